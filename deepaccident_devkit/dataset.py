@@ -210,7 +210,8 @@ class Dataset(OpenTables):
         """A sensor file's path, all boxes of its sample in the sensor's frame, and K (3, 3) of a camera.
 
         The path is that of `get_sample_data_path` or, where there is none, that of `local_path`. Boxes are not tested
-        against the image: those behind a camera are among them (`camera` finds those in it).
+        against the image: those behind a camera are among them (`camera` finds those in it). K is that of
+        calib, for an image of the size that `camera` says: `camera(…).resized(width, height)` has it for another size.
 
         Args:
             sample_data: token or record of a sensor file; with `channel`, of a sample.

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 from deepaccident_devkit import maps, overview, selection, v2x
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.interactions import interactions as interactions_of_scenario
+from deepaccident_devkit.reading import escaped
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.tables import open_index
@@ -106,7 +108,7 @@ class DeepAccident(Dataset):
             MissingExtraError: the dataroot is a URL, and the extra `cloud` is not installed.
         """
         how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": verbose}
-        place = None if index_dir is None else Path(os.path.abspath(Path(index_dir).expanduser()))  # noqa: PTH100
+        place = None if index_dir is None else Path(os.path.abspath(path_of(index_dir, "index_dir: expected a path")))  # noqa: PTH100
         layout = find_release(open_dataroot(dataroot, place, **how), version)
         for last_attempt in (False, True):
             index = open_index(layout, index_dir=place, on_error=on_error, **how)
@@ -187,4 +189,4 @@ class DeepAccident(Dataset):
 
 
 def _print(lines: Sequence[str]) -> None:
-    print("\n".join(lines))  # noqa: T201 - what the list_* methods are for
+    print(escaped("\n".join(lines)))  # noqa: T201 - what the list_* methods are for

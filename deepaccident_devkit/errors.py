@@ -3,11 +3,30 @@
 Each kind is also the built-in kind that a caller would expect (`ValueError`, `KeyError`, …) and is built from one
 sentence that names the file, the line and the remedy. One argument only: an exception with more does not survive
 the pickling on its way out of a worker process.
+
+What strangers wrote stands in these sentences too. So a sentence has a most length, and nothing in it moves a
+terminal's cursor, rings or turns the direction of letters.
 """
+
+from typing import ClassVar, Final
+
+from deepaccident_devkit.reading import escaped, shortened
+
+MOST_SAID: Final = 2000  # characters
 
 
 class DeepAccidentError(Exception):
     """Base of all errors raised on purpose by the devkit."""
+
+    _is_list: ClassVar[bool] = False  # if it is, each line may be as long as another error's message
+
+    def __init__(self, *message: object) -> None:
+        """Take the sentence. Its middle is left out if it is too long, and its control characters are shown."""
+        super().__init__(*map(self._said, message))
+
+    def _said(self, message: object) -> str:
+        parts = str(message).split("\n") if self._is_list else [str(message)]
+        return "\n".join(shortened(escaped(part), MOST_SAID) for part in parts)
 
     def __str__(self) -> str:
         """Return the sentence itself (`KeyError` would show its repr)."""
@@ -53,6 +72,8 @@ class SplitFileError(ReleaseError):
 class BrokenReleaseError(ReleaseError):
     """Indexing found broken scenarios; the message lists every one of them."""
 
+    _is_list = True
+
 
 class IndexStoreError(DeepAccidentError, OSError):
     """The index cannot be written or read at its place."""
@@ -64,6 +85,10 @@ class LabelFilesError(DeepAccidentError, OSError):
 
 class ExportError(DeepAccidentError, OSError):
     """A folder of an export cannot be made, written to or read, or it holds something else."""
+
+
+class OutputFolderError(DeepAccidentError, OSError):
+    """A link, or a path, would lead what is written or removed out of the folder that it belongs to."""
 
 
 class LookupFailedError(DeepAccidentError, KeyError):
@@ -120,6 +145,8 @@ class WorkerError(DeepAccidentError, RuntimeError):
 
 class SomeFailedError(DeepAccidentError, RuntimeError):
     """Some items of bulk work failed, and the others are done; the message lists every one that failed."""
+
+    _is_list = True
 
 
 class UnfinishedError(DeepAccidentError, RuntimeError):

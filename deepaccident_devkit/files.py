@@ -1,27 +1,32 @@
 """Files, written so that a reader sees either the old or the whole new one.
 
 What is being written has a temporary name in the same folder, `.NAME.HOST-PROCESS-START-NUMBER.tmp`. If the writer is
-killed it stays, and the next process that writes into that folder removes it.
+killed it stays, and the next process that writes into that folder removes it. The number is random, so that nobody can
+put a link there beforehand.
+
+A folder may hold a stranger's files, and links among them. `place_in` and `remove_in` keep what is written below it and
+removed from it inside.
 """
 
 from __future__ import annotations
 
 import hashlib
-import itertools
 import logging
 import os
 import platform
 import re
+import secrets
 import shutil
 import tempfile
 import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Final
 
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, OutputFolderError
+from deepaccident_devkit.reading import shortened
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -33,7 +38,6 @@ _TEMPORARY: Final = re.compile(
     re.DOTALL,
 )
 """A temporary name. Earlier versions wrote `.NAME.PROCESS.tmp`; a library may add the suffix that it writes by."""
-_NUMBERS: Final = itertools.count()
 _PLAIN_LENGTH: Final = 120
 _NAME_LENGTH: Final = 50
 """Characters of the final name that a temporary name has: names of files end at 255 bytes."""
@@ -71,7 +75,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 def temporary_path(path: Path) -> Path:
     """A path beside `path` that no other thread, process or host uses."""
-    return path.with_name(f".{path.name[:_NAME_LENGTH]}.{_writer(os.getpid())}-{next(_NUMBERS)}.tmp")
+    return path.with_name(f".{path.name[:_NAME_LENGTH]}.{_writer(os.getpid())}-{secrets.randbits(32)}.tmp")
 
 
 def temporary_of(name: str) -> str | None:
@@ -193,12 +197,13 @@ def held_lock(path: Path, task: str, *, shared: bool = False, wait: bool = True)
         wait: whether to wait, saying so, while another process holds it.
 
     Raises:
+        OutputFolderError: the file is a link, whose target would be opened.
         BlockingIOError: another process holds it, and `wait` is false.
         OSError, NotImplementedError: the folder cannot be made or written to, or its file system has no locks.
     """
     from filelock import FileLock, Timeout
 
-    path.parent.mkdir(parents=True, exist_ok=True)
+    place_in(path.parent, path.name, opened=True).parent.mkdir(parents=True, exist_ok=True)
     if shared:
         return SharedLock(path, task, wait=wait)
     lock = FileLock(path)
@@ -221,6 +226,46 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Write `content` to `path` atomically, making its folder where needed."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
+
+
+def place_in(folder: Path, path: str | PurePath, *, opened: bool = False) -> Path:
+    """The path of something below a folder; writing or removing it changes nothing outside.
+
+    No folder on the way is a link. This is so at the moment of the call: ask for each file, right before it is used.
+    The given folder may be a link. So may the file, if it is not `opened`: `replacing` and `remove_in` follow no link.
+
+    Args:
+        folder: which may hold a stranger's files.
+        path: relative to it; it may be empty, for the folder itself, if that is `opened`.
+        opened: whether it must be no link itself, as a lock, or a folder into which others write.
+
+    Raises:
+        OutputFolderError: there is a link, or the path is absolute, has `..`, or is empty.
+    """
+    inside = PurePath(path)
+    if inside.is_absolute() or ".." in inside.parts or not (inside.parts or opened):
+        raise OutputFolderError(f"{folder}: {str(path)!r} is no path below it; give another folder")
+    place = folder / inside
+    for part in [place, *place.parents][not opened : len(inside.parts)]:
+        if os.path.islink(part):  # noqa: PTH114 - Path.is_symlink raises for a name that is too long
+            raise OutputFolderError(
+                f"{part}: a symbolic link, which no devkit makes; remove it, or give another folder than {folder}"
+            )
+    return place
+
+
+def remove_in(folder: Path, path: str | PurePath) -> None:
+    """Remove a file or a whole folder below a folder, if it is there; of a link the link itself, never its target.
+
+    Raises:
+        OutputFolderError: as of `place_in`.
+        OSError: it cannot be removed.
+    """
+    place = place_in(folder, path)
+    if os.path.isdir(place) and not os.path.islink(place):  # noqa: PTH112, PTH114 - as above
+        shutil.rmtree(place)
+    elif os.path.lexists(place):
+        place.unlink(missing_ok=True)
 
 
 def plain_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:
@@ -253,15 +298,37 @@ def is_writable_folder(path: Path) -> bool:
         return False
 
 
+def path_text(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> str:
+    """The text of what a caller gives as a path.
+
+    Args:
+        given: a text, or a path object of one.
+        expected: how the message begins, such as `out: expected a folder`.
+        error: the kind of error.
+
+    Raises:
+        ConfigError: it is something else, or empty, or no file can have this name (or the other kind).
+    """
+    with suppress(TypeError, ValueError, RuntimeError):  # no path; half a character; `~` of nobody
+        text = os.fspath(given)  # type: ignore[call-overload]
+        if isinstance(text, str) and text and b"\0" not in os.fsencode(Path(text).expanduser()):
+            return text
+    found = "an empty path; give '.' for the current one" if given == "" else shortened(repr(given))
+    raise error(f"{expected}, found {found}")
+
+
+def path_of(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> Path:
+    """What a caller gives as a path, with `~` for the home folder; takes and raises what `path_text` does."""
+    return Path(path_text(given, expected, error=error)).expanduser()
+
+
 def writable_folder(folder: str | os.PathLike[str]) -> Path:
     """A folder that files can be written to, made if it is not there.
 
     Raises:
-        ConfigError: the path is empty, it or a folder above it is a file, or it may not be written to.
+        ConfigError: it is no path, it or a folder above it is a file, or it may not be written to.
     """
-    if not os.fspath(folder):
-        raise ConfigError("expected a folder to write to, found an empty path; give '.' for the current one")
-    path = Path(folder)
+    path = path_of(folder, "expected a folder to write to")
     if is_writable_folder(path):
         return path
     for part in (path, *path.parents):

@@ -1,18 +1,21 @@
-"""`parsed_json`: JSON of strangers, read strictly and within bounds.
+"""JSON of strangers, read strictly and within bounds: `parsed_json` as plain values, `parsed_record` as a record.
 
 Python's reader silently accepts a name that stands twice in an object, NaN, and half a character; and a value nested
-1,000 levels deep, which no function that calls itself can walk through afterwards.
+1,000 levels deep, which no function that calls itself can walk through afterwards. msgspec accepts the first one, so
+records are made of what `parsed_json` gives. It is imported when the first record is asked for.
 """
 
 import json
 import math
 import re
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from deepaccident_devkit.reading import shortened
+
+Record = TypeVar("Record")
 
 MOST_LEVELS: Final = 64
 """The largest depth of nested objects and lists; the devkit's files have some ten."""
@@ -69,12 +72,38 @@ def parsed_json(content: bytes, *, constants: bool = False) -> Any:
     try:
         text = content.decode("utf-8")
         value = json.loads(text, object_pairs_hook=made, parse_constant=told)
-    except ValueError as error:  # also of other bytes than UTF-8, and of numbers with thousands of digits
-        raise ValueError(f"is no JSON ({error})") from error
+    except ValueError as error:  # the words of Python's own errors change with its version
+        where = (
+            f"line {error.lineno}, column {error.colno}"
+            if isinstance(error, json.JSONDecodeError)
+            else "not in UTF-8, or a number of thousands of digits"
+        )
+        raise ValueError(f"is no JSON ({where})") from error
     fault = next(_faults(value, ""), None) if faults or _WRITTEN_SURROGATE.search(text) else None
     if faults or fault:
         raise ValueError(fault or "holds a name twice in one object")
     return value
+
+
+def parsed_record(content: bytes, kind: type[Record]) -> Record:
+    """The record that JSON text describes; raises ValueError as `parsed_json` and `as_record` do."""
+    return as_record(parsed_json(content), kind)
+
+
+def as_record(value: object, kind: type[Record]) -> Record:
+    """The record that a value of `parsed_json` describes: a `msgspec.Struct` or a dataclass.
+
+    Raises:
+        ValueError: a field is missing, of another type or out of bounds; half a sentence, which names its place, such
+            as ``expected `float`, got `str` - at `$.results[0].size```.
+    """
+    import msgspec
+
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        said = str(error)
+        raise ValueError(shortened(said[:1].lower() + said[1:])) from error
 
 
 def _check_levels(content: bytes) -> None:

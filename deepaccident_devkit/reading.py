@@ -64,6 +64,10 @@ MOST_QUOTED: Final = 100
 """Characters of a stranger's text in a message."""
 MOST_TOLD: Final = 300
 """Characters of what a library or the gate says of a fault: numbers, a remedy, perhaps a stranger's text."""
+# control characters except new line and tab, marks that turn the direction of letters, and halves of characters
+_UNSEEN: Final = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
+)
 _LIMIT: Final = re.compile(r"([a-z_]+)=(\w+)", re.ASCII)
 _SIZE: Final = re.compile(r"([1-9][0-9]{0,11})([KMGT]?)")
 _FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
@@ -78,6 +82,9 @@ class StoredFile(Protocol):
 
 
 _observer: ContextVar[Callable[[Path | StoredFile, bytes], None] | None] = ContextVar("observer", default=None)
+
+
+NO_NAME: Final = "cannot be a file's name: it holds a NUL character, or half of a pair that stands for one character"
 
 
 class RefusedFileError(OSError):
@@ -211,9 +218,17 @@ def shortened(text: str, most: int = MOST_QUOTED) -> str:
     return f"{text[:half]} … {text[-half:]}"
 
 
+def escaped(text: str) -> str:
+    r"""A stranger's text for a terminal: what cannot be seen there stands as in JSON, such as `\u001b`."""
+    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
 def _opened(path: Path) -> tuple[int, int]:
     """The descriptor of a regular file, and its size; raises OSError."""
-    descriptor = os.open(path, _FLAGS)
+    try:
+        descriptor = os.open(path, _FLAGS)
+    except ValueError:  # what Python says of it depends on its version
+        raise RefusedFileError(errno.EINVAL, NO_NAME) from None
     try:
         status = os.fstat(descriptor)
         if (irregular := irregular_text(status.st_mode)) is not None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, TokenError
-from deepaccident_devkit.files import replacing
+from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.release import write_split_file
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SCENARIO_ATTRIBUTES, SPLITS, VEHICLE_AGENTS
 from deepaccident_devkit.text import columns_text, natural_order
@@ -75,7 +75,9 @@ class Splits:
             ConfigError: one of the files is there and `overwrite` is not set, or `folder` is a file.
             TokenError: a scenario's name has blanks, which a split file cannot hold.
         """
-        return _write_all({Path(folder) / f"{name}.txt": tokens for name, tokens in self.by_name().items()}, overwrite)
+        return _write_all(
+            {path_of(folder) / f"{name}.txt": tokens for name, tokens in self.by_name().items()}, overwrite
+        )
 
 
 def official_split(dataset: Dataset, seed: int = OFFICIAL_SEED, *, released_skip: bool = False) -> Splits:
@@ -146,7 +148,7 @@ def save_selection(scenarios: Iterable[RowArgument], path: str | os.PathLike[str
         TokenError: something is neither a scenario's token nor a record of one, or has blanks, which a split file
             cannot hold.
     """
-    path = Path(path)
+    path = path_of(path)
     if path.suffix != ".txt":
         raise ConfigError(f"{path}: a split file's name ends in .txt; choose another name")
     tokens = tuple(dict.fromkeys(_scenario_token(scenario) for scenario in scenarios))

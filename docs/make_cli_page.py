@@ -46,6 +46,10 @@ file is half-written, and the same command can be run again. While a file is wri
 `.tmp`. If a command is killed, such files stay; the next command that writes into their folder removes them, and keeps
 those that others are writing. Files from other hosts are kept for a day.
 
+Files are written first, then the command prints. So no file is missing if the reader of the output goes away (exit
+status 141) or the output cannot be written (one line and exit status 2). A letter that the terminal lacks becomes a
+question mark, and control characters in names are shown as in JSON, such as `\\u001b`.
+
 ## Options of a release
 
 Every command with a DATAROOT and a link to this section has these options:

@@ -21,14 +21,15 @@ def packed(
     method: str = "stored",
     above: str = "",
     chosen: Callable[[Path], bool] = lambda _: True,
+    written: Callable[[str], str] = str,
 ) -> Path:
-    """A zip of a release's files, by their paths from there, below the folders `above`."""
+    """A zip of a release's files, by their paths from there, below the folders `above`, in another way if `written`."""
     archive.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(archive, "w", _METHODS[method]) as opened:
         for path in files_of(root):
             below = path.relative_to(root)
             if chosen(below):
-                opened.write(path, above + below.as_posix())
+                opened.writestr(written(above + below.as_posix()), path.read_bytes(), _METHODS[method])
     return archive
 
 

@@ -100,7 +100,7 @@ WORDS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
     "evaluate": lambda root, out, results: (
         *("evaluate", "accident", root, *IN_TRAIN, "--results", results, "--protocol", "boxes", "--out", out / "run"),
     ),
-    "export": lambda root, out, _: ("export", "opencood", root, "--out", out / "export"),
+    "export": lambda root, out, _: ("export", "opencood", root, "--without-clouds", "--out", out / "export"),
     "video": lambda root, out, _: ("render", "video", root, "--what", "bev", "--out", out / "video.gif"),
 }
 """Verb with workers → its words, for a release, a folder to write into and a results file."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.baselines.study_result import METRICS, PERCENT, StudyRow, StudyTable, V2XStudy
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.render.baselines import Panel, save_panels
 
 _SHOWN: Final = ("iou_100", "vpq_100", "apa", "boxes_apa", "mAP")
@@ -19,7 +20,7 @@ def save_study(study: V2XStudy, folder: str | os.PathLike[str]) -> list[Path]:
     """Render each table of a study into `<name>.png`, over those that exist. Returns their paths."""
     paths = []
     for table in study.tables.values():
-        paths.append(Path(folder) / f"{table.name}.png")
+        paths.append(path_of(folder) / f"{table.name}.png")
         save_panels(study_panels(table), table.title, paths[-1])
     return paths
 

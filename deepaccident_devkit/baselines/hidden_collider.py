@@ -18,6 +18,8 @@ from deepaccident_devkit.evaluation.metrics.evaluator import ratio
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, VEHICLE_AGENTS
 from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.v2x.collisions import labelled_pair
+from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
@@ -89,10 +91,11 @@ def _accident(dataset: Dataset, scenario: RowArgument | None) -> tuple[ScenarioR
     """A scenario and the actor ids of its colliding pair."""
     given = dataset.scenario if scenario is None else [dataset.scenario[dataset.getind("scenario", scenario)]]
     for record in given:
-        if record["collision"] is not None:
-            return record, set(record["collision"]["ids"])
+        pair = labelled_pair(record["collision"], scenario_tracks(dataset, record).actor_id)
+        if pair is not None:
+            return record, set(pair)
     place = dataset.dataroot if scenario is None else given[0]["token"]
-    raise NotAvailableError(f"{place}: nobody collides; choose a scenario with an accident")
+    raise NotAvailableError(f"{place}: no label shows a colliding pair; choose a scenario with an accident")
 
 
 def _alarms(dataset: Dataset, record: ScenarioRecord, pair: set[int], agents: str) -> dict[str, float]:

@@ -21,6 +21,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, read_results
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import (
     MERGE,
@@ -134,7 +135,7 @@ def predict_results(  # noqa: PLR0913 - what, where, and on what
     """
     part = part_of(part)
     work = _Work(dataset, choice("task", task, get_args(ResultsTask)), baseline or Baseline())
-    path = Path(out).expanduser().absolute()
+    path = path_of(out).absolute()
     files, jobs = work.jobs(path, tokens)
     if not work.is_done(path, tokens):
         whole = work.writer(path)  # refuses what stands there
@@ -161,7 +162,7 @@ def is_predicted(
     baseline: Baseline | None = None,
 ) -> bool:
     """Whether `predict_results` has written its results with these arguments before."""
-    return _Work(dataset, task, baseline or Baseline()).is_done(Path(out).expanduser().absolute(), tokens)
+    return _Work(dataset, task, baseline or Baseline()).is_done(path_of(out).absolute(), tokens)
 
 
 def samples_by_scenario(tokens: Sequence[str]) -> list[tuple[str, ...]]:

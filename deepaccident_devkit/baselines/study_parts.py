@@ -22,7 +22,7 @@ from deepaccident_devkit.baselines.study_config import StudyConfig
 from deepaccident_devkit.baselines.study_result import V2XStudy
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.parallel import (
     MERGE,
@@ -80,7 +80,7 @@ class StudyInParts:
             "release": [dataset.version, dataset.tables_folder.name],
             "devkit": __version__,
         }
-        self._files = ShardFiles(Path(out).expanduser().absolute(), digest_of(decisive), ".json")
+        self._files = ShardFiles(path_of(out).absolute(), digest_of(decisive), ".json")
 
     def __repr__(self) -> str:
         """How many samples it is of, and its place."""

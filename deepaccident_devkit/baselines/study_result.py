@@ -17,7 +17,7 @@ from deepaccident_devkit.baselines.study_config import StudyConfig
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.text import columns_text
 
 METRICS: Final[Mapping[str, str]] = {
@@ -181,7 +181,7 @@ class V2XStudy(FrozenMappings):
         """Write a file a table into a folder, over those that are there; returns their paths. Raises OSError."""
         paths = []
         for table in self.tables.values():
-            paths.append(Path(folder) / f"{table.name}.csv")
+            paths.append(path_of(folder) / f"{table.name}.csv")
             write_bytes(paths[-1], table.to_csv().encode())
         return paths
 

@@ -1,10 +1,11 @@
 """The command line: `deepaccident <verb>`, one module for each verb.
 
 A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error; 130 after Ctrl-C, 143 after
-SIGTERM.
+SIGTERM, 141 if the reader of the output went away.
 """
 
 import logging
+import os
 import re
 import sys
 import warnings
@@ -14,6 +15,7 @@ import click
 
 from deepaccident_devkit.cli.groups import ModuleVerbs
 from deepaccident_devkit.cli.interruption import run_interruptibly
+from deepaccident_devkit.cli.streams import lasting_streams
 from deepaccident_devkit.deprecations import DEPRECATED
 from deepaccident_devkit.errors import DeepAccidentError, SomeFailedError
 
@@ -71,6 +73,13 @@ def deepaccident(context: click.Context, version: bool, every: bool) -> None:
 
 def main() -> None:
     """Run the command line; errors that the user can mend become one message and exit status 2."""
+    # no window, and no file of the user changes a picture; in worker processes too
+    os.environ |= {"MPLBACKEND": "Agg", "MATPLOTLIBRC": os.devnull}
+    with lasting_streams():
+        _run()
+
+
+def _run() -> None:
     shown = logging.StreamHandler()
     shown.addFilter(lambda record: record.name.partition(".")[0] not in _OF_DASK)  # its errors come as exceptions too
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[shown])

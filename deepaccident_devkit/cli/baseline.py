@@ -21,13 +21,14 @@ from deepaccident_devkit.cli.options import (
     refuse_unused,
     release_parameters,
     say_part_done,
+    write_report,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
-from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
 from deepaccident_devkit.parallel import Part, Shard, mine
 from deepaccident_devkit.taxonomy import AGENTS
@@ -154,8 +155,7 @@ def v2x(split: str, egos: tuple[str, ...], seeds: tuple[int, ...], resamples: in
         say_part_done(part, f"{samples:,} samples")
         return
     study = work.result()
-    click.echo(study.to_text())
-    written = [*study.to_csv(folder), *save_study(study, folder), folder / "v2x_study.json"]
-    write_bytes(written[-1], study.to_json().encode())
+    written = [*write_report(study, folder, "v2x_study.json"), *save_study(study, folder)]
     work.remove()
+    click.echo(study.to_text())
     click.echo(f"written: {len(written)} files in {folder}")

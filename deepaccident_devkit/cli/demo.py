@@ -31,7 +31,7 @@ from deepaccident_devkit.errors import ConfigError, MissingExtraError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import remove_leftovers, write_bytes
+from deepaccident_devkit.files import place_in, remove_leftovers, write_bytes
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.render import detached_figure, render_replay
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
@@ -199,7 +199,7 @@ def _claim(out: Path) -> None:
 
 def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
     """Make the release, if it is not there; what an interrupted demo has recorded is kept."""
-    root, scenario = out / "release", out / _SCENARIO_FILE
+    root, scenario = place_in(out, "release", opened=True), out / _SCENARIO_FILE
     if root.is_dir():
         return
     if not scenario.exists():
@@ -215,7 +215,7 @@ def _evaluate(release: DeepAccident, out: Path) -> None:
     results = read_results(predict_results(release, "accident", _SELECTION.tokens(release), path, workers=1))
     setup = EvaluationSetup(task="accident", protocol="boxes")
     run = evaluate_results(release, results, setup, _SELECTION, workers=1).broken_down()
-    save_report(run, out / REPORT_FOLDER, dataset=release, results=results)
+    save_report(run, place_in(out, REPORT_FOLDER, opened=True), dataset=release, results=results)
 
 
 def _next_steps(out: Path) -> tuple[NextStep, ...]:

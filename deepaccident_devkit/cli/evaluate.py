@@ -191,13 +191,15 @@ def _evaluate(
     if options.get("prevented"):
         run = with_prevented(run, dataset, resampling, progress=True, **engine)
     run, texts = _examined(run, dataset, opened, options)
+    if out is not None:
+        report = partial(save_report, run, dataset=dataset, results=opened)
+        kept = {name: options[name] for name in ("include_results", "overwrite")}
+        out = save_run(run, out, **kept, extras=[report])
     summary = run.summary()
     shown = summary_text(summary, by or SHOWN_BREAKDOWNS)
     click.echo(json.dumps(summary, indent=1) if as_json else "\n\n".join([shown, *texts]))
     if out is not None:
-        report = partial(save_report, run, dataset=dataset, results=opened)
-        kept = {name: options[name] for name in ("include_results", "overwrite")}
-        click.echo(f"written: {save_run(run, out, **kept, extras=[report])}", err=as_json)
+        click.echo(f"written: {out}", err=as_json)
 
 
 def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any], part: Part) -> None:

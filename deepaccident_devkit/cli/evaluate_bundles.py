@@ -134,7 +134,6 @@ def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...
             raise click.BadParameter(f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}")
     comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
     as_text = json.dumps(comparison.as_dict(), indent=1)
-    click.echo(as_text if as_json else comparison.to_text())
     for path in out:
         if path.suffix.lower() == ".csv":
             comparison.to_csv(path)
@@ -142,4 +141,6 @@ def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...
             write_bytes(path, as_text.encode())
         else:
             save_picture(render_comparison(comparison), path, dpi=_DPI)
+    click.echo(as_text if as_json else comparison.to_text())
+    for path in out:
         click.echo(f"written: {path}", err=as_json)

@@ -97,12 +97,18 @@ def nuscenes(van: str, lidar_axes: str, *, sweeps: bool, **options: Any) -> None
 @click.option(
     "--ego", type=WordChoice(VEHICLE_AGENTS), default="ego_vehicle", show_default=True, help="The vehicle that is 1."
 )
-def opencood(classes: str, ego: str, **options: Any) -> None:
+@click.option(
+    "--without-clouds",
+    is_flag=True,
+    help="Also write agents and moments that lack a point cloud, for models of cameras alone.",
+)
+def opencood(classes: str, ego: str, *, without_clouds: bool, **options: Any) -> None:
     """Write scenarios of the release in DATAROOT as OPV2V has them: a folder each, with yaml, json and pcd files.
 
     If a run is interrupted, the same command continues it.
     """
-    run_export(OpenCood, {"classes": tuple(classes.split(",")), "ego": ego}, **options)
+    own = {"classes": tuple(classes.split(",")), "ego": ego, "without_clouds": without_clouds}
+    run_export(OpenCood, own, **options)
 
 
 @click.command(short_help="Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.")

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final, NoReturn
 
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
@@ -112,4 +113,5 @@ def _kill_children() -> None:
 
 
 def _say_so() -> None:
-    os.write(2, _LINE)  # and not sys.stderr, which an interrupted print may hold
+    with suppress(OSError):  # nobody may read it
+        os.write(2, _LINE)  # and not sys.stderr, which an interrupted print may hold

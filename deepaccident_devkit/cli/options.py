@@ -3,7 +3,7 @@
 import functools
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -12,6 +12,7 @@ from click.core import ParameterSource
 
 from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.parallel import MERGE, Part, Shard, cluster_executor
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
 from deepaccident_devkit.text import choice, meant_text
@@ -169,6 +170,22 @@ def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
 def say_part_done(part: Shard, what: str, *, err: bool = False) -> None:
     """Say what a shard has done, and what comes after all of them."""
     click.echo(f"part {part}: {what}; next: the same with --merge", err=err)
+
+
+def write_report(report: Any, folder: Path | None, name: str) -> list[Path]:
+    """Write a report's tables, and all of it as JSON into a file `name`; the files written, none without a folder."""
+    if folder is None:
+        return []
+    written = [*report.to_csv(folder), folder / name]
+    write_bytes(written[-1], report.to_json().encode())
+    return written
+
+
+def say_report(report: Any, written: Sequence[Path], folder: Path | None, *, as_json: bool) -> None:
+    """Print a report, and how many files were written into a folder before: nothing written depends on the print."""
+    click.echo(report.to_json() if as_json else report.to_text())
+    if folder is not None:
+        click.echo(f"written: {len(written)} files in {folder}", err=as_json)
 
 
 def _shard(context: click.Context, parameter: click.Parameter, value: str | None) -> Shard | None:

@@ -1,7 +1,6 @@
 """`deepaccident render`: pictures and videos of a release, one verb for each view."""
 
 import logging
-import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -265,7 +264,6 @@ _PICTURES = {
 @click.group()
 def render() -> None:
     """Render pictures of a release, one command per view; `video` makes a video of them."""
-    os.environ.setdefault("MPLBACKEND", "Agg")  # only files are written, so no window system is needed
 
 
 def _verb(name: str, picture: _Picture) -> click.Command:

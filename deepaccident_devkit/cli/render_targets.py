@@ -70,11 +70,11 @@ def _of_scenario(dataset: Dataset, table: str, token: str, frames: range | None)
 def _instance(dataset: Dataset, scenario: str) -> str:
     """The actor that the first agent collides with; without a collision, the scenario's first actor."""
     record = dataset.get("scenario", scenario)
-    if record["collision"] is None:
-        return dataset.field2token("instance", "scenario_token", scenario)[0]
+    pair = () if record["collision"] is None else record["collision"]["ids"]
     first = dataset.agent.get(f"{scenario}/{agents_of(dataset, scenario)[0]}")["actor_id"]
-    other = next(actor for actor in record["collision"]["ids"] if actor != first)
-    return instance_token(scenario, other)
+    labelled = dataset.field2token("instance", "scenario_token", scenario)
+    others = (instance_token(scenario, actor) for actor in pair if actor != first)
+    return next((other for other in others if other in labelled), labelled[0])
 
 
 def _annotation(dataset: Dataset, sample: str) -> str:

@@ -4,9 +4,9 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import engine_of, release_parameters, where_parameter
+from deepaccident_devkit.cli.options import engine_of, release_parameters, say_report, where_parameter, write_report
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, render_avoidability
@@ -34,14 +34,10 @@ def avoidability(where: tuple[str, ...], out: str | None, as_json: bool, **optio
     dataset = DeepAccident(**options)
     chosen = dataset.find(*where) if where else None
     report = avoidability_report(dataset, chosen, **engine_of(options))
-    click.echo(report.to_json() if as_json else report.to_text())
-    if folder is None:
-        return
-    written = report.to_csv(folder)
-    written.append(folder / "avoidability.json")
-    write_bytes(written[-1], report.to_json().encode())
-    for group in GROUPS:
-        if report.members(group):
-            figure = render_avoidability(report, group, fig=detached_figure(AVOIDABILITY_SIZE))
-            written.append(write_figure(figure, folder / f"avoidability_{group.replace('-', '_')}.png", dpi=_DPI))
-    click.echo(f"written: {len(written)} files in {folder}", err=as_json)
+    written = write_report(report, folder, "avoidability.json")
+    if folder is not None:
+        for group in GROUPS:
+            if report.members(group):
+                figure = render_avoidability(report, group, fig=detached_figure(AVOIDABILITY_SIZE))
+                written.append(write_figure(figure, folder / f"avoidability_{group.replace('-', '_')}.png", dpi=_DPI))
+    say_report(report, written, folder, as_json=as_json)

@@ -36,10 +36,11 @@ def describe(scenario: str | None, where: tuple[str, ...], out: Path | None, as_
         chosen = dataset.find(*where)
     told = stories(dataset, chosen, **engine_of(options))
     lines = [json.dumps({**each.facts, "text": each.text}, allow_nan=False) for each in told]
+    if out is not None:
+        write_bytes(out, "".join(f"{line}\n" for line in lines).encode())
     for line, each in zip(lines, told, strict=True):
         click.echo(line if as_json else f"{each.facts['scenario']}\n  {each.text}")
         for reason in () if as_json else each.facts["unknown"]:
             click.echo(f"  not known: {reason}")
     if out is not None:
-        write_bytes(out, "".join(f"{line}\n" for line in lines).encode())
         click.echo(f"written: {len(lines)} scenarios in {out}", err=as_json)

@@ -9,10 +9,12 @@ from deepaccident_devkit.cli.options import (
     engine_of,
     refuse_unused,
     release_parameters,
+    say_report,
     where_parameter,
+    write_report,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.safety import render_lead_times
@@ -75,13 +77,8 @@ def lead_time(where: tuple[str, ...], out: str | None, as_json: bool, **options:
     dataset = DeepAccident(**options)
     chosen = dataset.find(*where) if where else None
     ledger = lead_time_ledger(dataset, chosen, rule, **engine_of(options))
-    click.echo(ledger.to_json() if as_json else ledger.to_text())
-    if folder is None:
-        return
-    written = ledger.to_csv(folder)
-    written.append(folder / "lead_times.json")
-    write_bytes(written[-1], ledger.to_json().encode())
-    if ledger.accidents:
+    written = write_report(ledger, folder, "lead_times.json")
+    if folder is not None and ledger.accidents:
         figure = render_lead_times(ledger, fig=detached_figure(LEAD_TIME_SIZE))
         written.append(write_figure(figure, folder / "lead_times.png", dpi=_DPI))
-    click.echo(f"written: {len(written)} files in {folder}", err=as_json)
+    say_report(ledger, written, folder, as_json=as_json)

@@ -5,9 +5,16 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import engine_of, refuse_unused, release_parameters, where_parameter
+from deepaccident_devkit.cli.options import (
+    engine_of,
+    refuse_unused,
+    release_parameters,
+    say_report,
+    where_parameter,
+    write_report,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.safety import render_twins
@@ -68,14 +75,9 @@ def twins(
     if diff is not None:
         chosen = [diff.accident]
     report = twin_report(dataset, chosen, parting, **engine_of(options))
-    click.echo(report.to_json() if as_json else report.to_text())
-    if folder is None:
-        return
-    written = report.to_csv(folder)
-    written.append(folder / "twins.json")
-    write_bytes(written[-1], report.to_json().encode())
-    if diff is not None:
+    written = write_report(report, folder, "twins.json")
+    if folder is not None and diff is not None:
         written.append(diff.to_csv(folder / "twins_over_time.csv"))
         figure = render_twins(diff, fig=detached_figure(TWINS_SIZE))
         written.append(write_figure(figure, folder / "twins.png", dpi=_DPI))
-    click.echo(f"written: {len(written)} files in {folder}", err=as_json)
+    say_report(report, written, folder, as_json=as_json)

@@ -10,10 +10,12 @@ from deepaccident_devkit.cli.options import (
     part_parameters,
     release_parameters,
     say_part_done,
+    say_report,
     where_parameter,
+    write_report,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.render.statistics import PictureFormat, save_statistics
 from deepaccident_devkit.statistics import (
@@ -71,11 +73,8 @@ def stats(
         statistics = merged_statistics(dataset, folder, chosen, interactions=interactions)
     else:
         statistics = dataset_statistics(dataset, chosen, interactions=interactions, **how)
-    click.echo(statistics.to_json() if as_json else statistics.to_text())
+    written = write_report(statistics, folder, "statistics.json")
     if folder:
-        written = statistics.to_csv(folder)
-        written.append(folder / "statistics.json")
-        write_bytes(written[-1], statistics.to_json().encode())
         written += save_statistics(statistics, folder, formats or get_args(PictureFormat))
         remove_shards(dataset, folder, chosen, interactions=interactions)
-        click.echo(f"written: {len(written)} files in {folder}", err=as_json)
+    say_report(statistics, written, folder, as_json=as_json)

@@ -37,6 +37,8 @@ SCORE: Final = "score:"
 PAGE: Final = 48
 _MOST_QUERY: Final = 2000
 """Characters."""
+_MOST_FREE: Final = 100  # filters of a query; values, in sum, that no facet has
+MOST_WORD: Final = 100  # characters of a value, or of another word of an address: it stands in many links of a page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,20 +62,28 @@ class Choices:
     page: int = 1
 
     @classmethod
-    def of(cls, given: Iterable[tuple[str, str]]) -> Choices:
-        """Those of the parameters of an address; what makes no sense is left out, so that no address fails."""
-        facets: dict[str, list[str]] = {}
-        others: dict[str, str] = {}
-        for name, value in given:
-            if name in FIELDS:
-                facets.setdefault(name, []).append(value)
-            else:
-                others[name] = value
+    def of(cls, given: Sequence[tuple[str, str]], scenarios: Scenarios | None = None) -> Choices:
+        """Those of the parameters of an address; what makes no sense is left out, so that no address fails.
+
+        An address may come from anyone, so it cannot ask for more than a page has.
+
+        Args:
+            given: names and values.
+            scenarios: values that these have all count, others only if they are few; None if they are not known.
+        """
+        known = {} if scenarios is None else {each.name: frozenset(each.values) for each in scenarios.facets()}
+        others = {name: value for name, value in given if name not in FIELDS}
+        facets: dict[str, tuple[str, ...]] = {}
+        unknown = 0
+        for name, value in dict.fromkeys(pair for pair in given if pair[0] in FIELDS and len(pair[1]) <= MOST_WORD):
+            unknown += value not in known.get(name, ())
+            if unknown <= _MOST_FREE or value in known.get(name, ()):
+                facets[name] = (*facets.get(name, ()), value)
         page = others.get("page", "")
         return cls(
-            facets={name: tuple(dict.fromkeys(values)) for name, values in facets.items()},
+            facets=facets,
             query=others.get("q", "").strip()[:_MOST_QUERY],
-            sort=others.get("sort", "name"),
+            sort=others.get("sort", "name")[:MOST_WORD],
             order="down" if others.get("order") == "down" else "up",
             view="table" if others.get("view") == "table" else "grid",
             page=int(page) if re.fullmatch(r"[1-9]\d{0,5}", page) else 1,
@@ -97,7 +107,8 @@ class Choices:
     @property
     def lines(self) -> list[str]:
         """The filters of the query."""
-        return [line.strip() for line in re.split(r"[;\n]", self.query) if line.strip()]
+        lines = (line.strip() for line in re.split(r"[;\n]", self.query))
+        return [line for line in dict.fromkeys(lines) if line][:_MOST_FREE]
 
     def python(self) -> str:
         """The call that finds the same scenarios."""

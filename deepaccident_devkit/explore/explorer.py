@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -77,7 +76,6 @@ class Explorer:
         self.replays: Kept[dict[str, Any]] = Kept(_MOST_REPLAYS)
         self._recordings: Kept[Recording] = Kept(_MOST_REPLAYS)
         self.thumbnails = KeptFiles(dataset)
-        self._drawing = threading.Lock()
 
     def __repr__(self) -> str:
         """Of which release, and of which models."""
@@ -117,13 +115,8 @@ class Explorer:
         return self.replays.get((token, model), make)
 
     def drawn(self, key: Hashable, draw: Callable[[], Any]) -> bytes:
-        """A figure as PNG, rendered at the first call with a key; one at a time, as matplotlib needs it."""
-
-        def png() -> bytes:
-            with self._drawing:
-                return figure_png(draw(), dpi=DPI)
-
-        return self.pictures.get(key, png)
+        """A figure as PNG, rendered at the first call with a key."""
+        return self.pictures.get(key, lambda: figure_png(draw(), dpi=DPI))
 
 
 def _few_workers(scenarios: int) -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, Generic, TypeVar
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.files import is_writable_folder, place_in
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release.store.cache import FileCache
 
@@ -68,7 +68,7 @@ class KeptFiles:
 
     def __init__(self, dataset: Dataset) -> None:
         """Take the release whose index they lie beside: they go when the tables are made again."""
-        folder = dataset.tables_folder / _THUMBNAILS
+        folder = place_in(dataset.tables_folder, _THUMBNAILS, opened=True)
         if not is_writable_folder(dataset.tables_folder):
             folder = FileCache.of_user().folder.with_name(_THUMBNAILS)
         self._files = FileCache(folder, _MOST_THUMBNAILS)
@@ -80,12 +80,12 @@ class KeptFiles:
 
     def get(self, identity: str, name: str, make: Callable[[], bytes]) -> bytes:
         """The content of a file; `identity` tells it from all others. Raises what `make` raises."""
-        path = self._files.path_of(identity, name)
         with suppress(OSError):
+            path = self._files.path_of(identity, name)
             content = read_bytes(path, "image")
             os.utime(path)  # who was not used the longest goes first
             return content
         content = make()
         with suppress(OSError):  # no room, or a folder that may not be written to: it is made again the next time
-            self._files.put(path, content)
+            self._files.put(self._files.path_of(identity, name), content)
         return content

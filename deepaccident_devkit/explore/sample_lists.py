@@ -12,6 +12,7 @@ from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes, attribute_name, sample_attributes
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.explore.background import Job
+from deepaccident_devkit.explore.choices import MOST_WORD
 from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.explore.standings import standings_job
 from deepaccident_devkit.text import natural_order
@@ -49,8 +50,8 @@ class SampleChoices:
         order: Any = given.get("order")
         return cls(
             by=attribute_name(by) if by else "",
-            value=given.get("value", "") if by else "",
-            scenario=given.get("scenario", ""),
+            value=given.get("value", "")[:MOST_WORD] if by else "",
+            scenario=given.get("scenario", "")[:MOST_WORD],
             order=order if order in get_args(Order) else None,
         )
 

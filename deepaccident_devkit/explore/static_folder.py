@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import replacing_folder, temporary_path, writable_folder, write_bytes
+from deepaccident_devkit.files import path_of, replacing_folder, temporary_path, writable_folder, write_bytes
 from deepaccident_devkit.reading import read_bytes
 
 MARK: Final = ".deepaccident_pages"
@@ -24,9 +24,7 @@ def target_folder(folder: str | os.PathLike[str]) -> Path:
     Raises:
         ConfigError: it cannot be written to, is a file, or holds files that no export wrote.
     """
-    if not os.fspath(folder):
-        raise ConfigError("expected a folder to write to, found an empty path")
-    target = Path(folder).expanduser().resolve()
+    target = path_of(folder, "expected a folder to write to").resolve()
     writable_folder(target.parent)
     if target.exists() and not target.is_dir():
         raise ConfigError(f"{target}: is a file; name a folder that does not exist yet")

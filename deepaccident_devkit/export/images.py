@@ -17,7 +17,6 @@ from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import PinholeCamera
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.text import choice, settle_choices
-from deepaccident_devkit.v2x.projection import camera_of
 
 ImageDtype = Literal["float32", "uint8"]
 Decoding = Literal["full", "scaled"]
@@ -81,7 +80,7 @@ class ImageConfig:
             SensorFileError: it cannot be read.
             ConfigError: the crop reaches beyond the image.
         """
-        lens = camera_of(dataset, camera)
+        lens = dataset.camera(camera)
         if self.decode == "scaled" and self.resize is not None:
             image = dataset.load_image(camera, least=self.resize)
             return _resized_part(image, self.resize, self.crop), self.intrinsic(lens, self.resize)
@@ -100,7 +99,7 @@ class ImageConfig:
     def intrinsic(self, lens: PinholeCamera, size: tuple[int, int]) -> FloatArray:
         """The intrinsic (3, 3) of a camera's image that was resized to `size`, height and width, then cropped."""
         height, width = size
-        intrinsic: FloatArray = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.intrinsic
+        intrinsic: FloatArray = lens.resized(width, height).intrinsic.copy()
         if self.crop is not None:
             top, left, _, _ = self.crop
             intrinsic[:2, 2] -= (left, top)

@@ -29,7 +29,8 @@ from deepaccident_devkit.export.bulk.manifest import Manifest
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.names import CAMERA_CHANNELS, VERSION, sensor_path, token
-from deepaccident_devkit.export.nuscenes.sensors import TURNS, image_size, scaled_intrinsic
+from deepaccident_devkit.export.nuscenes.sensors import TURNS
+from deepaccident_devkit.export.sensor_files import stored_camera
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.reading import read_bytes
@@ -117,25 +118,27 @@ def _placed(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
 def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, Any]]:
     """The infos of a scene's keyframes, without `sample_idx`."""
     ours_from_theirs = SE3.from_rotation(TURNS[form.lidar_axes]).inverse()
-    sizes = {camera: image_size(scene, camera) for camera in CAMERA_CHANNELS}
     for number in keyframes(scene.last):
         sample = scene.sample(number)
         ego_from_lidar = scene.dataset.ego_from(sample, LIDAR) @ ours_from_theirs
         lidar_from_world = (scene.dataset.world_from(sample, "lidar") @ ours_from_theirs).inverse()
         images = {}
         for camera, channel in CAMERA_CHANNELS.items():
-            if number not in scene.files[camera]:
+            file = scene.files[camera].get(number)
+            if file is None:
                 output.leave_out("images that are not in this release")
                 continue
             ego_from_camera = scene.dataset.ego_from(sample, camera)
             images[channel] = {
                 "img_path": _file(scene, camera, number).name,
-                "cam2img": scaled_intrinsic(scene.dataset, f"{sample}/{camera}", sizes[camera]).tolist(),
+                "cam2img": stored_camera(scene.dataset, f"{sample}/{camera}", file).intrinsic.tolist(),
                 "lidar2cam": (ego_from_camera.inverse() @ ego_from_lidar).matrix.tolist(),
                 "cam2ego": ego_from_camera.matrix.tolist(),
                 "sample_data_token": token("sample_data", sample, camera),
                 "timestamp": scene.stamp(number) / 1e6,
             }
+        if number not in scene.files[LIDAR]:
+            output.leave_out("point clouds that are not in this release (the infos name them)")
         before = [each for each in range(number - 1, max(number - 1 - _SWEEPS, 0), -1) if each in scene.files[LIDAR]]
         yield {
             "token": token("sample", sample),

@@ -54,6 +54,7 @@ class Parquet(Format):
     shard_scenarios: int = 32
 
     name: ClassVar[str] = "parquet"
+    channels: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         """Check the size of shards too."""

@@ -65,6 +65,11 @@ class ReleasedInfos(Format):
     root_prefix: str = "./data/DeepAccident_data"
     drop_empty: bool = False
     name: ClassVar[str] = "released"
+    channels: ClassVar[tuple[str, ...]] = ()
+    nothing: ClassVar[str] = (
+        "no scenario is in the split files train.txt or val.txt (which are in the root of the release or in "
+        "split_txt_files) and has labels and all five agents; add these files, or choose other scenarios"
+    )
 
     def __post_init__(self) -> None:
         """Check the choices."""

@@ -53,7 +53,8 @@ JSON_FIELDS: Final = """\
 null without an impact |
 | `velocity` | of the agent over the ground, in world; null if unknown |
 | `world_from_ego`, `ego_from_lidar` | 4×4; `world_from_ego @ ego_from_lidar` maps LiDAR points to world |
-| `cameras` | of each camera `ego_from_camera` 4×4, `intrinsic` 3×3, and `width` and `height` of its image |
+| `cameras` | of each camera `ego_from_camera` 4×4, `intrinsic` 3×3, and `width` and `height` of its image; \
+without an image those of calib |
 | `labelled` | whether there is a label; if not, there are no boxes |
 | `boxes` | columns with an entry a box: `center`, `size` (length, width, height), `yaw` and `velocity`, all in \
 the LiDAR frame, `category`, `actor_id` (−100 the agent itself, −1 untracked), `num_lidar_pts`, `camera_visible`, \
@@ -63,8 +64,11 @@ An unknown velocity of a box is null three times; `numpy.array(boxes["velocity"]
 """
 
 
-def sample_json(dataset: Dataset, sample: str) -> bytes:
-    """The JSON of a sample, given by its token; raises TokenError."""
+def sample_json(dataset: Dataset, sample: str, sizes: Mapping[str, tuple[int, int]]) -> bytes:
+    """The JSON of a sample, given by its token; `sizes` has width and height of its images that are there.
+
+    Raises TokenError.
+    """
     record = dataset.sample.get(sample)
     frame = dataset.frame.get(record["frame_token"])
     facts = {
@@ -76,15 +80,16 @@ def sample_json(dataset: Dataset, sample: str) -> bytes:
         **{name: record[name] for name in ("timestamp", "time_to_end", "time_to_impact", "velocity")},
         "world_from_ego": dataset.world_from(sample, "ego").matrix.tolist(),
         "ego_from_lidar": dataset.ego_from(sample, LIDAR).matrix.tolist(),
-        "cameras": {name: _camera(dataset, sample, channel) for channel, name in CAMERA_NAMES.items()},
+        "cameras": {name: _camera(dataset, sample, camera, sizes.get(camera)) for camera, name in CAMERA_NAMES.items()},
         "labelled": record["labelled"],
         "boxes": _boxes(dataset, sample),
     }
     return json.dumps(facts, allow_nan=False).encode()
 
 
-def _camera(dataset: Dataset, sample: str, channel: str) -> dict[str, Any]:
-    camera = dataset.camera(sample, channel)
+def _camera(dataset: Dataset, sample: str, channel: str, size: tuple[int, int] | None) -> dict[str, Any]:
+    calibrated = dataset.camera(sample, channel)
+    camera = calibrated if size is None else calibrated.resized(*size)
     return {
         "ego_from_camera": dataset.ego_from(sample, channel).matrix.tolist(),
         "intrinsic": camera.intrinsic.tolist(),

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.geometry import PinholeCamera
 from deepaccident_devkit.release import read_lidar
+from deepaccident_devkit.release.images import image_size
 from deepaccident_devkit.release.layout import frame_sizes
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_token
@@ -28,6 +30,22 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
         for number, size in sizes.items()
         if number <= count
     }
+
+
+def stored_camera(dataset: Dataset, camera: str, file: tuple[ReleasePath, int] | None) -> PinholeCamera:
+    """A camera with K and size of its image file, which may have another size than calib says.
+
+    Args:
+        dataset: the release.
+        camera: token of the image.
+        file: of `sensor_files`; None where the image is not in this release: then K and size are those of calib.
+
+    Raises:
+        TokenError: no such image.
+        SensorFileError: the file is no image.
+    """
+    lens = dataset.camera(camera)
+    return lens if file is None else lens.resized(*image_size(file[0]))
 
 
 def points_in(files: Mapping[int, tuple[ReleasePath, int]]) -> int:

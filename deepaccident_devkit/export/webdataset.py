@@ -20,7 +20,7 @@ from deepaccident_devkit.export.sample_json import CAMERA_NAMES, JSON_FIELDS, JS
 from deepaccident_devkit.export.sensor_files import points_in, sensor_files
 from deepaccident_devkit.export.shards import README, readme, shards
 from deepaccident_devkit.release import read_lidar
-from deepaccident_devkit.release.images import read_image_bytes
+from deepaccident_devkit.release.images import image_size, read_image_bytes
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, LIDAR
@@ -190,12 +190,16 @@ class _Recording:
         for number, agent in product(self._numbers, self._agents):
             token = sample_token(self._scenario, agent, number)
             key = token.replace("%", "%25").replace(".", "%2E")  # readers cut a name at its first dot
+            sizes = {}
             for camera, name in CAMERA_NAMES.items():
                 if number in self._files[agent, camera]:
-                    _add(archive, f"{key}.{name}.jpg", read_image_bytes(self._files[agent, camera][number][0]))
+                    path, _ = self._files[agent, camera][number]
+                    content = read_image_bytes(path)
+                    sizes[camera] = image_size(path, content)
+                    _add(archive, f"{key}.{name}.jpg", content)
             if number in self._files[agent, LIDAR]:
                 _add(archive, f"{key}.lidar.npy", _npy(self._files[agent, LIDAR][number][0]))
-            _add(archive, f"{key}.json", sample_json(self._dataset, token))
+            _add(archive, f"{key}.json", sample_json(self._dataset, token, sizes))
 
 
 def _add(archive: tarfile.TarFile, name: str, content: bytes) -> None:

@@ -83,6 +83,11 @@ class PinholeCamera(FrozenArrays):
         focal = width / 2 / np.tan(angle / 2)
         return cls(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height)
 
+    def resized(self, width: int, height: int) -> PinholeCamera:
+        """The camera of the same picture at another size, pixels; raises GeometryError if that has no pixels."""
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return PinholeCamera(scale @ self.intrinsic, width, height)
+
     def project(self, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Points (N, 3) of the optical frame → pixels (N, 2) as (u, v), and depths (N,) metres.
 

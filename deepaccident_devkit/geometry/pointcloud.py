@@ -23,11 +23,12 @@ from deepaccident_devkit.arrays import (
     readonly,
 )
 from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
-from deepaccident_devkit.files import replacing
+from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.nuscenes_names import CLOUD, without_names
+from deepaccident_devkit.reading import fault_text
 from deepaccident_devkit.text import Pictured
 
 Range = tuple[float, float]
@@ -173,7 +174,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
         `load` returns the same cloud, equal to the bit. This is not the release's format, which is single precision,
         left-handed and in the LiDAR frame: `release.write_lidar` writes that.
         """
-        with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        with replacing(path_of(path)) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **self._columns(), frame=np.array(self.frame))
 
     @classmethod
@@ -185,7 +186,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
             SensorFileError: it cannot be read, or is another kind of file.
         """
         try:
-            with open_zip(Path(path)) as archive:
+            with open_zip(path_of(path)) as archive:
                 there = {*_FIELDS, *archive.namelist()}
                 names = [name for name in (*_FIELDS, *_SOURCES) if name in there or f"{name}.npy" in there]
                 arrays: dict[str, Any] = {name: read_array(archive, name, "cloud") for name in names}
@@ -194,7 +195,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
             raise MissingFileError(f"{path}: no such file; LidarPointCloud.save writes one") from None
         except _FAULTS as error:
             raise SensorFileError(
-                f"{path}: not a cloud that LidarPointCloud.save wrote ({error}); "
+                f"{path}: not a cloud that LidarPointCloud.save wrote ({fault_text(error)}); "
                 "files of the release are read by load_point_cloud"
             ) from error
 

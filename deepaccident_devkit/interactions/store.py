@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.files import place_in
 from deepaccident_devkit.interactions.config import InteractionConfig
 from deepaccident_devkit.interactions.records import interaction_specs
 from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names
@@ -24,8 +25,8 @@ VERSION: Final = "1"
 
 
 def kept_path(dataset: Dataset, scenario: str) -> Path:
-    """Where the interactions of a scenario are kept."""
-    return dataset.tables_folder / FOLDER / f"{scenario}.arrow"
+    """Where the interactions of a scenario are kept; raises OutputFolderError if that is behind a link."""
+    return place_in(dataset.tables_folder, f"{FOLDER}/{scenario}.arrow")
 
 
 def read_kept(dataset: Dataset, scenario: str, config: InteractionConfig) -> Interactions | None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, as_floats, checked
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.maps.counting import GROUND_CLASSES
 from deepaccident_devkit.maps.polygons import AREAS, Area, geojson_of, outlines, simplified
 from deepaccident_devkit.text import choice
@@ -163,7 +163,7 @@ class TownMap(FrozenArrays):
         7946 asks for: a town of CARLA has none that are true. Open the file in a plane coordinate system of metres.
         The same map gives the same bytes.
         """
-        target = Path(path).expanduser()
+        target = path_of(path)
         write_bytes(target, geojson_of(self.town, {area: self.polygons(area) for area in ("drivable", "sidewalk")}))
         return target
 

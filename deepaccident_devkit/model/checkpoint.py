@@ -1,12 +1,11 @@
 """Weights in files: our own as safetensors, foreign ones of the release, BEVerse, Swin or torchvision.
 
 Names are the release's (tests/data/golden/model/released_keys_*.txt), so that the key table is the identity.
-A foreign file is read by `torch.load(weights_only=True)`, which runs no code of it.
+A foreign file is read by `release.checkpoints`, which runs no code of it and makes nothing large.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
+import msgspec
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
@@ -22,10 +22,11 @@ from torch import Tensor, nn
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.files import path_of, write_bytes
+from deepaccident_devkit.json_text import as_record, parsed_json, parsed_record
 from deepaccident_devkit.model.images import from_official
-from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.reading import MOST_TOLD, fault_text, read_bytes, shortened
+from deepaccident_devkit.release.checkpoints import FAULTS, SIZES, Storages, StoredTensor, read_checkpoint
 
 BEST: Final = "best.safetensors"
 FINAL: Final = "final.safetensors"
@@ -40,6 +41,19 @@ _META: Final = "deepaccident"
 _MADE: Final = ("relative_position_index", "transformer.frustum", "num_batches_tracked")
 """Ends of names whose values follow from the configuration, or do not matter."""
 _TOLD: Final = 3
+_HEADER: Final = 4 << 20
+"""Bytes of the header of a safetensors file; `released` has 0.1 MB."""
+_FACTOR: Final = 4
+_ROOM: Final = 1 << 20
+"""Tensors may have so many times the bytes of their foreign file, and so many more: several may share theirs."""
+_FAULTS: Final = (SafetensorError, *FAULTS)
+"""What a damaged or hostile file of weights can raise."""
+
+
+class _Header(msgspec.Struct):
+    """What else than tensors is in the header of a safetensors file."""
+
+    metadata: dict[str, str] = msgspec.field(name="__metadata__", default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,7 +101,7 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     Raises:
         ConfigError: the file is not there, cannot be read, or holds no state dict.
     """
-    path = Path(path)
+    path = path_of(path)
     if not path.exists():
         path = SHIPPED.get(str(path), path)
     if path.is_dir():
@@ -101,15 +115,25 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     if content[8:9] != b"{" and content[:2] in (b"PK", b"\x80\x02"):  # what torch.save writes, or wrote
         return Weights(tensors=_foreign(content, path), meta={}, path=path)
     try:
-        tensors = load(content)
         length = int.from_bytes(content[:8], "little")
-        header = parsed_json(content[8 : 8 + length])
-        meta = parsed_json(header.get("__metadata__", {}).get(_META, "{}").encode())
-        if not isinstance(meta, dict):
-            raise ValueError("its notes are no JSON object")
-    except (SafetensorError, ValueError) as error:
-        raise ConfigError(f"{path}: is no file of weights ({error}); give a safetensors file, or a .pth") from error
+        if length > _HEADER:
+            raise ValueError(f"its header would have {length:,} bytes")
+        header = parsed_record(content[8 : 8 + length], _Header)
+        meta = as_record(parsed_json(header.metadata.get(_META, "{}").encode()), dict[str, Any])
+        tensors: dict[str, Tensor] = load(content)
+        for name, each in tensors.items():
+            if str(each.dtype).removeprefix("torch.") not in SIZES:
+                raise ValueError(f"{shortened(name)!r} has numbers of {each.dtype}")
+    except _FAULTS as error:
+        raise ConfigError(
+            f"{path}: is no file of weights ({reason_of(error)}); give a safetensors file, or a .pth"
+        ) from error
     return Weights(tensors=tensors, meta=meta, path=path)
+
+
+def reason_of(error: Exception) -> str:
+    """What an error says, for a message: the first line, and not all of a long one."""
+    return shortened(fault_text(error).splitlines()[0], MOST_TOLD)
 
 
 def write_weights(path: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], *, half: bool = False) -> None:
@@ -164,44 +188,59 @@ def _difference(
     """What keeps weights from fitting a model, with the remedy."""
     told = []
     if other:
-        shapes = f"{other[0]} is {tuple(weights.tensors[other[0]].shape)}, not {tuple(own[other[0]].shape)}"
+        found = shortened(str(tuple(weights.tensors[other[0]].shape)))
+        shapes = f"{other[0]} is {found}, not {tuple(own[other[0]].shape)}"
         told.append(f"{len(other)} tensors have another shape ({shapes})")
     if missing:
         told.append(f"{len(missing)} of the model are missing ({_some(missing)})")
     if unused:
         told.append(f"{len(unused)} are not the model's ({_some(unused)})")
     preset = weights.meta.get("preset")
-    whose = f"weights of the preset {preset!r}" if preset else "weights"
+    whose = f"weights of the preset {shortened(repr(preset))}" if preset else "weights"
     return (
         f"{whose} do not fit this model: {', '.join(told)}; give the preset and the options that they were trained with"
     )
 
 
 def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:_TOLD]) + (f", … ({len(names)})" if len(names) > _TOLD else "")
+    return ", ".join(map(shortened, names[:_TOLD])) + (f", … ({len(names)})" if len(names) > _TOLD else "")
 
 
 def _foreign(content: bytes, path: Path) -> dict[str, Tensor]:
     """A foreign checkpoint's tensors under our names."""
     try:
-        found = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConfigError(f"{path}: is no plain checkpoint ({reason}); give one that holds tensors alone") from error
-    for name in ("state_dict", "model"):  # mmcv's, Swin's
-        if isinstance(found, dict) and isinstance(found.get(name), dict):
-            found = found[name]
-    tensors = (
-        {name: each for name, each in found.items() if isinstance(each, Tensor)} if isinstance(found, dict) else {}
-    )
-    if not tensors:
+        found, storages = read_checkpoint(content)
+        for name in ("state_dict", "model"):  # mmcv's, Swin's
+            if isinstance(found, dict) and isinstance(found.get(name), dict):
+                found = found[name]
+        pairs = found.items() if isinstance(found, dict) else ()
+        stored = {name: each for name, each in pairs if isinstance(name, str) and isinstance(each, StoredTensor)}
+        if sum(each.size for each in stored.values()) > _FACTOR * len(content) + _ROOM:
+            raise ValueError("its tensors are far larger than the file")
+        named = {name.removeprefix("module."): each for name, each in _made(stored, storages).items()}
+        if "patch_embed.proj.weight" in named:
+            named = from_official(named)
+    except _FAULTS as error:
+        raise ConfigError(
+            f"{path}: is no plain checkpoint ({reason_of(error)}); give one that holds tensors alone"
+        ) from error
+    if not named:
         raise ConfigError(f"{path}: holds no tensors by name; give a state dict")
-    named = {name.removeprefix("module."): each for name, each in tensors.items()}
-    if "patch_embed.proj.weight" in named:
-        named = from_official(named)
     if not any("." in name and name.split(".")[0] in _PARTS for name in named):
         named = {f"img_backbone.{name}": each for name, each in named.items()}  # an image encoder alone
     return named
+
+
+def _made(stored: Mapping[str, StoredTensor], storages: Storages) -> dict[str, Tensor]:
+    """Tensors, of which those of one storage share its memory; raises one of `_FAULTS`."""
+    contents = {name: bytearray(storages(name)) for name in {each.storage for each in stored.values()}}
+    tensors = {}
+    for name, each in stored.items():
+        content, dtype = contents[each.storage], getattr(torch, each.dtype)
+        whole = torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
+        # which refuses, before anything is made, what reaches beyond the storage
+        tensors[name] = whole.as_strided(each.shape, each.strides, each.offset)
+    return tensors
 
 
 _PARTS: Final = ("img_backbone", "img_neck", "transformer", "temporal_model", "pts_bbox_head")

@@ -7,11 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, get_args
+from typing import Annotated, Any, Final, get_args
+
+import msgspec
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
 from deepaccident_devkit.model.checkpoint import load_weights, read_weights
 from deepaccident_devkit.model.config import ModelConfig
@@ -41,6 +44,14 @@ from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, ModelFusion, ModelPreset
 from deepaccident_devkit.text import choice as chosen_word
 from deepaccident_devkit.text import settle_choices
+
+
+class _Described(msgspec.Struct):
+    """A `ModelChoice` in the notes of weights; all of it must be there."""
+
+    preset: ModelPreset
+    fusion: ModelFusion | None
+    horizon: Annotated[float, msgspec.Meta(gt=0, lt=1000)] | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,8 +100,8 @@ class ModelChoice:
             ConfigError: they do not describe one.
         """
         try:
-            return cls(**{name: described[name] for name in ("preset", "fusion", "horizon")})
-        except (KeyError, TypeError, ValueError) as error:
+            return cls(**msgspec.structs.asdict(as_record(described, _Described)))
+        except ValueError as error:
             raise ConfigError(
                 f"{path}: does not say which model its weights are of ({error}); give weights of deepaccident train, "
                 "or begin a training from these: deepaccident train --from"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -41,10 +41,10 @@ class MotionLabelConfig:
         future_frames: frames after the present that labels show.
         step: recorded frames (0.1 s) from one label frame to the next; 5 is 2 Hz.
         only_vehicle: leave out pedestrians (two-wheelers are vehicles, as in all three codes).
-        filter_invisible: rasterise only what the cooperating agents see by the released rule (docs/released_code.md,
-            Visibility and attributes).
-        agents: the agents whose sight counts; None for all that are there, as in the released code. Names are
-            kept as a tuple, and `available` as None.
+        filter_invisible: rasterise only what the cooperating agents see, by the protocol's `sight`
+            (docs/released_code.md, Visibility and attributes).
+        agents: the agents whose sight counts; None for all that are there, as in the released code; `single` for the
+            sample's own alone, as in FIERY. Names are kept as a tuple, and `available` as None.
         draw_ego: rasterise the ego's own box (the infrastructure has none).
         ignore_index: the value of offset and flow outside instances, and of missing frames that are ignored: 255, or a
             number of at least the grid's longer side in cells, which no vector can have.
@@ -130,11 +130,19 @@ class MotionLabelConfig:
         return range(-(self.receptive_field - 1) * self.step, self.future_frames * self.step + 1, self.step)
 
     def as_dict(self) -> dict[str, Any]:
-        """All that affects the labels' values, in types that JSON has; the protocol as its switches."""
+        """All that affects the labels' values, in types that JSON has; the protocol as its switches.
+
+        A switch with a default is younger than the first label files. It is there only with another value, so that a
+        configuration of then has the same digest now.
+        """
         described = asdict(self)
         described["grid"] = {"x": list(self.grid.x), "y": list(self.grid.y)}
         described["orientation"] = self.grid.orientation
-        described["protocol"] = asdict(self.rules)
+        described["protocol"] = {
+            one.name: getattr(self.rules, one.name)
+            for one in fields(self.rules)
+            if getattr(self.rules, one.name) != one.default
+        }
         described["agents"] = _agents_text(self.agents)
         return described
 
@@ -241,7 +249,7 @@ PRESETS: Final[Mapping[str, MotionLabelConfig]] = MappingProxyType(
             for seconds in (3, 4, 5)
         },
         "beverse": _BEVERSE,
-        "fiery": replace(_BEVERSE, protocol="fiery", orientation="fiery"),
+        "fiery": replace(_BEVERSE, agents="single", protocol="fiery", orientation="fiery"),
     }
 )
 """The released labels (2 s ahead), the same 3, 4 and 5 s ahead, and those of the two codes that it is based on."""

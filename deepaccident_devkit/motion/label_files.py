@@ -22,7 +22,7 @@ import numpy as np
 from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, LabelFilesError, NotAvailableError, TokenError
-from deepaccident_devkit.files import replacing
+from deepaccident_devkit.files import place_in, replacing
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.label_folder import (
@@ -110,6 +110,7 @@ def write_label_files(  # noqa: PLR0913 - what, where, on what, and which part
     Raises:
         ConfigError: the folder holds labels of another configuration, or with other names; it is left as it is.
         LabelFilesError: the folder holds something else, its manifest cannot be read, or it cannot be written to.
+        OutputFolderError: a link in the folder leads out of it; nothing is written there.
         TokenError: no such sample.
         ChoiceError: no sample at all, or no such agent, configuration of agents, code, or part.
         NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
@@ -286,7 +287,8 @@ class _Work:
             return False
         if self.merge:
             return None
-        with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        place = place_in(self.root, path.relative_to(self.root))
+        with replacing(place) as temporary, zipfile.ZipFile(temporary, "w") as archive:
             if self.names is None:
                 write_array(archive, "config", np.array(self.config.digest))
                 write_array(archive, "source", np.array(source))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, LabelFilesError
-from deepaccident_devkit.files import held_lock, temporary_of, write_bytes
+from deepaccident_devkit.files import held_lock, path_of, place_in, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig
@@ -127,9 +127,11 @@ def writing_to(root: Path, *, shared: bool = False) -> Iterator[None]:
 
     Raises:
         LabelFilesError: the folder cannot be made, locked or written to.
+        OutputFolderError: its lock is a link.
     """
+    path = place_in(root, _LOCK, opened=True)
     try:
-        lock = held_lock(root / _LOCK, "writes labels", shared=shared)
+        lock = held_lock(path, "writes labels", shared=shared)
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise LabelFilesError(f"{root}: no labels can be written there ({error}); choose another folder") from error
     tidy = (lambda _: None) if shared else _remove_half_written
@@ -147,10 +149,8 @@ def writing_to(root: Path, *, shared: bool = False) -> Iterator[None]:
 
 
 def folder_path(folder: str | os.PathLike[str]) -> Path:
-    """The absolute path of a given folder; raises LabelFilesError if it is empty."""
-    if not os.fspath(folder):
-        raise LabelFilesError("expected a folder of motion labels, found an empty path; give '.' for the current one")
-    return Path(folder).expanduser().absolute()
+    """The absolute path of a given folder; raises LabelFilesError if it is no path."""
+    return path_of(folder, "expected a folder of motion labels", error=LabelFilesError).absolute()
 
 
 def label_path(root: Path, recording: str) -> Path:
@@ -168,10 +168,10 @@ def _remove_half_written(root: Path) -> None:
 
     The lock is held, so that no living process has one, on whatever host.
     """
-    with suppress(OSError):
-        for path in [path for folder in ("", "*/*/", "*/*/*/") for path in root.glob(f"{folder}.*.tmp")]:
-            if _is_half_written(path.name):
-                path.unlink(missing_ok=True)
+    for folder, _, names in os.walk(root):  # follows no link
+        for name in filter(_is_half_written, names):
+            with suppress(OSError):
+                Path(folder, name).unlink()
 
 
 def _is_own(name: str) -> bool:

@@ -15,10 +15,14 @@ from deepaccident_devkit.text import choice
 WarpRule = Literal["stretched", "exact", "fiery"]
 """How a raster is sampled when it is warped to another frame: see `motion.warps.warping`."""
 DrawnWhen = Literal["present", "since", "now"]
+SightRule = Literal["released", "camera"]
+PoseRule = Literal["whole", "yaw"]
 _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "warp": get_args(WarpRule),
     "drawn_when": get_args(DrawnWhen),
     "native": ORIENTATIONS,
+    "sight": get_args(SightRule),
+    "pose": get_args(PoseRule),
 }
 
 
@@ -56,6 +60,13 @@ class LabelProtocol:
         native: the orientation in which corners are rounded, centres are computed and rasters are sampled; boxes and
             motions have its handedness in these steps. The warp `fiery` needs `fiery`. It decides how halves of a cell
             are rounded; `MotionLabelConfig.grid` has the orientation of the labels.
+        sight: when an agent sees an actor: `released`, by points and cameras, and untracked rows never; `camera`, where
+            a camera of the agent sees it (FIERY drops nuScenes' visibility 1). An untracked row is then seen by the
+            sample's own agent alone.
+        pose: how boxes come to the ego's frame: `whole`, by the whole pose, each as an upright box there; `yaw`
+            (FIERY), by the position and the yaw of the pose alone, in double precision, so that a box that leans has
+            the footprint of its leaning bottom. The yaw is the sixth number of the pose's 6-vector, which differs from
+            the heading where the agent leans.
     """
 
     own_box_moved_twice: bool
@@ -70,6 +81,8 @@ class LabelProtocol:
     ids_kept_between_samples: bool
     warp: WarpRule
     native: Orientation
+    sight: SightRule = "released"
+    pose: PoseRule = "whole"
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
@@ -110,7 +123,16 @@ _RELEASED: Final = LabelProtocol(
     warp="stretched",
     native="released",
 )
-_FIERY: Final = replace(_RELEASED, drawn_when="now", missing_frames_are_empty=False, warp="fiery", native="fiery")
+_FIERY: Final = replace(
+    _RELEASED,
+    drawn_when="now",
+    untracked_share_an_id=False,
+    missing_frames_are_empty=False,
+    warp="fiery",
+    native="fiery",
+    sight="camera",
+    pose="yaw",
+)
 LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
     {
         "released": _RELEASED,
@@ -128,7 +150,14 @@ LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
             warp="exact",
             native="released",
         ),
-        "beverse": replace(_FIERY, ids_kept_between_samples=False, warp="stretched", native="devkit"),
+        "beverse": replace(
+            _RELEASED,
+            drawn_when="now",
+            missing_frames_are_empty=False,
+            ids_kept_between_samples=False,
+            warp="stretched",
+            native="devkit",
+        ),
         "fiery": _FIERY,
     }
 )

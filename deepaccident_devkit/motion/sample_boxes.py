@@ -12,7 +12,8 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.geometry.se3 import stored_transforms
+from deepaccident_devkit.geometry import six_vectors
+from deepaccident_devkit.geometry.se3 import inverses, stored_transforms
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes
 from deepaccident_devkit.motion.warps.chains import egomotion
@@ -77,10 +78,14 @@ def _frames(
     actors = [boxes["actor_id"][one] for one in slices]
     visible = [np.ones(len(actor), dtype=bool) for actor in actors]
     if config.filter_invisible:
-        mask = np.isin(_pairs(actors), _seen(dataset, sample, index, config))
+        mask = np.isin(_pairs(actors, slices), _seen(dataset, sample, index, config))
         visible = np.split(mask, np.cumsum([len(actor) for actor in actors])[:-1])
     lidars = rows * len(CHANNELS) + CHANNELS.index(LIDAR)
     ego_from_lidar = stored_transforms(dataset.columns("sample_data")["matrix"][lidars])
+    if config.rules.pose == "yaw":
+        world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
+        world_from_level = six_vectors.from_matrices(world_from_ego) * (1, 1, 1, 0, 0, 1)
+        ego_from_lidar = inverses(six_vectors.to_matrices(world_from_level)) @ world_from_ego @ ego_from_lidar
     return [
         FrameBoxes(
             center=boxes["translation"][one],
@@ -110,9 +115,9 @@ def _seen(dataset: Dataset, sample: RowArgument, index: IntArray, config: Motion
             np.concatenate([boxes[name][one] for one in slices]) for name in _VISIBILITY_COLUMNS
         )
         actor = np.concatenate(actors)
-        mask = visible_mask(center[:, :2], category, points, camera, infrastructure=agent == INFRASTRUCTURE)
-        mask &= (actor != OWN_ACTOR_ID) & (actor != UNTRACKED_ID)
-        pairs.append(_pairs(actors)[mask])
+        by_points = visible_mask(center[:, :2], category, points, camera, infrastructure=agent == INFRASTRUCTURE)
+        mask = camera if config.rules.sight == "camera" else by_points & (actor != UNTRACKED_ID)
+        pairs.append(_pairs(actors, slices)[mask & (actor != OWN_ACTOR_ID)])
     return np.concatenate(pairs)
 
 
@@ -124,8 +129,12 @@ def _annotations(dataset: Dataset, rows: IntArray) -> list[slice]:
     return [slice(start, start + length) for start, length in zip(first, count, strict=True)]
 
 
-def _pairs(actors: list[AnyArray]) -> IntArray:
-    """One number for each row of `actors`, frame by frame: it stands for the pair of actor and frame."""
+def _pairs(actors: list[AnyArray], slices: list[slice]) -> IntArray:
+    """One number for each row of `actors`, frame by frame: it stands for the pair of actor and frame.
+
+    An untracked row is an actor of its own; `slices` has the rows in the annotation table.
+    """
+    actor, row = np.concatenate(actors), np.concatenate([np.arange(one.start, one.stop) for one in slices])
     number = np.repeat(np.arange(len(actors)), [len(actor) for actor in actors])
-    pairs: IntArray = np.concatenate(actors) * len(actors) + number
+    pairs: IntArray = np.where(actor == UNTRACKED_ID, OWN_ACTOR_ID - 1 - row, actor) * len(actors) + number
     return pairs

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, CancelledError
 from contextlib import contextmanager, suppress
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import DeepAccidentError, MissingExtraError, WorkerError
+from deepaccident_devkit.reading import MOST_TOLD, fault_text, shortened
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -23,7 +23,6 @@ logger = logging.getLogger(__name__)
 
 _USUAL_WIDTH: Final = 64
 """Tasks at once of an executor that does not say it."""
-_FILE_SECONDS: Final = 10.0
 MPI: Final = "mpi"
 _PACKAGE: Final = __name__.partition(".")[0]
 
@@ -105,11 +104,14 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
     place = str(scheduler_file or address)
     try:
         if scheduler_file is not None:
-            _wait_for(scheduler_file)
-        client = _made(Client, address=address, scheduler_file=scheduler_file, set_as_default=False)
-    except (OSError, ValueError, TypeError, KeyError, AssertionError) as error:  # the last ones: an odd file
+            from deepaccident_devkit.parallel.scheduler_file import address_in  # it brings msgspec
+
+            address = address_in(scheduler_file)
+        client = _made(Client, address=address, set_as_default=False)
+    except Exception as error:  # of an odd address dask raises many kinds
+        said = shortened(fault_text(error), MOST_TOLD)
         raise WorkerError(
-            f"{place}: no dask scheduler answers ({error}); start one with `dask scheduler`, and give its address"
+            f"{place}: no dask scheduler answers ({said}); start one with `dask scheduler`, and give its address"
         ) from error
     with client:
         _check_workers(client, place)
@@ -126,15 +128,6 @@ def _made(kind: Any, **options: Any) -> Client:
             client.close(timeout=1)
         raise
     return client
-
-
-def _wait_for(file: Path) -> None:
-    """Wait for a file that a scheduler which has just begun may not have written yet; dask would wait for ever."""
-    end = time.monotonic() + _FILE_SECONDS
-    while not file.is_file():
-        if time.monotonic() > end:
-            raise FileNotFoundError("there is no such file")
-        time.sleep(0.1)
 
 
 def _check_workers(client: Client, place: str) -> None:

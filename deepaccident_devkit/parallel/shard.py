@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError, UnfinishedError
+from deepaccident_devkit.files import place_in, remove_in
 
 Item = TypeVar("Item")
 MERGE: Final = "merge"
@@ -115,12 +115,12 @@ class ShardFiles:
     def remove(self) -> None:
         """Remove them, once the whole is written."""
         for path in self.found():
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+            remove_in(self.folder, path.name)
         with suppress(OSError):  # missing, or something else lies there
             self.folder.rmdir()
 
 
 def unfinished_folder(out: Path) -> Path:
-    """The folder beside `out` for what is not finished."""
+    """The folder beside `out` for what is not finished; raises OutputFolderError if it is a link."""
     place = out.absolute()
-    return place.with_name(f"{place.name}.unfinished")
+    return place_in(place.parent, f"{place.name}.unfinished", opened=True)

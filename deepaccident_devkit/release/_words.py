@@ -1,10 +1,22 @@
-"""Numbers in text files: their words as the release writes them, of any length."""
+"""Numbers in the release's files: the largest that count, and their words in text files, of any length."""
 
 import re
 from typing import Final
 
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray
+
 _NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+LARGEST: Final = 1e9
+"""Metres, m/s, pixels, …: a larger number is damage and counts as infinite; it would overflow where it is squared."""
 _INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
+
+
+def in_range(numbers: AnyArray | float) -> BoolArray:
+    """Which numbers are neither NaN nor infinite, nor as large as no sound file has them."""
+    small: BoolArray = np.abs(numbers) <= np.float64(LARGEST)  # half precision has no 1e9
+    return small
 
 
 def number_of(word: str) -> float | None:

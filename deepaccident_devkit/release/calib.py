@@ -15,6 +15,7 @@ from deepaccident_devkit.geometry import SE3, handedness
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release._unpickle import load_arrays
+from deepaccident_devkit.release._words import LARGEST, in_range
 from deepaccident_devkit.release.pickles import pickled
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -88,8 +89,8 @@ def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, Any
 
     Raises:
         MissingFileError: there is no such file.
-        CalibError: it is damaged, lacks a key, holds an array of a wrong shape, NaN or a transform that is not rigid,
-            or asks for anything but numpy arrays to be made (nothing of such a file is run).
+        CalibError: it is damaged, lacks a key, holds an array of a wrong shape, NaN, a number beyond 1e9 or a transform
+            that is not rigid, or asks for anything but numpy arrays to be made (nothing of such a file is run).
     """
     if raw:
         return read_calibs([path], raw=True)[0]
@@ -174,7 +175,7 @@ def _converted(paths: Sequence[ReleasePath], files: Sequence[Mapping[str, AnyArr
 
     poses, intrinsics = stacked(_POSE_KEYS, (4, 4)), stacked(_INTRINSIC_KEYS, (3, 3))
     rigid = _surely_rigid(poses).all(axis=1)
-    finite = np.isfinite(intrinsics).all(axis=(1, 2, 3))
+    finite = in_range(intrinsics).all(axis=(1, 2, 3))
     for index in np.flatnonzero(~(rigid & finite)).tolist():
         fault = _first_value_fault(poses[index], intrinsics[index])
         if fault:
@@ -194,15 +195,15 @@ def _surely_rigid(poses: FloatArray) -> BoolArray:
     with np.errstate(invalid="ignore", over="ignore"):
         off = np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max(axis=(-1, -2))
         proper = (off < RIGID_TOLERANCE / 2) & (np.linalg.det(turns) > 0)
-    sure: BoolArray = proper & np.isfinite(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1)
+    sure: BoolArray = proper & in_range(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1)
     return sure
 
 
 def _first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:
     faults = [f"{key}: {fault}" for key, pose in zip(_POSE_KEYS, poses, strict=True) if (fault := rigid_fault(pose))]
     faults += [
-        f"{key}: holds NaN or infinity"
-        for key, intrinsic in zip(_INTRINSIC_KEYS, intrinsics, strict=True)
-        if not np.isfinite(intrinsic).all()
+        f"{key}: holds NaN or infinity, or a number beyond {LARGEST:.0e}"
+        for key, matrix in zip((*_POSE_KEYS, *_INTRINSIC_KEYS), (*poses, *intrinsics), strict=True)
+        if not in_range(matrix).all()
     ]
     return faults[0] if faults else None

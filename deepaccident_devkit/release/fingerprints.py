@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -13,9 +13,9 @@ from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import FileKind
 from deepaccident_devkit.release._content import read_content
-from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers
+from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers, frame_sizes
 from deepaccident_devkit.release.store import ReleasePath, places_of
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -103,6 +103,19 @@ def folder_hashes(scenario: ScenarioFolder) -> ScenarioHashes:
         meta=_digest(meta, "meta", scenario.meta_path.parent),
         **{kind: _digest(_files(scenario, kind), kind, _base(scenario)) for kind in _ENDINGS},
     )
+
+
+def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) -> str:
+    """A hash of the frames and sizes of a scenario's sensor files of some agents and channels; folders are only listed.
+
+    Raises:
+        DatarootError: one of its folders cannot be listed.
+    """
+    sizes = [
+        (agent, channel, list(frame_sizes(scenario.kind_folder(agent, channel), CHANNEL_FORMAT[channel]).items()))
+        for agent, channel in sensors
+    ]
+    return digest_of(sizes)
 
 
 def fingerprint(hashes: Mapping[str, ScenarioHashes]) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import MOST_TOLD, check_size, fault_text, shortened
+from deepaccident_devkit.reading import MOST_TOLD, check_size, fault_text, open_file, shortened
 from deepaccident_devkit.release._content import read_content
-from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.release.store import ReleasePath, real_path
 
 JPEG_QUALITY = 90
 _DAMAGED = (OSError, SyntaxError, ValueError, struct.error, EOFError, MemoryError, OverflowError, zlib.error)
@@ -76,6 +76,17 @@ def decode_image(
         return np.array(picture)
 
 
+def image_size(path: ReleasePath, content: bytes | None = None) -> tuple[int, int]:
+    """Width and height that an image's head says, of its bytes if they are known; a real file is read no further.
+
+    Raises SensorFileError, as `read_image` does.
+    """
+    if content is None and not isinstance(path, Path):
+        content = read_image_bytes(path)
+    with _opened(path, content, _FORMATS) as image:
+        return image.width, image.height
+
+
 def read_jpeg(path: ReleasePath) -> tuple[bytes, tuple[int, int]]:
     """A JPEG file's bytes, and the width and height that its head says; the picture itself is not decoded.
 
@@ -104,13 +115,14 @@ def encode_jpeg(path: ReleasePath, image: ByteArray, quality: int = JPEG_QUALITY
 
 
 @contextmanager
-def _opened(path: ReleasePath, content: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
-    """Pillow's image of a file's bytes, which is not too large; what it raises becomes SensorFileError."""
+def _opened(path: ReleasePath, content: bytes | None, formats: tuple[str, ...]) -> Iterator[Any]:
+    """Pillow's image of a file's bytes (None: a real file's), not too large; what it raises becomes SensorFileError."""
     from PIL import Image, UnidentifiedImageError
 
     bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)
     try:
-        with Image.open(BytesIO(content), formats=formats) as image:
+        file = open_file(real_path(path)) if content is None else BytesIO(content)
+        with file, Image.open(file, formats=formats) as image:
             check_size(_BYTES_A_PIXEL * image.width * image.height, "image", "its picture")
             yield image
     except (*_DAMAGED, *bombs) as error:

@@ -5,7 +5,6 @@ this call cannot read (CRLF, blanks at line ends, one-token lines, faults) are t
 """
 
 import codecs
-import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -20,7 +19,7 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes, handedness, quaternions
 from deepaccident_devkit.reading import LIMITS_VARIABLE, limit_of, shortened
 from deepaccident_devkit.release._content import read_content
-from deepaccident_devkit.release._words import integer_of, number_of
+from deepaccident_devkit.release._words import LARGEST, in_range, integer_of, number_of
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import CATEGORIES
 
@@ -49,13 +48,13 @@ class Labels(ShortRepr):
     Attributes:
         raw: whether the values are the files' own.
         num_boxes: (F,) int64, boxes of each file.
-        agent_velocity: (F, 2) float64, m/s, the recording agent's velocity in the world frame.
+        agent_velocity: (F, 2) float64, m/s, the recording agent's velocity in the world frame; NaN as well.
         category: (N,) int8, index into `taxonomy.CATEGORIES`.
         center: (N, 3) float64, metres, box centre in the agent's LiDAR frame.
         size: (N, 3) float64, full length, width, height, metres.
         yaw: (N,) float64, radians about z in the LiDAR frame.
-        velocity: (N, 2) float64, m/s, as the label says; NaN where the label's is NaN or infinite. The world's, turned
-            once more by `yaw` (`world_from_label_velocity`).
+        velocity: (N, 2) float64, m/s, as the label says; NaN where the label's is NaN, infinite or beyond 1e9. The
+            world's, turned once more by `yaw` (`world_from_label_velocity`).
         actor_id: (N,) int64; −100 the recording agent, −1 untracked, from 20000 on parked.
         num_lidar_pts: (N,) int64.
         camera_visible: (N,) bool.
@@ -122,7 +121,8 @@ def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
     Raises:
         MissingFileError: a file is not there.
         LabelError: a file is truncated or too large, or a line has another number of fields, a word where a number
-            belongs, an unknown class, NaN or infinity in a position, size or yaw; the message names file and line.
+            belongs, an unknown class, NaN, infinity or more than 1e9 in a position, size or yaw; the message names file
+            and line.
     """
     parts = _parse_batches([paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)])
     parts = parts or [_columns_of(_parse_body(b""), _parse_header(b""), np.zeros(0, dtype=np.int64))]
@@ -298,10 +298,12 @@ def _columns_of(body: Any, header: Any, num_boxes: IntArray) -> dict[str, AnyArr
         return np.column_stack([table[name].to_numpy() for name in names])
 
     velocity = numbers(body, ("vx", "vy"))
-    velocity[~np.isfinite(velocity)] = np.nan
+    velocity[~in_range(velocity)] = np.nan
+    agent_velocity = numbers(header, _HEADER)
+    agent_velocity[~in_range(agent_velocity)] = np.nan
     return {
         "num_boxes": num_boxes,
-        "agent_velocity": numbers(header, _HEADER),
+        "agent_velocity": agent_velocity,
         "category": _category_codes(body["class"]),
         "center": numbers(body, ("x", "y", "z")),
         "size": numbers(body, ("l", "w", "h")),
@@ -323,7 +325,7 @@ def _category_codes(column: Any) -> AnyArray:
 
 
 def _has_fault(columns: dict[str, AnyArray]) -> bool:
-    values_good = all(np.isfinite(columns[name]).all() for name in ("center", "size", "yaw"))
+    values_good = all(in_range(columns[name]).all() for name in ("center", "size", "yaw"))
     return not values_good or bool((columns["category"] < 0).any())
 
 
@@ -400,8 +402,8 @@ def _field_fault(name: str, word: str) -> str | None:
         number = number_of(word)
         if number is None:
             expected = "a number"
-        elif name in _FINITE_FIELDS and not math.isfinite(number):
-            expected = "a finite number"
+        elif name in _FINITE_FIELDS and not in_range(number):
+            expected = f"a finite number up to {LARGEST:.0e}"
     return expected and f"{name} is {shortened(word)!r}, expected {expected}"
 
 

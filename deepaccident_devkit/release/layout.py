@@ -2,14 +2,15 @@
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import DatarootError, VersionError
-from deepaccident_devkit.release.store import Entry, ReleasePath, listed
+from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed
 from deepaccident_devkit.release.store.names import (
     MINI_FOLDER,
     SCENARIO_TYPE,
@@ -26,6 +27,13 @@ from deepaccident_devkit.taxonomy import (
 from deepaccident_devkit.text import spelled
 
 _UNLISTABLE_REMEDY = "unpack its archive again, or make it readable"
+_ABOVE_TYPES = (*SPLIT_FOLDERS, MINI_FOLDER)
+_IN_TYPE = ("meta", *AGENTS)
+_KINDS = ("calib", "label", *CHANNEL_FORMAT)
+_COPY = r"(?:Copy of )?({})(?:\W.*|_*\d.*|_+(?i:copy|part|old|new|backup)\w*)?"
+"""The names that browsers, drives and people give to a copy, or to a part, of a folder of some names."""
+_MOST_ASIDE = 3
+"""Folders that the error of a release without scenarios names at most."""
 _FRAME_FILE = re.compile(r"_(\d{3,})\.\w+")
 
 
@@ -110,14 +118,19 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
     if not _is_unicode(str(root)):
         raise DatarootError(f"{str(root)!r}: is not UTF-8, which Arrow needs a path to be; rename the folder")
     if not root.is_dir():
-        state = "is a file" if root.is_file() else "does not exist"
+        missing = "is a link that leads nowhere" if os.path.islink(str(root)) else "does not exist"  # noqa: PTH114
+        state = "is a file" if root.is_file() else missing
         raise DatarootError(f"{root}: {state}; give the folder that the release was unpacked into as dataroot")
     folders = _folders_of(root, version)
     scenarios = [scenario for folder in folders for scenario in _scenarios_in(root, folder)]
     if not scenarios:
+        aside = "".join(
+            f"; {path} {f'looks like {meant}: rename it' if meant else 'is a link that leads nowhere'}"
+            for path, meant in islice(left_aside(root), _MOST_ASIDE)
+        )
         raise DatarootError(
-            f"{root}: no scenario found; expected <scenario_type>/<agent>/calib/<scenario>/*.pkl below it, or below "
-            f"its folders {', '.join((*SPLIT_FOLDERS, MINI_FOLDER))} "
+            f"{root}: no scenario found{aside}; expected <scenario_type>/<agent>/calib/<scenario>/*.pkl below it, or "
+            f"below its folders {', '.join((*SPLIT_FOLDERS, MINI_FOLDER))} "
             "(unpack the calib archives, give a folder of zips alone, or make a small release with: deepaccident synth "
             "OUT)"
         )
@@ -213,11 +226,52 @@ def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[ReleasePath, st
             yield folder, name
 
 
+def left_aside(root: ReleasePath) -> Iterator[tuple[ReleasePath, str | None]]:
+    """What lies in a release and is not read, though it looks as if it should be.
+
+    Returns:
+        Each folder with a name that only looks like one of the release (downloads are unpacked beside each other as
+        `… (1)`, `…-001`), and what it looks like; each link that leads nowhere or back, and None.
+    """
+    splits = [root / name for name in _subfolders(root) if name in _ABOVE_TYPES]
+    yield from _aside_in(root, (SCENARIO_TYPE.pattern, *_ABOVE_TYPES))
+    for folder in splits:
+        yield from _aside_in(folder, (SCENARIO_TYPE.pattern,))
+    for of_type in (folder / name for folder in (root, *splits) for name in _scenario_types(folder)):
+        yield from _aside_in(of_type, _IN_TYPE)
+        for agent in (of_type / name for name in _subfolders(of_type) if name in AGENTS):
+            yield from _aside_in(agent, _KINDS)
+            for kind in (name for name in _subfolders(agent) if name in _KINDS):
+                yield from _aside_in(agent / kind, ())
+
+
+def _aside_in(folder: ReleasePath, known: Sequence[str]) -> Iterator[tuple[ReleasePath, str | None]]:
+    """What `left_aside` tells of one folder, in which these names (patterns) are read; of others only links."""
+    entries: list[Entry] = []
+    with suppress(DatarootError):  # told where its scenarios are read
+        entries = _entries_of_folder(folder)
+    for entry in sorted(entries, key=lambda entry: entry.name):
+        path, found = folder / entry.name, re.fullmatch(_COPY.format("|".join(known)), entry.name)
+        if leads_back(entry):
+            yield path, None
+        elif not known or entry.name.startswith(".") or not is_folder(entry) or (found and found[1] == entry.name):
+            continue
+        elif found and (found[1] not in _ABOVE_TYPES or _holds_types(path)):
+            yield path, found[1]
+        elif known is _IN_TYPE and {"calib", "label"}.intersection(_subfolders(path)):
+            yield path, f"an agent, of which the release has {', '.join(AGENTS)}"
+
+
+def _holds_types(folder: ReleasePath) -> bool:
+    """Whether scenario types lie in a folder, or in a split folder in it."""
+    return any(SCENARIO_TYPE.match(name) for below in ("", *_ABOVE_TYPES) for name in _subfolders(folder / below))
+
+
 def _folders_of(root: ReleasePath, version: str) -> list[str]:
     """The folders below the root, `""` for the root itself, that hold scenario types of this version."""
     flat = [""] if _scenario_types(root) else []
-    split = [name for name in SPLIT_FOLDERS if _scenario_types(root / name)]
-    mini = [MINI_FOLDER] if _scenario_types(root / MINI_FOLDER) else []
+    split = [name for name in _subfolders(root) if name in _ABOVE_TYPES and _scenario_types(root / name)]
+    mini = [split.pop(split.index(MINI_FOLDER))] if MINI_FOLDER in split else []
     root_is_mini = root.resolve().name == MINI_FOLDER
     if version == "v1":
         return flat + split or mini
@@ -239,7 +293,7 @@ def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
         closed: DatarootError | None = None
         for agent in AGENTS:
             try:
-                names = _subfolders(root / folder / scenario_type / agent / "calib")
+                names = _subfolders(root / folder / scenario_type / agent / "calib", loops=True)
             except DatarootError as error:  # scenarios that other agents name report this themselves when they are read
                 closed, names = error, []
             for name in names:
@@ -250,10 +304,13 @@ def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
             yield ScenarioFolder(root, folder, scenario_type, name, tuple(agents))
 
 
-def _subfolders(folder: ReleasePath) -> list[str]:
-    """The folders in a folder; none where a file is in the way, which `frame_numbers` reports for each scenario."""
+def _subfolders(folder: ReleasePath, *, loops: bool = False) -> list[str]:
+    """The folders in a folder; none where a file is in the way, which `frame_numbers` reports for each scenario.
+
+    With `loops`, so are links to themselves, which `frame_numbers` reports, too.
+    """
     entries = _entries_of_folder(folder)
-    return [entry.name for entry in entries if not entry.name.startswith(".") and _may_be_folder(entry)]
+    return [entry.name for entry in entries if not entry.name.startswith(".") and is_folder(entry, loops=loops)]
 
 
 def _entries_of_folder(folder: ReleasePath) -> list[Entry]:
@@ -264,14 +321,6 @@ def _entries_of_folder(folder: ReleasePath) -> list[Entry]:
         if isinstance(error.__cause__, NotADirectoryError):
             return []
         raise
-
-
-def _may_be_folder(entry: Entry) -> bool:
-    """Whether an entry is a folder, or a link whose end cannot be found; listing that one tells why."""
-    try:
-        return entry.is_dir()
-    except OSError:
-        return True
 
 
 def _entries(folder: ReleasePath) -> list[Entry]:

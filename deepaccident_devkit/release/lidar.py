@@ -10,6 +10,7 @@ from deepaccident_devkit.arrays import AnyArray, checked
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.handedness import flip_points
+from deepaccident_devkit.release._words import in_range
 from deepaccident_devkit.release.npz import read_npz, write_npz
 from deepaccident_devkit.release.store import ReleasePath
 
@@ -22,7 +23,7 @@ def read_lidar(path: ReleasePath, *, raw: Literal[False] = False) -> LidarPointC
 @overload
 def read_lidar(path: ReleasePath, *, raw: Literal[True]) -> AnyArray: ...
 def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | AnyArray:
-    """A point cloud in its LiDAR frame, right-handed, metres.
+    """A point cloud in its LiDAR frame, right-handed, metres; NaN where the file has infinity or a number beyond 1e9.
 
     Args:
         path: the file.
@@ -40,6 +41,7 @@ def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | Any
         )
     if raw:
         return data
+    data = np.where(in_range(data), data, np.nan)
     return LidarPointCloud(flip_points(data[:, :3]), data[:, 3].astype(np.float32), "lidar")
 
 

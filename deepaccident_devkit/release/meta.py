@@ -1,6 +1,5 @@
 """`meta/<scenario>.txt`: how a scenario was set up and how it ended (docs/format.md, Meta)."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from deepaccident_devkit.errors import MetaError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release._content import read_lines
-from deepaccident_devkit.release._words import integer_of, number_of
+from deepaccident_devkit.release._words import LARGEST, in_range, integer_of, number_of
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
 
@@ -221,6 +220,7 @@ def _integer(where: str, what: str, word: str) -> int:
 
 def _finite(where: str, what: str, word: str) -> float:
     value = number_of(word)
-    if value is None or not math.isfinite(value):
-        raise MetaError(f"{where}: {what}: expected a finite number, found {shortened(word)!r}; {_REMEDY}")
+    if value is None or not in_range(value):
+        found = f"found {shortened(word)!r} (at most {LARGEST:.0e} counts)"
+        raise MetaError(f"{where}: {what}: expected a finite number, {found}; {_REMEDY}")
     return value

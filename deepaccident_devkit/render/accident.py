@@ -15,6 +15,7 @@ from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, COLLID
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.pair import PAIR_LAYERS, Pair, draw_pair_from_above, draw_pair_in_camera, number_words
 from deepaccident_devkit.render.roles import in_drawing_order, short_name
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
@@ -40,6 +41,7 @@ _MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "s
 _DASHES: Final = ("-", "--")
 
 
+@in_own_settings
 def render_accident(
     dataset: Dataset,
     scenario: RowArgument,

@@ -18,6 +18,7 @@ from deepaccident_devkit.render.camera import draw_image
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.roles import role_colors, short_name
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.v2x.projection import camera_of
 
@@ -30,6 +31,7 @@ _LETTERS_AN_INCH: Final = 12
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "bev", "points", "boxes", "grid")
 
 
+@in_own_settings
 def render_annotation(
     dataset: Dataset,
     annotation: RowArgument,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Literal
 
 from deepaccident_devkit.errors import ChoiceError
@@ -20,7 +21,10 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (8, 8)) -> Axes:
         return ax
     from matplotlib import pyplot as plt
 
-    return plt.subplots(figsize=size_in_style(size, panels="one"), layout="constrained")[1]
+    from deepaccident_devkit.render.own_figure import OwnFigure
+
+    inches = size_in_style(size, panels="one")
+    return plt.subplots(figsize=inches, layout="constrained", FigureClass=OwnFigure)[1]
 
 
 def figure_or_new(fig: Figure | None, size: tuple[float, float]) -> Figure:
@@ -29,7 +33,9 @@ def figure_or_new(fig: Figure | None, size: tuple[float, float]) -> Figure:
         return fig
     from matplotlib import pyplot as plt
 
-    return plt.figure(figsize=size_in_style(size, panels="several"), layout="constrained")
+    from deepaccident_devkit.render.own_figure import OwnFigure
+
+    return plt.figure(figsize=size_in_style(size, panels="several"), layout="constrained", FigureClass=OwnFigure)
 
 
 def axis_words(frame: str) -> tuple[str, str]:
@@ -52,9 +58,9 @@ def titled_from_above(ax: Axes, title: str, *, grid: bool) -> Axes:
 
 def detached_figure(size: tuple[float, float]) -> Figure:
     """A figure that pyplot does not know, for files: pyplot does not keep it, and no display is needed."""
-    from matplotlib.figure import Figure
+    from deepaccident_devkit.render.own_figure import OwnFigure
 
-    return Figure(figsize=size, layout="constrained")
+    return OwnFigure(figsize=size, layout="constrained")
 
 
 def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
@@ -73,6 +79,7 @@ def settled(fig: Figure, passes: int = 1) -> Figure:
     """
     engine = fig.get_layout_engine() if fig.figure is fig else None  # a part of a figure is laid out with it
     if engine is not None:
-        for _ in range(passes):
-            engine.execute(fig)
+        with getattr(fig, "settings", nullcontext)():
+            for _ in range(passes):
+                engine.execute(fig)
     return fig

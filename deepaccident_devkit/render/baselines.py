@@ -14,6 +14,7 @@ from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure
 from deepaccident_devkit.render.colors import CONFIGURATION_COLORS, OWN_COLOR, PREDICTED_COLOR
 from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.styles import in_own_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,6 +49,7 @@ class Panel:
     intervals: Mapping[str, Mapping[str | float, tuple[float, float]]] = field(default_factory=dict)
 
 
+@in_own_settings
 def render_panel(panel: Panel, *, ax: Axes | None = None) -> Axes:
     """Render a panel.
 
@@ -68,6 +70,7 @@ def render_panel(panel: Panel, *, ax: Axes | None = None) -> Axes:
     return with_light_grid(ax, "y" if panel.xlabel is None else "both")
 
 
+@in_own_settings
 def render_panels(panels: Sequence[Sequence[Panel]], title: str, *, fig: Figure | None = None) -> Figure:
     """Render rows of panels under one title, with one legend.
 

@@ -30,6 +30,7 @@ from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend, handles_from_above
 from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import at_once, collider_ids, label_ids, recorder_ids, role_colors, short_name
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.render.town_map import draw_town_map, map_beneath
 from deepaccident_devkit.render.trails import draw_trails
@@ -114,6 +115,7 @@ class DrawnBev:
     clouds: tuple[AgentName, ...]
 
 
+@in_own_settings
 def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook
     dataset: Dataset,
     sample: RowArgument,

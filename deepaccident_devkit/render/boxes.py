@@ -13,6 +13,7 @@ from deepaccident_devkit.geometry import Box, Boxes, PinholeCamera
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
 from deepaccident_devkit.render.colors import CASING_COLOR, CATEGORY_COLORS, CATEGORY_MARKERS, OWN_COLOR
 from deepaccident_devkit.render.layers import Layer
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ NEAREST_DRAWN = 0.1
 """Metres in front of the camera at which edges are cut off."""
 
 
+@in_own_settings
 def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
     """Render one box from above, in its own frame's x and y, metres, with a line towards its front.
 

@@ -18,6 +18,7 @@ from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
 from deepaccident_devkit.render.moments import CAMERA_GRID
 from deepaccident_devkit.render.roles import at_once, in_drawing_order
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title, set_title
 from deepaccident_devkit.v2x import Agents, cooperating_agents, cooperative_boxes, project_to_image
 
@@ -32,6 +33,7 @@ _FARTHEST: Final = 60.0
 _COLUMNS: Final = 3
 
 
+@in_own_settings
 def render_calibration(
     dataset: Dataset,
     frame_or_sample: RowArgument,

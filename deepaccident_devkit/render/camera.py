@@ -29,6 +29,7 @@ from deepaccident_devkit.render.missing import (
     write_missing,
 )
 from deepaccident_devkit.render.roles import role_colors
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import moment_words, set_scene_title
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.text import choice
@@ -50,6 +51,7 @@ _HEIGHTS: Final = (-1.0, 6.0)
 """Metres above the origin of the camera's agent at which the colours of height begin and end."""
 
 
+@in_own_settings
 def render_sample_data(
     dataset: Dataset, sample_data: RowArgument, *, layers: Iterable[Layer] | None = None, ax: Axes | None = None
 ) -> Axes:
@@ -177,6 +179,7 @@ def draw_camera_boxes(
     return drawn
 
 
+@in_own_settings
 def render_pointcloud_in_image(
     dataset: Dataset,
     camera: RowArgument,

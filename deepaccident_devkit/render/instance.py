@@ -21,6 +21,7 @@ from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.roles import agent_actors, camera_name, in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sightings, sightings
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title, set_title
 from deepaccident_devkit.render.trails import draw_trail
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
@@ -40,6 +41,7 @@ _AROUND: Final = 10.0
 """At least so many metres are rendered around the path, on each side."""
 
 
+@in_own_settings
 def render_instance(
     dataset: Dataset,
     instance: RowArgument,

@@ -20,6 +20,7 @@ from deepaccident_devkit.render.colors import AGENT_COLORS, MUTED_COLOR, OWN_COL
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes
@@ -64,6 +65,7 @@ class SharedBoxes:
         return self.true.center[first, :2], self.received.center[second, :2]
 
 
+@in_own_settings
 def render_link(
     dataset: Dataset,
     sample: RowArgument,

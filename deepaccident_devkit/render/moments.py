@@ -14,6 +14,7 @@ from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, dra
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.legends import box_handles, draw_legend, handles_from_above
 from deepaccident_devkit.render.roles import at_once, in_drawing_order, short_name
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
@@ -47,6 +48,7 @@ _BESIDE, _ABOUT = 0.9, 1.6
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
 
 
+@in_own_settings
 def render_sample(
     dataset: Dataset,
     sample: RowArgument,
@@ -92,6 +94,7 @@ def render_sample(
     return fig
 
 
+@in_own_settings
 def render_frame(
     dataset: Dataset,
     frame: RowArgument,

@@ -14,6 +14,7 @@ from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.motion_cells import draw_key, draw_map_of, draw_trail_of
 from deepaccident_devkit.render.motion_maps import MAPS, DrawnMap, MotionMaps, maps_of_labels, maps_of_output
 from deepaccident_devkit.render.roles import collider_ids, recorder_ids
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.text import choice
 
@@ -34,6 +35,7 @@ _KEY_WIDTH: Final = 0.5
 """Width of the column that explains the colours, in widths of a panel."""
 
 
+@in_own_settings
 def render_motion_labels(
     dataset: Dataset,
     sample: RowArgument,
@@ -73,6 +75,7 @@ def render_motion_labels(
     return settled(fig) if style == "trail" else fig
 
 
+@in_own_settings
 def draw_motion_labels(
     labels: MotionLabels,
     *,
@@ -101,6 +104,7 @@ def draw_motion_labels(
     return _draw(maps_of_labels(labels, marked, agents), style, layers, fig)
 
 
+@in_own_settings
 def draw_motion_output(
     output: MotionOutput,
     *,
@@ -134,6 +138,7 @@ def draw_motion_output(
     return _draw(maps, style, layers, fig)
 
 
+@in_own_settings
 def draw_motion_map(
     labels: MotionLabels | MotionOutput,
     name: DrawnMap,
@@ -170,6 +175,7 @@ def draw_motion_map(
     return draw_map_of(maps, name, frame, shown, axes_or_new(ax))
 
 
+@in_own_settings
 def draw_motion_trail(
     labels: MotionLabels | MotionOutput,
     *,

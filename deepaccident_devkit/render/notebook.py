@@ -12,6 +12,7 @@ from deepaccident_devkit.render.axes import axis_words, detached_figure, with_li
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
 from deepaccident_devkit.render.colors import CATEGORY_COLORS, HEIGHT_COLORMAP
 from deepaccident_devkit.render.motion import draw_motion_trail
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.taxonomy import CAMERAS
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ _LETTERS: Final = 7
 _LEVEL_FROM_OPTICAL: Final = SE3.from_rotation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
+@in_own_settings
 def png_of(thing: object) -> bytes:
     """A small picture as PNG.
 

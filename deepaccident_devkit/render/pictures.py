@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.files import replacing
+from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.render.axes import detached_figure, settled
 from deepaccident_devkit.render.styles import style_dpi
 
@@ -23,7 +23,7 @@ PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
     """The path, if it has the suffix of a picture; raises ChoiceError."""
-    path = Path(path).expanduser()
+    path = path_of(path)
     if path.suffix.lower() not in PICTURE_SUFFIXES:
         raise ChoiceError(f"path: expected a file that ends in {', '.join(PICTURE_SUFFIXES)}, found {str(path)!r}")
     return path

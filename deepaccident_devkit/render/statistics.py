@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.render.axes import detached_figure, figure_or_new
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SPLIT_COLORS
@@ -20,6 +21,7 @@ from deepaccident_devkit.render.statistics_panels import (
     render_quantiles,
     render_relative_positions,
 )
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.statistics import GROUPS, DatasetStatistics
 from deepaccident_devkit.text import choice
 
@@ -108,6 +110,7 @@ STATISTICS_FIGURES: Final[Mapping[str, tuple[float, float]]] = {group: size for 
 """The groups that `render_statistics` renders → width and height of their figures in inches."""
 
 
+@in_own_settings
 def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure | None = None) -> Figure:
     """Render one group of statistics, coloured by split.
 
@@ -159,7 +162,7 @@ def save_statistics(
         ChoiceError: no such format.
         ConfigError: `folder` is a file.
     """
-    folder, formats = Path(folder), [choice("formats", name, get_args(PictureFormat)) for name in formats]
+    folder, formats = path_of(folder), [choice("formats", name, get_args(PictureFormat)) for name in formats]
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; give a folder")
     paths = []

@@ -18,6 +18,7 @@ from deepaccident_devkit.render.colors import (
     SPLIT_COLORS,
 )
 from deepaccident_devkit.render.legends import draw_legend
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.statistics import (
     GROUPS,
     PROBABILITIES,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 _PANEL = (7.0, 4.5)
 
 
+@in_own_settings
 def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
     """Render a table of counts as horizontal bars, the splits one after the other, each with its sum and share.
 
@@ -66,6 +68,7 @@ def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
     return with_light_grid(ax, "x")
 
 
+@in_own_settings
 def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     """Render a histogram as bars, the splits on top of each other.
 
@@ -87,6 +90,7 @@ def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     return with_light_grid(ax, "y")
 
 
+@in_own_settings
 def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None) -> Axes:
     """Render a number's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %.
 
@@ -106,6 +110,7 @@ def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None
     return ax
 
 
+@in_own_settings
 def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     """Render a histogram of angles around a circle: 0° up, counter-clockwise.
 
@@ -143,6 +148,7 @@ def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
+@in_own_settings
 def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None = None) -> Axes:
     """Render where the other actor of each colliding pair was at the last frame, seen from the first, forward up.
 

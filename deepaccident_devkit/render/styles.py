@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, Final, Literal, cast, get_args
+from threading import RLock
+from typing import Any, Final, Literal, TypeVar, cast, get_args
 
 from deepaccident_devkit.errors import ChoiceError
 
+Drawing = TypeVar("Drawing", bound=Callable[..., Any])
 StyleName = Literal["paper", "slide"]
 _ROOM_FOR_WORDS: Final = 0.8
 """Inches of a picture's height that words take, about: they do not shrink with the picture."""
@@ -46,6 +48,40 @@ _STYLES: Final[Mapping[str, _Style]] = {
 _current: ContextVar[_Style] = ContextVar("style", default=_NOTEBOOK)
 
 
+_applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
+_ONE_AT_A_TIME: Final = RLock()  # matplotlib has its settings once for all threads
+
+
+@contextmanager
+def own_settings(style: _Style | None = None) -> Iterator[None]:
+    """Matplotlib's own settings and those of a style, in place of the user's; for `with`, or before a function.
+
+    All that renders passes here, so that a picture depends on nothing but its style: a user's font, grid or
+    `image.origin` would change what it says.
+
+    Args:
+        style: None for the current one.
+    """
+    from matplotlib import style as styles
+
+    chosen = style or current_style()
+    if _applied.get() is chosen:
+        yield
+        return
+    settings: Any = ["default", {**chosen.rc, "savefig.dpi": chosen.dpi}]
+    with _ONE_AT_A_TIME, styles.context(settings):
+        token = _applied.set(chosen)
+        try:
+            yield
+        finally:
+            _applied.reset(token)
+
+
+def in_own_settings(function: Drawing) -> Drawing:
+    """Before a function that renders: it does so with `own_settings`."""
+    return own_settings()(function)
+
+
 @contextmanager
 def style(name: StyleName) -> Iterator[None]:
     """In a `with` statement: new pictures have the size and the letters that a paper or a slide needs.
@@ -69,6 +105,11 @@ def style(name: StyleName) -> Iterator[None]:
             yield
     finally:
         _current.reset(token)
+
+
+def current_style() -> _Style:
+    """The style of pictures that are made now."""
+    return _current.get()
 
 
 def has_tokens() -> bool:

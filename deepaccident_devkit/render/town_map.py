@@ -13,6 +13,7 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps import GROUND_CLASSES, TownMap, kept_town_map, town_map
 from deepaccident_devkit.render.axes import axes_or_new, axis_words
 from deepaccident_devkit.render.colors import BEV_COLORS
+from deepaccident_devkit.render.styles import in_own_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +22,7 @@ _MOST_PIXELS: Final = 800
 """Cells along a side, about; of a larger part every second, third, … is drawn."""
 
 
+@in_own_settings
 def render_town_map(dataset: Dataset, town: str, *, ax: Axes | None = None) -> Axes:
     """Render the map of a town, which is made if none is kept: roads, their lines and sidewalks, in pale colours.
 
@@ -39,6 +41,7 @@ def render_town_map(dataset: Dataset, town: str, *, ax: Axes | None = None) -> A
     return draw_whole_map(town_map(dataset, town), axes_or_new(ax, (7, 7)))
 
 
+@in_own_settings
 def draw_whole_map(drawn: TownMap, ax: Axes) -> Axes:
     """Render a map as far as it reaches, in metres of the world, with a title."""
     left, right, bottom, top = drawn.extent

@@ -11,6 +11,7 @@ import numpy as np
 from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
 from deepaccident_devkit.render.colors import MUTED_COLOR, OWN_COLOR, PREDICTED_COLOR
 from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.styles import in_own_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +24,7 @@ _MEANS: Final = 60
 """Steps are averaged in at most so many groups, so that a curve shows its way and not its noise."""
 
 
+@in_own_settings
 def render_curve(steps: Sequence[int], values: Sequence[float], title: str, *, ax: Axes | None = None) -> Axes:
     """Render one number by step: each value as a dot, and means of groups of steps as a line.
 
@@ -45,6 +47,7 @@ def render_curve(steps: Sequence[int], values: Sequence[float], title: str, *, a
     return with_light_grid(ax, "both")
 
 
+@in_own_settings
 def render_training(rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figure | None = None) -> Figure:
     """Render the curves of a run.
 

@@ -23,6 +23,7 @@ from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sights, sights
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import Frame
 from deepaccident_devkit.text import choice
@@ -52,6 +53,7 @@ _BRIGHT: Final = 0.3
 """Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
 
 
+@in_own_settings
 def render_visibility(
     dataset: Dataset,
     moment: RowArgument,
@@ -124,6 +126,7 @@ def render_visibility(
     return ax
 
 
+@in_own_settings
 def render_visibility_matrix(
     dataset: Dataset, moment: RowArgument, *, agents: Agents = None, ax: Axes | None = None
 ) -> Axes:

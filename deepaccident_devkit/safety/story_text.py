@@ -27,7 +27,7 @@ def story_text(facts: Mapping[str, Any]) -> str:
     if accident is not None:
         sentences = [_collision(facts, accident), _seen(accident), _avoidance(accident)]
     else:
-        sentences = [_no_collision(facts), _nearest(facts["nearest"])]
+        sentences = [_no_accident(facts), _nearest(facts["nearest"])]
     return " ".join(f"{each[0].upper()}{each[1:]}." for each in sentences if each)
 
 
@@ -105,10 +105,13 @@ def _avoidance(accident: Mapping[str, Any]) -> str | None:
     return None if braking["slack"] is None else f"{how} until {braking['slack']:.1f} s before would have avoided it"
 
 
-def _no_collision(facts: Mapping[str, Any]) -> str:
-    known = facts["collision"] is not None
-    what = "nobody collides" if known else "it is not known whether anybody collides"
-    return " ".join(part for part in (_place(facts), what, _number(facts["duration"], "in {:.1f} s")) if part)
+def _no_accident(facts: Mapping[str, Any]) -> str:
+    what, more = {
+        None: ("it is not known whether anybody collides", ""),
+        False: ("nobody collides", ""),
+        True: ("two collide", ", but the labels do not show how"),
+    }[facts["collision"]]
+    return " ".join(part for part in (_place(facts), what, _number(facts["duration"], "in {:.1f} s")) if part) + more
 
 
 def _nearest(nearest: Mapping[str, Any] | None) -> str | None:

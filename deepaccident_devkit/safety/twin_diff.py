@@ -12,6 +12,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked_number
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
 from deepaccident_devkit.safety.tables import write_csv
 from deepaccident_devkit.safety.twin_matching import MatchedBy
@@ -211,7 +212,7 @@ class TwinDiff(FrozenArrays):
         values = [*self.poses[:, rows, frames].transpose(0, 2, 1).reshape(6, -1), *self.speeds[:, rows, frames]]
         values += [self.distances[rows, frames], self.heading_differences[rows, frames]]
         columns += [[_known(value) for value in each] for each in values]
-        return write_csv(Path(path), [_OVER_TIME, *zip(*columns, strict=True)])
+        return write_csv(path_of(path), [_OVER_TIME, *zip(*columns, strict=True)])
 
     def _actor(self, row: int) -> dict[str, Any]:
         ids: list[int] = self.actor_ids[row].tolist()

@@ -16,7 +16,7 @@ import numpy as np
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.files import replacing, writable_folder
+from deepaccident_devkit.files import path_of, replacing, writable_folder
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.parallel import Shard, ShardFiles, check_whole
 from deepaccident_devkit.statistics.compute import Chosen, chosen_rows, runs_of, statistics_of, tallies_of
@@ -108,7 +108,7 @@ def _shard_files(
 ) -> ShardFiles:
     """The files of the shards of these scenarios of this state of the release, with or without interactions."""
     text = repr((__version__, dataset.tables_folder.name, runs_of(rows), interactions))
-    return ShardFiles(Path(out).absolute(), hashlib.blake2b(text.encode(), digest_size=8).hexdigest(), ".npz")
+    return ShardFiles(path_of(out).absolute(), hashlib.blake2b(text.encode(), digest_size=8).hexdigest(), ".npz")
 
 
 def _write(path: Path, tallies: Mapping[int, Tally]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.files import is_writable_folder, path_of, place_in
 from deepaccident_devkit.parallel import MERGE, Part, Places, Progress, Shard, check_whole, mine, part_of, run_unordered
 from deepaccident_devkit.release.store.names import SPLIT_FILE_FOLDER
 from deepaccident_devkit.synth.config import SynthConfig
@@ -54,12 +54,14 @@ def make_release(
     Raises:
         ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of another
             configuration is there, or another process makes it; the scenario file cannot be read or simulated.
+        OutputFolderError: a link in the hidden folder leads out of it; nothing is written there.
         ChoiceError: there is no such part, or `workers` is less than 1.
         MissingExtraError: files of sensors are wanted and the package embreex is not installed.
         UnfinishedError: `part` is `merge`, and some scenarios are not recorded.
         WorkerError: a worker was killed, or cannot do the work.
     """
     wanted, part = config or SynthConfig(), part_of(part)
+    out = path_of(out)
     check_free(out)
     if wanted.sensors != "none":
         require_embree()
@@ -83,7 +85,7 @@ def make_release(
         splits = plan_splits(plans)
         splits.save(unfinished.release, overwrite=True)
         if wanted.for_released_code:
-            splits.save(unfinished.release / SPLIT_FILE_FOLDER, overwrite=True)
+            splits.save(place_in(unfinished.release, SPLIT_FILE_FOLDER, opened=True), overwrite=True)
     return out
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import held_lock, temporary_of, write_bytes
+from deepaccident_devkit.files import held_lock, place_in, remove_in, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.synth.config import SynthConfig
@@ -35,11 +35,11 @@ class Unfinished:
     @property
     def release(self) -> Path:
         """The release, as far as it is made."""
-        return self.folder / "release"
+        return place_in(self.folder, "release", opened=True)
 
     def part(self, name: str) -> Path:
         """Where a part of a scenario is recorded, as in a release of its own."""
-        return self.folder / "parts" / name
+        return place_in(self.folder, f"parts/{name}", opened=True)
 
     @contextmanager
     def alone(self, name: str) -> Iterator[None]:
@@ -57,7 +57,7 @@ class Unfinished:
 
     def clear(self, name: str) -> None:
         """Remove the incomplete files of a part that was interrupted."""
-        shutil.rmtree(self.part(name), ignore_errors=True)
+        remove_in(self.folder, f"parts/{name}")
 
     def is_made(self, name: str) -> bool:
         """Whether a part is complete."""
@@ -74,22 +74,20 @@ class Unfinished:
     def note(self, name: str) -> None:
         """Remember that a part is complete; raises ConfigError if it was removed meanwhile."""
         self._check_there()
-        self._note(name).parent.mkdir(exist_ok=True)
-        self._note(name).touch()
+        write_bytes(self._note(name), b"")
 
     def gather(self, names: Iterable[str]) -> None:
         """Move the files of a scenario's parts into the release, if they are not there yet."""
         for name in names:
             if self.part(name).is_dir():
-                _remove_half_written(self.part(name))
                 _merge(self.part(name), self.release)
 
     @property
     def _locks(self) -> Path:
-        return self.folder / "locks"
+        return place_in(self.folder, "locks", opened=True)
 
     def _note(self, name: str) -> Path:
-        return self.folder / "made" / name
+        return place_in(self.folder, f"made/{name}")
 
     def _check_there(self) -> None:
         if not (self.folder / _CONFIG_FILE).exists():
@@ -110,7 +108,7 @@ def unfinished_release(out: Path, config: SynthConfig, *, shared: bool = False) 
             is making it.
     """
     place = out.absolute()
-    unfinished = Unfinished(place.with_name(f".{place.name}.unfinished"))
+    unfinished = Unfinished(place_in(place.parent, f".{place.name}.unfinished", opened=True))
     try:
         lock = held_lock(unfinished.folder / _LOCK, "makes the release", shared=shared, wait=False)
     except BlockingIOError as error:
@@ -208,20 +206,15 @@ def _move_into_place(release: Path, out: Path) -> None:
     release.replace(out)
 
 
-def _remove_half_written(part: Path) -> None:
-    """Remove temporary files, which only those leave whose locks do not keep others out: the part is complete."""
-    for folder, _, files in os.walk(part):
-        for name in files:
-            if temporary_of(name) is not None:
-                Path(folder, name).unlink()
+def _merge(part: Path, release: Path) -> None:
+    """Move a part's files to their places, and remove the part.
 
-
-def _merge(source: Path, target: Path) -> None:
-    """Move a folder's contents into another one."""
-    for path in source.iterdir():
-        place = target / path.name
-        if path.is_dir() and place.is_dir():
-            _merge(path, place)
-        else:
-            path.replace(place)
-    source.rmdir()
+    Temporary files go with it: only those leave some whose locks do not keep others out, and the part is complete.
+    """
+    for folder, _, names in os.walk(part):
+        place = place_in(release, Path(folder).relative_to(part), opened=True)
+        place.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            if temporary_of(name) is None:
+                Path(folder, name).replace(place / name)
+    shutil.rmtree(part)

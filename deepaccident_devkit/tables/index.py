@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError
-from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.files import is_writable_folder, place_in
 from deepaccident_devkit.parallel import Shard
 from deepaccident_devkit.reading import RefusedFileError, fault_text, limit_of
 from deepaccident_devkit.release import ReleaseLayout
@@ -65,8 +65,8 @@ class Index(ShortRepr):
 
     @property
     def tables_folder(self) -> Path:
-        """The folder with one Arrow file a table."""
-        return self.folder / self.manifest.tables
+        """The folder with one Arrow file a table; raises OutputFolderError if it is a link."""
+        return place_in(self.folder, self.manifest.tables, opened=True)
 
 
 def open_index(

@@ -305,8 +305,8 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def _refuse_links(shards: Path) -> None:
-    """Raise IndexStoreError if a link leads out of the folder of shards, where files are written and removed."""
-    for path in (shards, *shards.glob("*")):
+    """Raise IndexStoreError if a link leads out of the index, where files are written and removed."""
+    for path in (shards, shards.with_name(MARK_FILE), *shards.glob("*")):
         if path.is_symlink():
             raise IndexStoreError(f"{path}: a symbolic link, which no devkit makes; remove it")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import SharedLock, held_lock, say_waiting
+from deepaccident_devkit.files import SharedLock, held_lock, place_in, say_waiting
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -34,10 +34,9 @@ def index_lock(folder: Path, *, wait: bool = True, shared: bool = False) -> Iter
     """
     from filelock import FileLock, Timeout
 
-    if (folder / LOCK_FILE).is_symlink():  # it would be emptied
-        raise IndexStoreError(f"{folder / LOCK_FILE}: a symbolic link, which no devkit makes; remove it")
     lock: BaseFileLock | SharedLock
     try:
+        place_in(folder, LOCK_FILE, opened=True)  # a link's target would be emptied
         if shared:
             lock = held_lock(folder / LOCK_FILE, _TASK, shared=True)
         else:

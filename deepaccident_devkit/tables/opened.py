@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.release.store import ReleasePath, places_of
 from deepaccident_devkit.tables.manifest import Problem
@@ -211,7 +212,7 @@ class OpenTables:
         if not isinstance(split, str | os.PathLike):
             raise ChoiceError(f"split: expected the name of one, or the path of a split file, found {split!r}")
         if not isinstance(split, str) or split.endswith(".txt"):
-            return self._listed_scenarios(Path(split).expanduser(), missing)
+            return self._listed_scenarios(path_of(split), missing)
         split = choice("split", split, (*SPLITS, *MINI_SPLITS))
         if split in MINI_SPLITS:
             if split not in self._split_files:

@@ -125,10 +125,10 @@ def cameras() -> st.SearchStrategy[PinholeCamera]:
 
 @st.composite
 def labels(draw: st.DrawFn, max_count: int = 5) -> Labels:
-    """The content of one label file: any finite numbers, some unknown velocities, either handedness."""
+    """The content of one label file: any numbers up to 1e9, some unknown velocities, either handedness."""
     count = draw(st.integers(0, max_count))
-    anything = st.floats(allow_nan=False, allow_infinity=False)
-    velocity = draw(hnp.arrays(np.float64, (count, 2), elements=st.floats(allow_infinity=False)))
+    anything = numbers(1e9)
+    velocity = draw(hnp.arrays(np.float64, (count, 2), elements=anything | st.just(np.nan)))
     integers = st.integers(-(2**63), 2**63 - 1)
     return Labels(
         raw=draw(st.booleans()),
@@ -182,7 +182,7 @@ def metas(draw: st.DrawFn) -> Meta:
     collision = Collision(
         ids=(draw(actors), draw(actors)),
         classes=(draw(st.sampled_from(CATEGORIES)), draw(st.sampled_from(CATEGORIES))),
-        impact=draw(st.floats(allow_nan=False, allow_infinity=False)),
+        impact=draw(numbers(1e9)),
         spawn_relation=draw(st.sampled_from(["same", "opposite", "left"])),
         contact_side=draw(st.sampled_from(["front_side", "rear_side"])),
         agents=draw(st.none() | st.tuples(agents, agents)),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, FrozenArrays
+from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import Boxes, quaternions
@@ -19,7 +19,7 @@ from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.tables.records import ScenarioRecord
+    from deepaccident_devkit.tables.records import CollisionRecord, ScenarioRecord
 
 ContactSide = Literal["front", "rear", "left", "right"]
 CONTACT_GAP: Final = 1.5
@@ -79,10 +79,17 @@ class Contact(FrozenArrays):
 
 
 def first_accident(dataset: Dataset) -> str:
-    """The token of the first scenario that ends in an accident; raises NotAvailableError if no meta file names one."""
-    for record in dataset.scenario:
-        if record["collision"] is not None:
+    """The token of the first scenario that ends in an accident, of those whose labels show both actors if there are.
+
+    Raises:
+        NotAvailableError: no meta file names an accident.
+    """
+    accidents = [record for record in dataset.scenario if record["collision"] is not None]
+    for record in accidents:
+        if labelled_pair(record["collision"], scenario_tracks(dataset, record["token"]).actor_id) is not None:
             return record["token"]
+    if accidents:
+        return accidents[0]["token"]
     others = f", or show another view of a scenario that is there, such as {dataset.scenario[0]['token']}"
     raise NotAvailableError(
         f"{dataset.dataroot}: no scenario ends in an accident that a meta file names; unpack an accident and its meta"
@@ -166,6 +173,19 @@ def colliding_pair(record: ScenarioRecord) -> tuple[int, int] | None:
             f"{record['token']}: meta names actor {first} twice instead of a colliding pair; restore the meta file"
         )
     return first, second
+
+
+def labelled_pair(collision: CollisionRecord | None, actor_ids: IntArray) -> tuple[int, int] | None:
+    """The actor ids of the pair that collides, if labels show both; the one place that decides this.
+
+    Meta may name one actor twice, or one that no label has: id 0, or of an agent that is not here.
+
+    Args:
+        collision: of the scenario; None if meta names none.
+        actor_ids: (N,) of all who are labelled in it, such as of its tracks; one may come several times.
+    """
+    first, second = (0, 0) if collision is None else collision["ids"]
+    return (first, second) if first != second and np.isin((first, second), actor_ids).all() else None
 
 
 def _velocities_into(dataset: Dataset, frame: str, pair: Boxes) -> FloatArray:

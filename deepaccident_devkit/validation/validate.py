@@ -14,7 +14,7 @@ from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.parallel import Places, Shard, check_whole, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
-from deepaccident_devkit.release.layout import names_without_calib
+from deepaccident_devkit.release.layout import left_aside, names_without_calib
 from deepaccident_devkit.release.store import Dataroot, checksums_compared, open_dataroot, places_of
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.build import read_scenario
@@ -242,6 +242,11 @@ def _strays(layout: ReleaseLayout) -> Iterator[Finding]:
     for folder, name in names_without_calib(layout):
         what = "has labels, meta or sensor files, but no calib files of any agent, and is left out"
         yield make_finding("calib-missing", None, str(folder / "*" / "calib" / name), what)
+    for path, meant in left_aside(layout.root):
+        if meant is None:
+            yield make_finding("link-leads-nowhere", None, str(path), "its end is not there, or is a folder above it")
+        else:
+            yield make_finding("folder-left-aside", None, str(path), f"is not read; it looks like {meant}")
 
 
 def _coverage(version: str, checks: Sequence[ScenarioCheck], splits: SplitAssignment) -> Coverage:

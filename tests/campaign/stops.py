@@ -62,10 +62,10 @@ VERBS = (
     *(
         Verb(
             f"export {name}",
-            f"export {name} {_RELEASE} --out {{out}}/{name}",
+            f"export {name} {_RELEASE} --out {{out}}/{name}{own}",
             progress=f"{name}/{name}.manifest.json",
         )
-        for name in ("opencood", "nuscenes", "parquet", "webdataset")
+        for name, own in {"opencood": " --without-clouds", "nuscenes": "", "parquet": "", "webdataset": ""}.items()
     ),
     Verb("replay", f"replay {_SENSORS} --out {{out}}/replay.html"),
 )

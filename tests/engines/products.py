@@ -11,7 +11,7 @@ COMMANDS = {
     "index": "index {release} --index-dir {out}/index",
     "validate": "validate {release} --json",
     "labels": "labels {release} --split train --samples evaluate --out {out}/labels",
-    "opencood": "export opencood {release} --out {out}/opencood",
+    "opencood": "export opencood {release} --without-clouds --out {out}/opencood",
     "evaluate": "evaluate accident {release} --results {results}/motion --split train --resamples 20 "
     "--out {out}/bundle",
     "predict": "baseline predict {release} --split train --task accident --out {out}/predictions",

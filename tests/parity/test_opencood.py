@@ -27,7 +27,7 @@ def made(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("golden")
     shutil.copytree(golden / "release", root / "release")
     dataset = DeepAccident("v1", root / "release", index_dir=root / "index", verbose=False)
-    return export_release(dataset, root / "out", OpenCood()).folder
+    return export_release(dataset, root / "out", OpenCood(without_clouds=True)).folder
 
 
 def test_every_value_is_equal(golden: Path, made: Path) -> None:

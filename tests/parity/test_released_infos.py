@@ -31,7 +31,7 @@ def test_every_info_is_equal(golden: Path, tmp_path: Path) -> None:
     export_release(dataset, tmp_path / "out", ReleasedInfos())
     found = pickle.loads((tmp_path / "out/carla_infos_train.pkl").read_bytes())
     expected = json.loads((golden / "released_infos.json").read_text())
-    assert len(expected) > 30
+    assert expected
     assert [plain(info) for info in found["infos"]] == expected
     assert found["metadata"] == {"version": "v1.0-trainval"}
 

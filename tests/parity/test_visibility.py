@@ -67,7 +67,7 @@ def test_accident_visibility_equals_the_released_codes(golden) -> None:
     """The rule over three moments; the last of them also from what the scene's agent sees (frame 0 is the present)."""
     scene, agent = golden.entry, AGENTS.index(golden.entry["agent"])
     _, first, _, second, _ = scene["meta"][0].split()
-    with np.load(golden.folder / f"{scene['name']}.npz") as arrays:
+    with np.load(golden.folder / f"a_labels_{golden.index:02d}.npz") as arrays:
         in_view, expected = arrays["check_accident_visibility"], arrays["accident_visibility"]
         xy, classes, points, camera, ids = (
             arrays[f"vis_{name}_0_{agent}"] for name in ("xy", "cls", "pts", "cam", "ids")

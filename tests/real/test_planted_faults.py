@@ -86,6 +86,23 @@ def _moved(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     write_lidar(path, xyz, np.zeros(len(xyz)))
 
 
+def _turned(root: Path) -> None:
+    _moved(root, lambda xyz: xyz[:, [1, 0, 2]] * (-1.0, 1.0, 1.0))
+
+
+def _raised(root: Path) -> None:
+    _moved(root, lambda xyz: xyz + np.array([0.0, 0.0, 1.0]))
+
+
+def _one_late(root: Path) -> None:
+    """Each cloud of an agent is that of the frame before, where that is there."""
+    folder, name = _clouds(root, "ego_vehicle")
+    for frame in range(100, 1, -1):
+        path, before = (folder / f"{name}_{number:03d}.npz" for number in (frame, frame - 1))
+        if path.is_file() and before.is_file():
+            path.write_bytes(before.read_bytes())
+
+
 def _miscounted(root: Path) -> None:
     """A near car's points, up by a half."""
     folder, name = _clouds(root, "ego_vehicle")
@@ -109,7 +126,9 @@ def damaged(real_root: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(real_root, tmp_path / "release"))
 
 
-@pytest.mark.parametrize("plant", [_two_frames, _two_agents, _shifted, _mirrored, _halved, _miscounted])
+@pytest.mark.parametrize(
+    "plant", [_two_frames, _two_agents, _shifted, _mirrored, _halved, _turned, _raised, _one_late, _miscounted]
+)
 def test_a_cloud_that_does_not_fit_its_label_is_told(damaged: Path, plant: Callable[[Path], None]) -> None:
     before = doubts(damaged, deep=True)
     plant(damaged)

@@ -2,11 +2,12 @@
 
 import json
 import time
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import pytest
 
-from deepaccident_devkit.json_text import MOST_LEVELS, parsed_json
+from deepaccident_devkit.json_text import MOST_LEVELS, parsed_json, parsed_record
 
 
 @pytest.mark.parametrize("value", [None, 1, "a", [], {}, {"a": [1.5, {"b": '[[[\\"{'}], "[": "\\"}, '\\"' * 3, "é😀"])
@@ -39,11 +40,12 @@ def test_levels_are_counted(far: int) -> None:
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (b"", "is no JSON"),
-        (b'{"a"', "is no JSON"),
+        (b"", r"is no JSON \(line 1, column 1\)"),
+        (b'{"a"', r"is no JSON \(line 1, column 5\)"),
+        (b"[1,\n x", r"is no JSON \(line 2, column 2\)"),
         (b"\x1f\x8b", "is compressed with gzip"),
         (b"\x80\x04", "is a pickle"),
-        (b'"\xff"', "is no JSON"),
+        (b'"\xff"', r"is no JSON \(not in UTF-8, or a number of thousands of digits\)"),
         (b'{"a": [{"b": 1, "b": 2}]}', "a: entry 0: b: stands there twice"),
         (b'{"a": NaN}', "a: expected a finite number, found NaN"),
         (b"[-Infinity]", "entry 0: expected a finite number, found Infinity"),
@@ -70,3 +72,30 @@ def test_the_time_is_linear(content: bytes) -> None:
     with pytest.raises(ValueError, match="is no JSON"):
         parsed_json(content)
     assert time.monotonic() - began < 5
+
+
+class Record(msgspec.Struct):
+    sizes: list[Annotated[float, msgspec.Meta(le=10)]]
+    kind: str = "car"
+
+
+def test_a_record_is_read() -> None:
+    assert parsed_record(b'{"sizes": [1, 2.5], "other": 3}', Record) == Record(sizes=[1.0, 2.5])
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b'{"sizes": [1, "2"]}', r"^expected `float`, got `str` - at `\$\.sizes\[1\]`$"),
+        (b'{"sizes": [1, 11]}', r"^expected `float` <= 10\.0 - at `\$\.sizes\[1\]`$"),
+        (b'{"sizes": [1e999]}', r"<= 10\.0 - at `\$\.sizes\[0\]`$"),
+        (b"{}", "^object missing required field `sizes`$"),
+        (b"3", "^expected `object`, got `int`$"),
+        (b'{"sizes": [], "sizes": []}', "^sizes: stands there twice$"),
+        (b'{"sizes": [NaN]}', "expected a finite number, found NaN"),
+        (b'{"sizes": ' + b"[" * 100_000, "is nested more than"),
+    ],
+)
+def test_a_record_that_is_something_else(content: bytes, told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        parsed_record(content, Record)

@@ -10,7 +10,16 @@ from pathlib import Path
 import pytest
 
 import deepaccident_devkit
-from deepaccident_devkit.reading import LIMITS, LIMITS_VARIABLE, check_size, limit_of, open_file, read_bytes, shortened
+from deepaccident_devkit.reading import (
+    LIMITS,
+    LIMITS_VARIABLE,
+    check_size,
+    file_checksum,
+    limit_of,
+    open_file,
+    read_bytes,
+    shortened,
+)
 
 
 @pytest.fixture
@@ -52,6 +61,13 @@ def test_what_is_no_file_is_refused_at_once(path: Path, make, said: str, read) -
     make(path)
     with pytest.raises(OSError, match=said):
         read(path)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "\ud800"])
+@pytest.mark.parametrize("read", [lambda path: read_bytes(path, "label"), open_file, file_checksum])
+def test_what_can_be_no_name_is_said_in_our_words(tmp_path: Path, name: str, read) -> None:
+    with pytest.raises(OSError, match="cannot be a file's name: it holds a NUL character, or half of a pair"):
+        read(tmp_path / name)
 
 
 @pytest.mark.parametrize("kind", LIMITS)
@@ -102,6 +118,7 @@ NOT_OF_STRANGERS = {
     "reading.py": "the gate",
     "archives.py": "its archives, of which the end was checked",
     "files.py": "the system's processes",
+    "cli/streams.py": "nothing: the null device",
     "cli/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
     "explore/pages/scenarios.py": "the split file that was written a line before",

@@ -13,19 +13,17 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.reading import fault_text, read_bytes, shortened
+from deepaccident_devkit.reading import fault_text, read_bytes
 
 Counts = Mapping[str, Any]
 """What one sample adds: names → whole numbers, floats, None, or nested lists of them; as JSON holds it."""
-_MOST_SETTINGS: Final = 600
-"""Characters of another evaluation's settings in a message."""
 Result = TypeVar("Result")
 EvaluatorT = TypeVar("EvaluatorT", bound="Evaluator[Any]")
 
@@ -188,7 +186,7 @@ class Evaluator(ABC, Generic[Result]):
         Raises:
             EvaluationError: it cannot be written.
         """
-        target = Path(path).expanduser()
+        target = path_of(path)
         state = {
             "made_by": self._maker,
             "settings": self.settings,
@@ -209,7 +207,7 @@ class Evaluator(ABC, Generic[Result]):
             EvaluationError: there is no such file, it cannot be read, or it is of other settings, another evaluator or
                 another version of the devkit.
         """
-        source = Path(path).expanduser()
+        source = path_of(path)
         try:
             state = parsed_json(read_bytes(source, "results"), constants=True)
             maker, settings, repeated = state["made_by"], state["settings"], set(state["repeated"])
@@ -217,11 +215,9 @@ class Evaluator(ABC, Generic[Result]):
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise EvaluationError(f"{source}: no saved evaluation ({fault_text(error)}); begin again") from error
         if maker != self._maker:
-            saver = shortened(str(maker))
-            raise EvaluationError(f"{source}: was saved by {saver}, this is {self._maker}; begin again")
+            raise EvaluationError(f"{source}: was saved by {maker}, this is {self._maker}; begin again")
         if settings != self.settings:
-            others = shortened(str(settings), _MOST_SETTINGS)
-            raise EvaluationError(f"{source}: was saved with other settings ({others}); begin again, or use those")
+            raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin again, or use those")
         for token, each in counts.items():
             self.add(token, each)
         self.repeated |= repeated

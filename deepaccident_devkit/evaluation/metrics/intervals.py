@@ -227,8 +227,10 @@ def _wilson(
     by_errors = errors**2 / (inside * (1 - inside))
     bounded = np.maximum(plain_t**2 * by_errors, np.minimum(t**2 * by_errors, plain_t**2 / having))
     unsure = np.where(np.isnan(errors), plain_t**2 / having, bounded)
-    middle, half = inside + unsure / 2, np.sqrt(unsure * inside * (1 - inside) + unsure**2 / 4)
-    return np.maximum((middle - half) / (1 + unsure), 0), np.minimum((middle + half) / (1 + unsure), 1)
+    half = np.sqrt(unsure * inside * (1 - inside) + unsure**2 / 4)
+    # the high end is 1 less the low one of what is missing: of a share of 1 it is 1, however numbers are rounded
+    low, missing = (np.maximum((each + unsure / 2 - half) / (1 + unsure), 0) for each in (inside, 1 - inside))
+    return low, 1 - missing
 
 
 def _notes(having: Mapping[str, int]) -> Iterator[str]:

@@ -10,12 +10,10 @@ from typing import Any, Final
 
 from deepaccident_devkit import json_text
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.reading import fault_text, shortened
+from deepaccident_devkit.reading import fault_text
 
 _SHOWN: Final = 80
 """Characters of a wrong value that an error shows."""
-_MOST_TOLD: Final = 600
-"""Characters of what is wrong, names in the file among them."""
 
 
 class ContentError(ValueError):
@@ -37,8 +35,7 @@ def told_of(path: Path) -> Iterator[None]:
     try:
         yield
     except ContentError as error:
-        told = shortened(str(error), _MOST_TOLD)
-        raise ResultsError(f"{path}: {told}; the format is described in schema/results/README.md") from error
+        raise ResultsError(f"{path}: {error}; the format is described in schema/results/README.md") from error
     except OSError as error:
         raise ResultsError(f"{path}: {fault_text(error)}; give a results file that can be read") from error
 

@@ -22,8 +22,9 @@ from deepaccident_devkit.evaluation.results.faults import at, parsed_json, told_
 from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, Header, MotionForm, ResultsTask, read_header
 from deepaccident_devkit.evaluation.results.motion_arrays import paths_of, stored_output, stored_paths
 from deepaccident_devkit.evaluation.results.shards import OpenShards, ShardCheck, check_shard, read_manifest
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.reading import irregular_text, read_bytes
+from deepaccident_devkit.reading import NO_NAME, fault_text, irregular_text, read_bytes
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -272,7 +273,7 @@ def read_results(path: str | os.PathLike[str]) -> Results:
         ResultsError: there is none, it is of another version, or against its format; the message names the first
             wrong entry by its token and field.
     """
-    file = _file_of(Path(path).expanduser().absolute())
+    file = _file_of(path_of(path, error=ResultsError).absolute())
     with told_of(file):
         fingerprint = content_fingerprint(read_bytes(file, "results"))
     task = contents_of(file, fingerprint).header.task
@@ -289,8 +290,10 @@ def _file_of(path: Path) -> Path:
     except FileNotFoundError:
         what = "no such file or folder" if file == path else f"holds no {RESULTS_FILE}"
         raise ResultsError(f"{path}: {what}; give the results that ResultsWriter made") from None
-    except (OSError, ValueError) as error:  # a ValueError: a name with a null character
-        raise ResultsError(f"{path}: cannot be read ({error}); give a results file that can") from error
+    except (OSError, ValueError) as error:
+        raise ResultsError(
+            f"{path}: {fault_text(error) if isinstance(error, OSError) else NO_NAME}; give results that can be read"
+        ) from error
     if irregular:
         raise ResultsError(f"{file}: {irregular}; give a results file")
     return file

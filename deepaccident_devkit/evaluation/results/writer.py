@@ -23,7 +23,7 @@ from deepaccident_devkit.evaluation.results.header import (
     json_meta,
 )
 from deepaccident_devkit.evaluation.results.shards import ShardWriter
-from deepaccident_devkit.files import replacing, replacing_folder
+from deepaccident_devkit.files import path_of, replacing, replacing_folder
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.text import choice
 
@@ -80,7 +80,7 @@ class ResultsWriter:
             ResultsError: a value that cannot be written, or something stands at `path`.
         """
         self.task = choice("task", task, get_args(ResultsTask))
-        self.path = Path(path).expanduser().absolute()
+        self.path = path_of(path).absolute()
         try:
             self._header = Header(task=self.task, meta=json_meta({} if meta is None else meta))
         except ContentError as error:

@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.runs.shapes import FILES, SCENARIOS, SUMMARY, misfits
-from deepaccident_devkit.files import replacing_folder, temporary_path
+from deepaccident_devkit.files import path_of, remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
@@ -149,6 +149,7 @@ class Bundle(ShortRepr):
 
 def read_bundle(folder: Path) -> Bundle:
     """Open a bundle; raises ResultsError if there is none that this devkit can read."""
+    folder = path_of(folder)
     if not folder.is_dir():
         raise ResultsError(f"{folder}: no such folder; {_REMEDY}")
     path = folder / SUMMARY_FILE
@@ -287,7 +288,7 @@ def save_run(
         if before is not None and not target.exists():
             before.rename(target)
         elif before is not None:
-            shutil.rmtree(before)
+            remove_in(before.parent, before.name)
     remove_checkpoints(target)
     return target
 
@@ -299,9 +300,7 @@ def checked_target(folder: str | os.PathLike[str], *, overwrite: bool = False) -
         ResultsError: something lies there that is no bundle, or one that is not to be replaced, or one with files that
             are not its own.
     """
-    if not os.fspath(folder):
-        raise ResultsError("out: expected a folder, found an empty path; give '.' for the current one")
-    target = Path(folder).expanduser().absolute()
+    target = path_of(folder, "out: expected a folder", error=ResultsError).absolute()
     if not target.exists():
         return target
     if not target.is_dir():

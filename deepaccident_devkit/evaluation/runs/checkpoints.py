@@ -13,6 +13,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Shard, ShardFiles, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
 
@@ -91,4 +92,4 @@ def remove_checkpoints(out: str | os.PathLike[str]) -> None:
 
 
 def _absolute(out: str | os.PathLike[str]) -> Path:
-    return Path(out).expanduser().absolute()
+    return path_of(out).absolute()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.evaluation.runs.comparable import comparable_pair
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison, Family
 from deepaccident_devkit.evaluation.runs.paired import PairedTest, holm, paired_test, undecided
+from deepaccident_devkit.files import path_of
 
 
 def compare_bundles(
@@ -42,7 +42,7 @@ def compare_bundles(
         EvaluationError: they differ in task, rules, labels or samples, or were made by another devkit.
     """
     chosen = resampling or Resampling()
-    pair = comparable_pair(Path(a).expanduser(), Path(b).expanduser(), common=common)
+    pair = comparable_pair(path_of(a), path_of(b), common=common)
     setup = pair.bundles[0].setup
     results = [evaluator.compute(pair.tokens) for evaluator in pair.evaluators]
     known = {each.path: each for result in results for each in headlines(setup.task, result)}

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.text import columns_text
 
 Family = Literal["main", "headlines", "other"]
@@ -141,7 +141,7 @@ class Comparison(ShortRepr):
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(_COLUMNS)
         writer.writerows([getattr(each, name) for name in _COLUMNS] for each in self.numbers)
-        target = Path(path).expanduser()
+        target = path_of(path)
         write_bytes(target, text.getvalue().encode())
         return target
 

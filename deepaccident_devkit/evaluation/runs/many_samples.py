@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, run_unordered
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def evaluate_samples(
         WorkerError: a worker was killed.
         ChoiceError: `workers` is less than 1.
     """
-    saved = None if checkpoint is None else Path(checkpoint).expanduser()
+    saved = None if checkpoint is None else path_of(checkpoint)
     if saved is not None:
         if saved.exists():
             _resume(evaluator, saved, samples)

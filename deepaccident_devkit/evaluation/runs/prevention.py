@@ -21,6 +21,7 @@ from deepaccident_devkit.evaluation.metrics.warning.anticipation import LATENCIE
 from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import AccidentOutcomes, OutcomeTable
 from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
 from deepaccident_devkit.evaluation.metrics.warning.prevention import PreventedResult
+from deepaccident_devkit.evaluation.metrics.warning.recordings import UNPLACED
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.safety import Accident, Skipped, accident_of, outcomes_of, undisturbed
@@ -110,7 +111,7 @@ def prevention_evaluator(
     frames: dict[str, dict[str, list[int]]] = {}
     for token in sorted(evaluator.tokens):
         each = counts[token]
-        if each["kind"] == "accident":
+        if each["kind"] in ("accident", UNPLACED):  # of the latter it is told why nothing is judged
             scenario, _, agent = each["recording"].rpartition("/")
             frames.setdefault(scenario, {}).setdefault(agent, []).append(each["frame"])
     wanted = {

@@ -10,7 +10,12 @@ from typing import Any, Final, Literal, get_args
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS as ACCIDENT_PROTOCOLS
-from deepaccident_devkit.evaluation.metrics.accident import AccidentEvaluator, ReleasedAccidents, accident_context
+from deepaccident_devkit.evaluation.metrics.accident import (
+    AccidentEvaluator,
+    BoxAccidents,
+    ReleasedAccidents,
+    accident_context,
+)
 from deepaccident_devkit.evaluation.metrics.choices import switched
 from deepaccident_devkit.evaluation.metrics.detection import (
     DETECTION_PROTOCOLS,
@@ -161,7 +166,10 @@ class SampleLoader:
             return self.detected(token, prediction, rules.frame), detection_truth(self.dataset, token, rules)
         if self.setup.task == "motion":
             return prediction, self.label(token)
-        context = accident_context(self.dataset, token, self.setup.horizon, references=self.setup.task == "warning")
+        boxes = self.setup.task == "warning" or isinstance(rules, BoxAccidents)  # what happens is in boxes, not maps
+        context = accident_context(
+            self.dataset, token, self.setup.horizon if boxes else None, references=self.setup.task == "warning"
+        )
         return prediction, self.label(token), context
 
     def label_config(self) -> MotionLabelConfig | None:

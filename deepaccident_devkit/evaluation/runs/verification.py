@@ -34,6 +34,7 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.evaluation.runs.prevention import with_prevented
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ def verify_bundle(
     Raises:
         ResultsError: there is no bundle of this devkit's format, no results to evaluate, or a path must be given.
     """
-    bundle = read_bundle(Path(folder).expanduser())
+    bundle = read_bundle(path_of(folder))
     check_repeated(bundle, {"dataroot": dataset.dataroot, "results": results, "split": split})
     given = bundle.results_path if results is None else results
     opened = given if isinstance(given, Results) else read_results(given)

@@ -43,10 +43,13 @@ def routes() -> list[Route]:
     ]
 
 
-async def _list(request: Request) -> Response:
-    """Runs in the server's own thread: all of it is in memory, and takes milliseconds."""
-    explorer = explorer_of(request)
-    choices = Choices.of(request.query_params.multi_items())
+def choices_of(request: Request) -> Choices:
+    """What an address chose of the scenarios."""
+    return Choices.of(request.query_params.multi_items(), explorer_of(request).scenarios)
+
+
+def _list(request: Request) -> Response:
+    explorer, choices = explorer_of(request), choices_of(request)
     found = found_by(explorer.scenarios, choices, explorer.scores)
     return page(request, "scenarios.html", **list_context(explorer, choices, found))
 
@@ -180,7 +183,7 @@ def _chosen(choices: Choices) -> list[tuple[str, str]]:
 def _selection(request: Request) -> Response:
     """The scenarios that were chosen as a split file, in the order of the list."""
     explorer = explorer_of(request)
-    found = found_by(explorer.scenarios, Choices.of(request.query_params.multi_items()), explorer.scores)
+    found = found_by(explorer.scenarios, choices_of(request), explorer.scores)
     if found.faults or found.waiting:
         words = " ".join([*found.faults, *found.waiting])
         return page(request, "error.html", status=409, title="Not saved", words=words)

@@ -8,13 +8,14 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, get_args
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.export.bulk.output import Link, Output
 from deepaccident_devkit.selection import parse_where
-from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, MINI_SPLITS, SPLITS
 from deepaccident_devkit.text import choice, settle_choices
 
 if TYPE_CHECKING:
@@ -83,6 +84,10 @@ class Format(ABC):
 
     name: ClassVar[str]
     """One word, as on the command line."""
+    channels: ClassVar[tuple[str, ...]] = CHANNELS
+    """Sensors whose files decide what is written; tables and infos name files, there or not."""
+    nothing: ClassVar[str] = "no chosen agent recorded one of these scenarios; choose other agents or scenarios"
+    """Why there may be no sample to write, and the remedy."""
     beside: ClassVar[tuple[str, ...]] = ()
     """Formats whose exports may lie in the same folder already."""
 
@@ -107,6 +112,10 @@ class Format(ABC):
         found = asdict(self)
         del found["link"]
         return {**found, "split": None if self.split is None else os.fspath(self.split)}
+
+    def sensors(self) -> tuple[tuple[str, str], ...]:
+        """Agents and channels of the sensor files that decide what is written."""
+        return tuple(product(self.agents, self.channels))
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:  # noqa: ARG002 - for those that ask it
         """The chosen scenarios as units: one each."""

@@ -14,7 +14,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ExportError
 from deepaccident_devkit.export.bulk.output import MALFORMED, Tally
 from deepaccident_devkit.export.bulk.unfinished import FOLDER
-from deepaccident_devkit.files import held_lock, remove_leftovers, temporary_of, write_bytes
+from deepaccident_devkit.files import held_lock, place_in, remove_leftovers, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 
@@ -32,7 +32,8 @@ class Manifest:
         name: of the format; the file is `<name>.manifest.json`.
         settings: everything that decides what is written.
         fingerprint: of the truth of the exported scenarios (`release.fingerprints`); None until it is complete.
-        scenarios: token → hashes of its label, meta and calib files, by kind; empty until it is complete.
+        scenarios: token → hashes of its label, meta and calib files, by kind, and of the list of its sensor files,
+            `sensors`, where these matter; empty until it is complete.
         tally: counts of all that is there.
     """
 
@@ -152,9 +153,11 @@ def writing_to(folder: Path, *, shared: bool = False) -> Iterator[None]:
 
     Raises:
         ExportError: the folder cannot be made, locked or written to.
+        OutputFolderError: its lock is a link.
     """
+    path = place_in(folder, _LOCK, opened=True)
     try:
-        lock = held_lock(folder / _LOCK, "writes an export", shared=shared)
+        lock = held_lock(path, "writes an export", shared=shared)
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise ExportError(f"{folder}: no export can be written there ({error}); choose another folder") from error
     tidy = (lambda _: None) if shared else _remove_half_written

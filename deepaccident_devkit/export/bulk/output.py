@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from deepaccident_devkit.errors import SensorFileError
-from deepaccident_devkit.files import replacing, replacing_folder, write_bytes
+from deepaccident_devkit.files import place_in, remove_in, replacing, replacing_folder, write_bytes
 from deepaccident_devkit.reading import fault_text, open_file, read_bytes
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 
@@ -118,7 +118,7 @@ class Output:
     def whole_folder(self, path: str) -> Iterator[Output]:
         """Yield the output of a folder whose files all appear at once, in the place of an older one."""
         target = self._place(path)
-        shutil.rmtree(target, ignore_errors=True)
+        remove_in(self.folder, path)
         with replacing_folder(target) as temporary:
             yield Output(temporary, self.parts, self._link, self.tally)
 
@@ -152,7 +152,7 @@ class Output:
 
     def _place(self, path: str) -> Path:
         self._note(path)
-        return self.folder / path
+        return place_in(self.folder, path)
 
     def _count(self, size: int) -> None:
         self.tally.files += 1

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from deepaccident_devkit.errors import ExportError, MissingFileError, NotAvailableError
 from deepaccident_devkit.export.bulk.format import Format, Plan, Unit
 from deepaccident_devkit.export.bulk.manifest import Manifest, writing_to
 from deepaccident_devkit.export.bulk.output import Tally
 from deepaccident_devkit.export.bulk.unfinished import Unfinished
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import (
     MERGE,
     Failure,
@@ -28,7 +30,7 @@ from deepaccident_devkit.parallel import (
     part_of,
     run_batch,
 )
-from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders
+from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders, sensor_digest
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
 
@@ -37,6 +39,10 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.dataset import Dataset
 
+logger = logging.getLogger(__name__)
+
+_SENSORS: Final = "sensors"
+"""Name of the hash of the list of a scenario's sensor files, beside the hashes of its truth."""
 Job: TypeAlias = tuple[Unit, tuple[ScenarioFolder, ...]]
 """A unit, and where its scenarios lie."""
 
@@ -75,7 +81,8 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
     """Write scenarios of a release in another format. If a call is interrupted, the same call continues it.
 
     What is continued equals an undisturbed call: scenarios whose label, meta or calib files have changed since are
-    written again. A complete export is only compared with the release.
+    written again. A complete export is compared with the release: units whose sensor files have come, gone or changed
+    their size are written again, and other changes are refused.
 
     Args:
         dataset: the release.
@@ -92,15 +99,14 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
         ConfigError: the folder holds an export with other settings; it is left as it is.
         ExportError: the folder holds something else, there is too little room, it cannot be written to, or it was made
             from other scenarios or another state of them.
-        NotAvailableError: no scenario is left to export, or the release has no such split.
+        OutputFolderError: a link in the folder leads out of it; nothing is written there.
+        NotAvailableError: no scenario or no sample is left to export, or the release has no such split.
         ChoiceError, FieldError: no such filter, or `workers` is less than 1.
         SomeFailedError: files of some scenarios cannot be read; the others are written, and the same call continues.
         UnfinishedError: `part` is `merge`, and some scenarios are not written.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    if not os.fspath(folder):
-        raise ExportError("expected a folder for the export, found an empty path; give '.' for the current one")
-    root = Path(folder).expanduser().absolute()
+    root = path_of(folder, "expected a folder for the export", error=ExportError).absolute()
     part = part_of(part)
     scenarios = _chosen(dataset, form)
     settings = {**form.settings(), "version": dataset.version}
@@ -110,6 +116,8 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
     own = mine(part, units)
     plans = run(task.plan, own, label="planning", places=Places(reads=dataset.places))
     plan = sum(plans, Plan())
+    if not plan.samples and not isinstance(part, Shard):
+        raise NotAvailableError(form.nothing)
     free = shutil.disk_usage(next(each for each in (root, *root.parents) if each.exists())).free
     exported = partial(Exported, folder=root, plan=plan)
     if on_plan is not None:
@@ -120,28 +128,28 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
         return exported(written=0, kept=0, tally=Tally())
     form.check(dataset, root)
     folders = _folders(dataset, scenarios)
-    places = Places(reads=dataset.places, writes=(root,))
-    if not manifest.complete:
-        with writing_to(root, shared=isinstance(part, Shard)):
-            manifest = Manifest.of(root, form.name, settings, form.beside)  # who held the lock may have completed it
-            if not manifest.complete:
-                manifest.write(root)
-                if not isinstance(part, Shard):
-                    task.unfinished.remove_others(units)
-                jobs = [(unit, tuple(folders[token] for token in unit.scenarios)) for unit in own]
-                done = _checked(run(Tried(task.write), jobs, label=form.name, places=places), own, root)
-                written = sum(each.new for each in done)
-                if isinstance(part, Shard):
-                    tally = sum((each.tally for each in done), Tally())
-                    return exported(written=written, kept=len(own) - written, tally=tally)
-                manifest = task.finished(units, done, settings)
-                manifest.write(root)
+    compare = partial(run, task.state, list(folders.values()), label="comparing", places=Places(reads=dataset.places))
+    if _is_current(manifest, root, folders, compare):
+        return exported(written=0, kept=len(units), tally=manifest.tally)
+    with writing_to(root, shared=isinstance(part, Shard)):
+        held = Manifest.of(root, form.name, settings, form.beside)
+        if held.complete and not manifest.complete:  # by the one who held the lock
+            return exported(written=0, kept=len(units), tally=held.tally)
+        Manifest(name=form.name, settings=settings).write(root)
+        if not isinstance(part, Shard):
+            task.unfinished.remove_others(units)
+        jobs = [(unit, tuple(folders[token] for token in unit.scenarios)) for unit in own]
+        places = Places(reads=dataset.places, writes=(root,))
+        done = _checked(run(Tried(task.write), jobs, label=form.name, places=places), own, root)
+        tally = sum((each.tally for each in done), Tally())
+        if not isinstance(part, Shard):
+            manifest = task.finished(units, done, settings)
+            if not form.sensors():  # no later download changes it, so that its parts are needed no more
                 task.unfinished.remove()
-                return exported(written=written, kept=len(units) - written, tally=manifest.tally)
-    hashes = run(folder_hashes, list(folders.values()), label="comparing", places=Places(reads=dataset.places))
-    _check_release(manifest, root, {token: each.as_dict() for token, each in zip(folders, hashes, strict=True)})
-    task.unfinished.remove()  # left by a call that was killed after the manifest was complete
-    return exported(written=0, kept=len(units), tally=manifest.tally)
+            manifest.write(root)
+            tally = manifest.tally
+    written = sum(each.new for each in done)
+    return exported(written=written, kept=len(own) - written, tally=tally)
 
 
 def _checked(results: Sequence[_Done | Failure | None], units: Sequence[Unit], root: Path) -> list[_Done]:
@@ -154,7 +162,7 @@ def _checked(results: Sequence[_Done | Failure | None], units: Sequence[Unit], r
 
 @dataclass(frozen=True, slots=True)
 class _Done:
-    """A unit that was written: the hashes of its scenarios and its counts, and whether that was now."""
+    """A unit that was written: the states of its scenarios and its counts, and whether that was now."""
 
     scenarios: Mapping[str, Any]
     tally: Tally
@@ -174,20 +182,26 @@ class _Work:
         """About how much a unit is."""
         return self.form.plan(self.dataset, unit)
 
+    def state(self, folder: ScenarioFolder) -> dict[str, str | None]:
+        """What is compared of a scenario: the hashes of its truth, and of the list of its sensor files."""
+        sensors = self.form.sensors()
+        listed = {_SENSORS: sensor_digest(folder, sensors)} if sensors else {}
+        return {**folder_hashes(folder).as_dict(), **listed}
+
     def write(self, job: Job) -> _Done | None:
         """Write a unit, unless it was written from the same files before; None if it is to be there and is not."""
         unit, folders = job
-        hashes = {each.token: folder_hashes(each).as_dict() for each in folders}
+        states = {each.token: self.state(each) for each in folders}
         with self.unfinished.alone(unit):  # a worker that a scheduler took for lost may be at it still
             found = self.unfinished.done(unit)
-            if found is not None and found[0] == hashes:
-                return _Done(hashes, found[1], new=False)
+            if found is not None and found[0] == states:
+                return _Done(states, found[1], new=False)
             if self.merge:
                 return None
             with self.unfinished.output(self.form.link, unit) as output:
                 self.form.write(self.dataset, unit, output)
-            self.unfinished.set_done(unit, hashes, output.tally)
-        return _Done(hashes, output.tally, new=True)
+            self.unfinished.set_done(unit, states, output.tally)
+        return _Done(states, output.tally, new=True)
 
     def finished(self, units: Sequence[Unit], done: Sequence[_Done], settings: Mapping[str, Any]) -> Manifest:
         """Write what spans units; the manifest of the complete export."""
@@ -200,7 +214,7 @@ class _Work:
         return Manifest(
             name=self.form.name,
             settings=settings,
-            fingerprint=digest_of(scenarios),
+            fingerprint=digest_of(_truth(scenarios)),
             scenarios=scenarios,
             tally=output.tally,
         )
@@ -236,11 +250,30 @@ def _folders(dataset: Dataset, scenarios: Sequence[str]) -> dict[str, ScenarioFo
     return folders
 
 
-def _check_release(manifest: Manifest, root: Path, now: Mapping[str, Any]) -> None:
-    """Raise ExportError if a complete export was made from scenarios with other hashes."""
-    changed = sorted(token for token in {*manifest.scenarios, *now} if manifest.scenarios.get(token) != now.get(token))
+def _truth(states: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """States of scenarios without their sensor files."""
+    return {token: {name: each for name, each in state.items() if name != _SENSORS} for token, state in states.items()}
+
+
+def _is_current(
+    manifest: Manifest, root: Path, scenarios: Collection[str], compare: Callable[[], Sequence[Mapping[str, Any]]]
+) -> bool:
+    """Whether an export is complete and has the sensor files of today; raises ExportError if its truth was another."""
+    if not manifest.complete:
+        return False
+    now = dict(zip(scenarios, compare(), strict=True))
+    before, after = _truth(manifest.scenarios), _truth(now)
+    changed = sorted(token for token in {*before, *after} if before.get(token) != after.get(token))
     if changed:
         raise ExportError(
             f"{root}: was made from another state of the release, or a split file ({len(changed)} scenarios have "
             f"changed, come or gone since, such as {changed[0]}); choose another folder"
         )
+    if before == manifest.scenarios and after != now:
+        logger.warning(
+            "%s: was made by an earlier version, which did not note the sensor files; whether some have come or gone "
+            "since is unknown: if so, export again into an empty folder",
+            root,
+        )
+        return True
+    return manifest.scenarios == now

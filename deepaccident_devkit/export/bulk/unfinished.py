@@ -1,14 +1,15 @@
-"""What lies beside an unfinished export: of each unit its parts, the paths that it wrote, and a record that it is done.
+"""What lies beside an export: of each unit its parts, the paths that it wrote, and a record that it is done.
 
-By the paths the next call removes what a killed one wrote and would not be written today: of a scenario whose files
-have changed since, or that is not chosen any more.
+By the paths the next call removes what an earlier one wrote and would not be written today: of a scenario whose files
+have changed since, or that is not chosen any more. By the parts a complete export gets new sensor files without being
+written as a whole.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from typing import Any, Final
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.export.bulk.format import Unit
 from deepaccident_devkit.export.bulk.output import MALFORMED, Link, Output, Tally
-from deepaccident_devkit.files import held_lock, remove_leftovers, write_bytes
+from deepaccident_devkit.files import held_lock, place_in, remove_in, remove_leftovers, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import read_bytes
 
@@ -26,8 +27,10 @@ FOLDER: Final = ".deepaccident-parts"
 _DONE: Final = "done.json"
 _PATHS: Final = ".paths"
 _LOCK: Final = ".lock"
-_ODD: Final = ("", ".", "..")
-"""Names that would lead out of the export, if somebody else wrote the paths."""
+_REFUSED: Final = re.compile(r"(.*/)?(\.{0,2}|\.deepaccident[^/]*|[^/]*\.manifest\.json)(/.*)?", re.DOTALL)
+"""Paths that no export notes: out of its folder, or to what it keeps there itself. Somebody else wrote those."""
+_LONGEST: Final = 4096
+"""Characters of a path; no system opens a longer one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +47,8 @@ class Unfinished:
 
     @property
     def folder(self) -> Path:
-        """Its place, there or not."""
-        return self.root / FOLDER / self.name
+        """Its place, there or not; raises OutputFolderError if it is behind a link."""
+        return place_in(self.root, f"{FOLDER}/{self.name}", opened=True)
 
     def parts(self, unit: Unit) -> Path:
         """The folder of a unit's parts."""
@@ -84,11 +87,11 @@ class Unfinished:
         """
         name = "" if unit is None else unit.name
         if unit is not None:
-            shutil.rmtree(self.parts(unit), ignore_errors=True)
-        self.folder.mkdir(parents=True, exist_ok=True)
+            remove_in(self.folder, name)
         journal = self.folder / f"{name}{_PATHS}"
         earlier, now = _noted(journal), set[str]()
         self._remove_half_written(earlier)
+        write_bytes(journal, "".join(f"{path}\0" for path in sorted(earlier)).encode())  # a new file, and no link
         with journal.open("ab", buffering=0) as file:
 
             def note(path: str) -> None:
@@ -97,27 +100,29 @@ class Unfinished:
 
             yield Output(self.root, self.folder / name, link, note=note)
         self._remove_paths(earlier - now)
+        write_bytes(journal, "".join(f"{path}\0" for path in sorted(now)).encode())
 
     def remove_others(self, units: Sequence[Unit]) -> None:
         """Remove what was written of units that are not among these."""
-        names = {"", *(unit.name for unit in units)}
-        for journal in sorted(self.folder.glob(f"*{_PATHS}")):
+        names = {unit.name for unit in units}
+        for journal in sorted(self.folder.glob(f"[!.]*{_PATHS}")):
             name = journal.name.removesuffix(_PATHS)
             if name not in names:
                 self._remove_paths(_noted(journal))
-                shutil.rmtree(self.folder / name, ignore_errors=True)
+                remove_in(self.folder, name)
                 journal.unlink()
+                (self.folder / f"{name}{_LOCK}").unlink(missing_ok=True)
 
     def remove(self) -> None:
-        """Remove all of it: the export is complete."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove all of it."""
+        remove_in(self.root, f"{FOLDER}/{self.name}")
         with suppress(OSError):  # another format's is there
-            self.folder.parent.rmdir()
+            (self.root / FOLDER).rmdir()
 
     def _remove_half_written(self, paths: Collection[str]) -> None:
         """Remove the temporary files and folders of these paths."""
         names: dict[Path, set[str]] = {}
-        for place in map(self.root.joinpath, paths):
+        for place in (place_in(self.root, path) for path in paths):
             names.setdefault(place.parent, set()).add(place.name)
         for folder, each in names.items():
             remove_leftovers(folder, each)
@@ -125,13 +130,9 @@ class Unfinished:
     def _remove_paths(self, paths: Collection[str]) -> None:
         """Remove files or whole folders, and the folders that are empty then."""
         for path in sorted(paths):
-            place = self.root / path
-            if place.is_dir() and not place.is_symlink():
-                shutil.rmtree(place)
-            else:
-                place.unlink(missing_ok=True)
+            remove_in(self.root, path)
             with suppress(OSError):
-                os.removedirs(place.parent)
+                os.removedirs((self.root / path).parent)
 
 
 def _noted(journal: Path) -> set[str]:
@@ -140,4 +141,4 @@ def _noted(journal: Path) -> set[str]:
         paths = read_bytes(journal, "bundle").decode().split("\0")[:-1]
     except (OSError, ValueError):
         return set()
-    return {path for path in paths if not set(path.split("/")) & set(_ODD)}
+    return {path for path in paths if len(path) <= _LONGEST and not _REFUSED.fullmatch(path)}

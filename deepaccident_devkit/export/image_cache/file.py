@@ -16,7 +16,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.errors import SensorFileError
-from deepaccident_devkit.reading import fault_text, open_file
+from deepaccident_devkit.reading import check_size, fault_text, open_file
 
 MAGIC: Final = b"DAimages"
 _NUMBER: Final = np.dtype("<i8")
@@ -48,12 +48,12 @@ class ImagesFile:
         rows: agents at frames.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Map it; raises SensorFileError if it is not there, or not whole."""
+    def __init__(self, path: Path, cameras: int) -> None:
+        """Map it; raises SensorFileError if it is not there, not whole, or not of so many cameras."""
         try:
             with open_file(path) as file:
                 self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            self._table = self._checked_table()
+            self._table = self._checked_table(cameras)
         except (OSError, ValueError) as error:
             raise SensorFileError(
                 f"{path}: {fault_text(error)}; remove the cache of images and make it again"
@@ -69,13 +69,16 @@ class ImagesFile:
         """Whether an image is in it."""
         return bool(self._table[row, camera, 1])
 
-    def _checked_table(self) -> IntArray:
-        """The table; raises ValueError."""
+    def _checked_table(self, wanted: int) -> IntArray:
+        """The table; raises ValueError or OSError."""
         numbers = np.frombuffer(self._bytes, dtype=_NUMBER, offset=len(MAGIC), count=2) if self._is_ours() else None
         if numbers is None:
             raise ValueError("is no file of cached images")
         rows, cameras = numbers.tolist()
-        if min(rows, cameras) < 0 or file_bytes(rows, cameras, 0) > len(self._bytes):
+        if cameras != wanted:
+            raise ValueError(f"has {cameras} cameras, and its cache {wanted}")
+        check_size(file_bytes(rows, cameras, 0), "bundle", "its table")
+        if rows < 0 or file_bytes(rows, cameras, 0) > len(self._bytes):
             raise ValueError("is cut off")
         table = np.frombuffer(self._bytes, dtype=_NUMBER, offset=_HEAD, count=rows * cameras * 2)
         table = table.reshape(rows, cameras, 2)
@@ -83,6 +86,7 @@ class ImagesFile:
             table.min() < 0 or table.max() > len(self._bytes) or table.sum(axis=2).max() > len(self._bytes)
         ):
             raise ValueError("is cut off")
+        check_size(int(table[..., 1].max(initial=0)), "image", "an image")
         return table.astype(np.int64, copy=False)
 
     def _is_ours(self) -> bool:

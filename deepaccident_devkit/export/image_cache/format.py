@@ -45,6 +45,7 @@ class CachedImages(Format):
     codec: Codec = "raw"
 
     name: ClassVar[str] = NAME
+    nothing: ClassVar[str] = "none of these images is in this release; unpack the archives that hold them"
 
     def __post_init__(self) -> None:
         """Check the choices too."""
@@ -57,6 +58,10 @@ class CachedImages(Format):
         """Everything that decides what is written."""
         found = super().settings()
         return {**found, "images": {name: found["images"][name] for name in KEPT}}
+
+    def sensors(self) -> tuple[tuple[str, str], ...]:
+        """The images that are kept."""
+        return tuple(product(self.agents, self.images.cameras))
 
     def check(self, dataset: Dataset, folder: Path) -> None:
         """Refuse to write all scenarios; raises ConfigError."""
@@ -78,7 +83,8 @@ class CachedImages(Format):
             each = len(self._content(dataset, _camera_token(scenario, agent, min(numbers), camera)))
         rows = len(self.agents) * frames
         size = file_bytes(rows, len(self.images.cameras), count * each)
-        return Plan(samples=len(agents_of(dataset, scenario)) * frames, files=1, bytes=size)
+        samples = {(agent, number) for (agent, _), numbers in there.items() for number in numbers}
+        return Plan(samples=len(samples), files=1, bytes=size)
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a scenario's file: all frames of the first agent, then of the next one."""

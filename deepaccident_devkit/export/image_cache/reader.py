@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
+import msgspec
 import numpy as np
 
 from deepaccident_devkit.arrays import ByteArray, FloatArray
@@ -15,14 +15,25 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, ExportError, MissingFileError, SensorFileError
 from deepaccident_devkit.export.bulk.manifest import Manifest
 from deepaccident_devkit.export.image_cache.file import ImagesFile
-from deepaccident_devkit.export.image_cache.format import KEPT, NAME, images_path, stored_size
+from deepaccident_devkit.export.image_cache.format import KEPT, NAME, Codec, images_path, stored_size
 from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.files import path_of
+from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image
+from deepaccident_devkit.taxonomy import AgentName
 
 _MOST_OPEN: Final = 128
 """Files that are mapped at once: each has a descriptor, of which a process may have 1024 or fewer."""
-_MALFORMED: Final = (KeyError, TypeError, ValueError)
+
+
+class _Settings(msgspec.Struct):
+    """What is needed of the settings of a cache."""
+
+    images: ImageConfig
+    codec: Codec
+    agents: Annotated[tuple[AgentName, ...], msgspec.Meta(min_length=1)]
+    version: str
 
 
 class ImageCache:
@@ -37,14 +48,13 @@ class ImageCache:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Read its manifest; raises ConfigError if there is none, or if the cache is not complete."""
-        self.folder = Path(folder).expanduser().absolute()
+        self.folder = path_of(folder).absolute()
         try:
             manifest = Manifest.read(self.folder, NAME)
-            settings: dict[str, Any] = dict(manifest.settings)
-            self.images = ImageConfig(**settings["images"])
-            self.codec, self.agents = str(settings["codec"]), tuple(settings["agents"])
-            self._version = settings["version"]
-        except (ExportError, *_MALFORMED) as error:
+            settings = as_record(manifest.settings, _Settings)
+            if absent := set(KEPT) - manifest.settings["images"].keys():
+                raise ValueError(f"its images have no {min(absent)}")
+        except (ExportError, ValueError) as error:
             raise ConfigError(
                 f"images_cache: {self.folder} holds no cache of images ({error}); make one with deepaccident cache"
             ) from error
@@ -53,8 +63,9 @@ class ImageCache:
                 f"images_cache: {self.folder} is not complete; run the deepaccident cache that makes it again, which "
                 "continues it"
             )
+        self.images, self._size = settings.images, stored_size(settings.images)
+        self.codec, self.agents, self._version = settings.codec, settings.agents, settings.version
         self._scenarios = manifest.scenarios
-        self._size = stored_size(self.images)
         self._file = lru_cache(_MOST_OPEN)(self._opened)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -100,8 +111,8 @@ class ImageCache:
             self._row_of(token)
         if agents:
             scenario = agents[0].rpartition("/")[0]
-            now = {token: each.as_dict() for token, each in scenario_hashes(dataset, [scenario], workers=1).items()}
-            if now.get(scenario) != self._scenarios[scenario]:
+            now = scenario_hashes(dataset, [scenario], workers=1).get(scenario)
+            if now is None or not now.as_dict().items() <= self._scenarios[scenario].items():
                 raise self._other_release(f"another state of {scenario}")
 
     def has(self, camera: str) -> bool:
@@ -167,7 +178,7 @@ class ImageCache:
         return scenario, self.agents.index(name)
 
     def _opened(self, scenario: str) -> ImagesFile:
-        return ImagesFile(self.folder / images_path(scenario))
+        return ImagesFile(self.folder / images_path(scenario), len(self.images.cameras))
 
     def _other_release(self, why: str) -> ConfigError:
         return ConfigError(

@@ -19,6 +19,7 @@ from typing import Any
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
 from deepaccident_devkit.export.mcap.config import EPOCH, McapConfig, Predictions
+from deepaccident_devkit.files import path_of
 
 __all__ = ["EPOCH", "McapConfig", "Predictions", "export_mcap"]
 
@@ -58,7 +59,7 @@ def export_mcap(
         SensorFileError: a sensor file cannot be read.
     """
     config = McapConfig.of(**choices)
-    target = Path(path).expanduser()
+    target = path_of(path)
     if target.is_dir():
         raise ChoiceError(f"path: expected a file, such as {target / 'accident.mcap'}, found the folder {target}")
     try:

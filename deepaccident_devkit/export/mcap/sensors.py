@@ -17,7 +17,6 @@ from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import LIDAR
-from deepaccident_devkit.v2x.projection import camera_of
 
 LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
@@ -68,16 +67,15 @@ class Sensors:
 
 def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str, index: int) -> Any:
     """A CameraCalibration for an image of `size` (width, height), which may be smaller than calib says."""
-    lens, (width, height) = camera_of(dataset, token), size
-    scaled = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.intrinsic
+    lens = dataset.camera(token).resized(*size)
     return CameraCalibration(
         timestamp=frame_timestamp(index),
         frame_id=frame,
-        width=width,
-        height=height,
+        width=lens.width,
+        height=lens.height,
         distortion_model="plumb_bob",
         D=[0.0] * 5,
-        K=scaled.ravel().tolist(),
+        K=lens.intrinsic.ravel().tolist(),
         R=np.eye(3).ravel().tolist(),
-        P=np.column_stack([scaled, np.zeros(3)]).ravel().tolist(),
+        P=np.column_stack([lens.intrinsic, np.zeros(3)]).ravel().tolist(),
     )

@@ -11,7 +11,6 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -24,6 +23,7 @@ from deepaccident_devkit.evaluation.results.faults import ContentError, shown
 from deepaccident_devkit.evaluation.results.header import FORMAT
 from deepaccident_devkit.export.keyframes import KEY_STEP
 from deepaccident_devkit.export.nuscenes.names import token
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 OTHER_CLASSES: Final = ("bus", "trailer", "construction_vehicle", "barrier", "traffic_cone")
 """nuScenes' detection classes that this dataset does not have."""
-_MOST_TOLD: Final = 600
-"""Characters of what is wrong in a file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,14 +64,13 @@ def results_from_nuscenes(dataset: Dataset, path: str | os.PathLike[str]) -> NuS
         ResultsError: it cannot be read, is no such file, or has a sample that is not of this release's export; the
             message names the first one.
     """
-    file = Path(path).expanduser().absolute()
+    file = path_of(path).absolute()
     ours = {token("sample", sample): sample for sample in _key_samples(dataset)}
     try:
         return _read(parsed_json(read_bytes(file, "results"), constants=True), ours)
     except (OSError, ValueError) as error:
-        told = shortened(fault_text(error), _MOST_TOLD)
         remedy = 'give nuScenes detections, {"meta": …, "results": sample token → boxes}, of the nuScenes export of'
-        raise ResultsError(f"{file}: {told}; {remedy} {dataset.dataroot}") from error
+        raise ResultsError(f"{file}: {fault_text(error)}; {remedy} {dataset.dataroot}") from error
 
 
 def _read(document: object, ours: Mapping[str, str]) -> NuScenesDetections:

@@ -8,18 +8,16 @@ import numpy as np
 
 from deepaccident_devkit.export.nuscenes.names import CHANNEL_NAMES, ENDINGS, sensor_path, token
 from deepaccident_devkit.export.nuscenes.scenes import Row, Rows, Scene, linked
-from deepaccident_devkit.export.sensor_files import sensor_files
+from deepaccident_devkit.export.sensor_files import sensor_files, stored_camera
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import read_lidar
-from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_data_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.arrays import FloatArray
-    from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output
+    from deepaccident_devkit.geometry import PinholeCamera
 
 LidarAxes = Literal["ego", "nuscenes"]
 POINT_BYTES: Final = 20
@@ -35,7 +33,7 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     """Write the clouds of a scene, link its images, and return the rows of `sample_data` and `calibrated_sensor`.
 
     Files that are missing in a partial release have rows too, as those of a partial nuScenes download: evaluations look
-    up every keyframe's `LIDAR_TOP`, but open no cloud.
+    up every keyframe's `LIDAR_TOP`, but open no cloud. A missing image has the size of the camera's first one.
 
     Raises:
         SensorFileError: a file cannot be read.
@@ -43,15 +41,18 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     data: list[Row] = []
     calibrated: dict[str, Row] = {}
     for channel, files in scene.files.items():
-        size = (0, 0) if channel == LIDAR else image_size(scene, channel)
-        rows = []
+        rows, any_file = [], next(iter(files.values()), None)
         for number in scene.frames:
             source = sample_data_token(scene.sample(number), channel)
-            sensor = scene.dataset.sample_data.get(source)["calibrated_sensor_token"]
+            record = scene.dataset.sample_data.get(source)
+            lens = None if channel == LIDAR else stored_camera(scene.dataset, source, files.get(number, any_file))
+            sensor = record["calibrated_sensor_token"]
+            if lens is not None and (lens.width, lens.height) != (record["width"], record["height"]):
+                sensor = f"{sensor} {lens.width} x {lens.height}"  # with a K of its own
             if sensor not in calibrated:
-                calibrated[sensor] = _calibrated_row(scene, sensor, source, size, axes)
+                calibrated[sensor] = _calibrated_row(scene, record["calibrated_sensor_token"], sensor, lens, axes)
             path = sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
-            rows.append(_data_row(scene, number, channel, sensor, path, size))
+            rows.append(_data_row(scene, number, channel, sensor, path, lens))
             if number not in files:
                 continue
             if channel == LIDAR:
@@ -66,22 +67,7 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     return {"sample_data": data, "calibrated_sensor": list(calibrated.values())}
 
 
-def image_size(scene: Scene, camera: str) -> tuple[int, int]:
-    """Width and height of the first of a camera's images, as all of a recording are; without one, as calib says."""
-    files = scene.files[camera]
-    if files:
-        return read_jpeg(next(iter(files.values()))[0])[1]
-    lens = scene.dataset.camera(scene.sample(scene.last), camera)
-    return lens.width, lens.height
-
-
-def scaled_intrinsic(dataset: Dataset, data: str, size: tuple[int, int]) -> FloatArray:
-    """K (3, 3) of a camera's file for images of `size` (width, height): they may be smaller than calib says."""
-    lens = dataset.camera(data)
-    return np.diag([size[0] / lens.width, size[1] / lens.height, 1.0]) @ lens.intrinsic
-
-
-def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, size: tuple[int, int]) -> Row:
+def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, lens: PinholeCamera | None) -> Row:
     sample = scene.sample(number)
     return {
         "token": token("sample_data", sample, channel),
@@ -91,22 +77,22 @@ def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, s
         "timestamp": scene.stamp(number),
         "fileformat": ENDINGS[channel].removesuffix(".bin"),
         "is_key_frame": scene.is_key(number),
-        "height": size[1],
-        "width": size[0],
+        "height": 0 if lens is None else lens.height,
+        "width": 0 if lens is None else lens.width,
         "filename": path,
     }
 
 
-def _calibrated_row(scene: Scene, sensor: str, source: str, size: tuple[int, int], axes: LidarAxes) -> Row:
-    """The row of a calibrated sensor, which made the file `source`, with K for images of `size` (width, height)."""
-    record = scene.dataset.calibrated_sensor.get(sensor)
+def _calibrated_row(scene: Scene, source: str, name: str, lens: PinholeCamera | None, axes: LidarAxes) -> Row:
+    """The row of our calibrated sensor `source`, whose token is made of `name`; a camera has the K of its images."""
+    record = scene.dataset.calibrated_sensor.get(source)
     rotation, intrinsic = record["rotation"], []
-    if record["camera_intrinsic"] is None:
+    if lens is None:
         rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ TURNS[axes].T).tolist()
     else:
-        intrinsic = scaled_intrinsic(scene.dataset, source, size).tolist()
+        intrinsic = lens.intrinsic.tolist()
     return {
-        "token": token("calibrated_sensor", sensor),
+        "token": token("calibrated_sensor", name),
         "sensor_token": token("sensor", CHANNEL_NAMES[record["sensor_token"]]),
         "translation": record["translation"],
         "rotation": rotation,

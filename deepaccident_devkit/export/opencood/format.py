@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
 from deepaccident_devkit.text import choice
 
+logger = logging.getLogger(__name__)
+
 _SPLITS: Final[Mapping[str | None, str]] = {"train": "train", "val": "validate", "test": "test", None: "unknown"}
 """Our split → their folder."""
 _AGENTS: Final = "agents.json"
@@ -36,11 +39,18 @@ class OpenCood(Format):
     Attributes:
         classes: which boxes are vehicles; OpenCOOD has one class, so all of these become it.
         ego: the vehicle that is 1; the others follow in their usual order.
+        without_clouds: whether to write agents and moments that lack a point cloud, too, for models of cameras alone.
+            Loaders of clouds take them for moments at which nothing was hit, with true boxes.
     """
 
     classes: tuple[str, ...] = ("car", "truck", "van")
     ego: str = "ego_vehicle"
+    without_clouds: bool = False
     name: ClassVar[str] = "opencood"
+    nothing: ClassVar[str] = (
+        "no moment of these scenarios and agents has its point clouds; unpack the archives of lidar01, leave out the "
+        "agents without it (agents, --agents), or write images alone (without_clouds, --without-clouds)"
+    )
 
     def __post_init__(self) -> None:
         """Check the choices."""
@@ -53,7 +63,7 @@ class OpenCood(Format):
 
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
         """About how much a scenario is."""
-        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego)
+        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
         total = Plan()
         for agent in recording.agents:
             images = [size for camera in CAMERAS for _, size in recording.files[agent][camera].values()]
@@ -71,23 +81,35 @@ class OpenCood(Format):
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a scenario's folder, which appears when it is whole."""
-        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego)
+        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
         recording.count_left_out(output)
-        with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:
-            folder.write("data_protocol.yaml", _yaml(recording.protocol()))
-            for agent in recording.agents:
-                self._write_agent(recording, agent, folder)
-        folders = [recording.folders[agent] for agent in recording.agents]
-        write_bytes(output.parts / _AGENTS, json.dumps(folders).encode())
+        if recording.frames:  # loaders stop at a scenario without agents
+            with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:
+                folder.write("data_protocol.yaml", _yaml(recording.protocol()))
+                for agent in recording.agents:
+                    self._write_agent(recording, agent, folder)
+        folders = [recording.folders[agent] for agent in recording.agents] if recording.frames else []
+        facts = {"folders": folders, "written": recording.written, "samples": recording.samples}
+        write_bytes(output.parts / _AGENTS, json.dumps(facts).encode())
 
     def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002 - others need the release
         """Write HEAL's assignment, by which all agents have the same sensors."""
-        agents = {unit.name: parsed_json(read_bytes(parts(unit) / _AGENTS, "bundle")) for unit in units}
-        found = {name: dict.fromkeys(folders, "m1") for name, folders in agents.items()}
+        facts = {unit.name: parsed_json(read_bytes(parts(unit) / _AGENTS, "bundle")) for unit in units}
+        found = {name: dict.fromkeys(each["folders"], "m1") for name, each in facts.items() if each["folders"]}
         output.write("heter_modality_assign.json", f"{json.dumps(found, indent=1)}\n".encode())
 
+        written, samples = (sum(each[name] for each in facts.values()) for name in ("written", "samples"))
+        if 2 * written < samples:
+            logger.warning(
+                "%d of %d samples, most of the export, are left out for lack of point clouds; unpack the archives of "
+                "lidar01, leave out the agents without it (agents, --agents), or write images alone "
+                "(without_clouds, --without-clouds)",
+                samples - written,
+                samples,
+            )
+
     def _write_agent(self, recording: Recording, agent: str, output: Output) -> None:
-        moments = Moments(recording.dataset, recording.token, agent, self.classes)
+        moments = Moments(recording, agent, self.classes)
         files = recording.files[agent]
         for number in recording.frames:
             stem, facts = f"{recording.folders[agent]}/{number:06d}", moments.facts(number, output)

@@ -8,9 +8,10 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray
-from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.bulk import Output
+from deepaccident_devkit.export.opencood.recording import Recording
 from deepaccident_devkit.export.poses import carla_six
+from deepaccident_devkit.export.sensor_files import stored_camera
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.handedness import camera_from_lidar_to_raw, flip_pose
 from deepaccident_devkit.geometry.quaternions import to_matrix
@@ -37,17 +38,18 @@ class Moments:
         samples: tokens, by frame.
     """
 
-    def __init__(self, dataset: Dataset, scenario: str, agent: str, classes: tuple[str, ...]) -> None:
+    def __init__(self, recording: Recording, agent: str, classes: tuple[str, ...]) -> None:
         """Take an agent, and the classes that count as vehicles; raises TokenError."""
-        self._dataset, numbers = dataset, [CATEGORIES.index(name) for name in classes]
+        self._dataset = dataset = recording.dataset
+        self._files, numbers = recording.files[agent], [CATEGORIES.index(name) for name in classes]
         self._kept: dict[str, Callable[[Boxes], BoolArray]] = {
             "boxes of the agents themselves": lambda boxes: boxes.actor_id != OWN_ACTOR_ID,
             "boxes of other classes": lambda boxes: np.isin(boxes.category, numbers),
             "untracked boxes": lambda boxes: boxes.actor_id != UNTRACKED_ID,
             "boxes without LiDAR points": lambda boxes: boxes.num_lidar_pts > 0,
         }
-        count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
-        self.samples = [sample_token(scenario, agent, number) for number in range(1, count + 1)]
+        count = recording.record["num_frames"]
+        self.samples = [sample_token(recording.token, agent, number) for number in range(1, count + 1)]
         first = dataset.getind("sample", self.samples[0])
         self._world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][first : first + count])
         rows = slice(first * len(CHANNELS), (first + count) * len(CHANNELS))
@@ -106,11 +108,12 @@ class Moments:
 
     def _camera(self, name: str, at: int, raw_world_from_lidar: FloatArray) -> dict[str, Any]:
         lidar_to_camera = self._extrinsic[name][at]
+        lens = stored_camera(self._dataset, f"{self.samples[at]}/{name}", self._files[name].get(at + 1))
         world_from_camera = raw_world_from_lidar @ inverses(lidar_to_camera)
         return {
             "cords": carla_six(flip_pose(world_from_camera)).tolist(),
             "extrinsic": lidar_to_camera.tolist(),
-            "intrinsic": self._dataset.camera(self.samples[at], name).intrinsic.tolist(),
+            "intrinsic": lens.intrinsic.tolist(),
         }
 
     def _camera_from_lidar(self, name: str) -> FloatArray:

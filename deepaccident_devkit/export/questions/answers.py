@@ -6,25 +6,46 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
+import msgspec
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, ShortRepr, checked_number
 from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
-from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.files import path_of
+from deepaccident_devkit.json_text import Record, parsed_record
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.tables.tokens import sample_token
 
-_REQUIRED: Final = ("id", "accident", "who", "where")
-_OPTIONAL: Final = ("when", "why")
-_OF_TRUTH: Final = ("id", "sample", "last_frame", "accident", "actors")
 _REMEDY: Final = "mend that line; README.md beside the questions says what an answer is"
-_FARTHEST: Final = 1e6
-"""Metres and seconds: larger numbers are mistakes."""
 _SURE: Final = 0.5
+_Metres = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+"""Larger numbers are mistakes, as with seconds."""
+_TWO: Final = msgspec.Meta(min_length=2, max_length=2)
+
+
+class _Answer(msgspec.Struct, forbid_unknown_fields=True):
+    """A line of the answers."""
+
+    id: str
+    accident: list[bool | Annotated[float, msgspec.Meta(ge=0, le=1)]]
+    who: tuple[str | None, str | None] | None
+    where: Annotated[list[_Metres | Annotated[list[_Metres], _TWO]], _TWO] | None
+    when: Annotated[float, msgspec.Meta(ge=0, le=1e6)] | None = None
+    why: Any = None
+
+
+class _Question(msgspec.Struct):
+    """What is needed of a line of the truth."""
+
+    id: str
+    sample: Annotated[str, msgspec.Meta(max_length=1000, pattern=r"^([^/\s]+/){3}[0-9]{3}\Z")]
+    last_frame: Annotated[int, msgspec.Meta(ge=1, le=999)]
+    accident: Annotated[list[bool | None], msgspec.Meta(min_length=1)]
+    actors: dict[str, Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,21 +90,26 @@ def read_answers(
     """
     if not 0 <= checked_number("threshold", threshold, "a number from 0 to 1", ConfigError) <= 1:
         raise ConfigError(f"threshold: expected a number from 0 to 1, found {threshold!r}")
-    asked = _asked(Path(truth))
-    accidents: dict[str, list[Accident]] = {each["sample"]: [] for each in asked.values()}
+    asked = _asked(path_of(truth))
+    accidents: dict[str, list[Accident]] = {each.sample: [] for each in asked.values()}
     for each in asked.values():
-        recording = each["sample"].rpartition("/")[0]
+        recording = each.sample.rpartition("/")[0]
         scenario, _, agent = recording.rpartition("/")
-        accidents.setdefault(sample_token(scenario, agent, each["last_frame"]), [])
+        accidents.setdefault(sample_token(scenario, agent, each.last_frame), [])
     lines: dict[str, int] = {}
-    for number, answer in _lines(Path(answers)):
+    for number, answer in _lines(path_of(answers), _Answer, _REMEDY):
         where = f"{answers}:{number}"
-        question = _question(where, answer, asked)
-        if (first := lines.setdefault(answer["id"], number)) != number:
+        if answer.id not in asked:
             raise ResultsError(
-                f"{where}: id: {answer['id']} is answered in line {first} already; leave one of them out"
+                f"{where}: id: {_shown(answer.id)} is no question of the truth file; give the truth of these "
+                "questions, or leave the line out"
             )
-        accidents[question["sample"]] += _alarms(where, answer, question, threshold)
+        if (first := lines.setdefault(answer.id, number)) != number:
+            raise ResultsError(
+                f"{where}: id: {shortened(answer.id)} is answered in line {first} already; leave one of them out"
+            )
+        question = asked[answer.id]
+        accidents[question.sample] += _alarms(where, answer, question, threshold)
     return Answers(accidents=accidents, answered=len(lines), missing=tuple(key for key in asked if key not in lines))
 
 
@@ -120,22 +146,17 @@ def results_of_answers(
     return read
 
 
-def _asked(path: Path) -> dict[str, Mapping[str, Any]]:
+def _asked(path: Path) -> dict[str, _Question]:
     """Id → the line of the truth file, in the order of the samples."""
-    found = {}
-    for number, line in _lines(path):
-        if not all(name in line for name in _OF_TRUTH):
-            raise ResultsError(
-                f"{path}:{number}: is no line of a truth file; give truth.jsonl of the export of the questions"
-            )
-        found[line["id"]] = line
+    remedy = "give truth.jsonl of the export of the questions"
+    found = {line.id: line for _, line in _lines(path, _Question, f"this is no line of a truth file; {remedy}")}
     if not found:
-        raise ResultsError(f"{path}: holds no question; give truth.jsonl of the export of the questions")
-    return dict(sorted(found.items(), key=lambda each: str(each[1]["sample"])))
+        raise ResultsError(f"{path}: holds no question; {remedy}")
+    return dict(sorted(found.items(), key=lambda each: each[1].sample))
 
 
-def _lines(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The objects of a file of JSON lines with their numbers, from 1; blank lines are passed over."""
+def _lines(path: Path, kind: type[Record], remedy: str) -> Iterator[tuple[int, Record]]:
+    """The records of a file of JSON lines with their numbers, from 1; blank lines are passed over."""
     try:
         content = read_bytes(path, "results")
     except OSError as error:
@@ -144,65 +165,36 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         if not line.strip():
             continue
         try:
-            value = parsed_json(line)
+            record = parsed_record(line, kind)
         except ValueError as error:
-            raise ResultsError(f"{path}:{number}: {error}; {_REMEDY}") from error
-        if not isinstance(value, dict):
-            raise ResultsError(f"{path}:{number}: expected a JSON object, found {_shown(value)}; {_REMEDY}")
-        yield number, value
+            raise ResultsError(f"{path}:{number}: {error}; {remedy}") from error
+        yield number, record
 
 
-def _question(where: str, answer: Mapping[str, Any], asked: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
-    """The question that a line answers; checks which fields there are."""
-    for name in _REQUIRED:
-        if name not in answer:
-            raise ResultsError(f"{where}: {name}: is missing; {_REMEDY}")
-    for name in answer:
-        if name not in (*_REQUIRED, *_OPTIONAL):
-            raise ResultsError(f"{where}: {shortened(name)}: is no field of an answer; {_REMEDY}")
-    key = answer["id"]
-    if not isinstance(key, str) or key not in asked:
-        raise ResultsError(
-            f"{where}: id: {_shown(key)} is no question of the truth file; give the truth of these questions, or leave "
-            "the line out"
-        )
-    return asked[key]
-
-
-def _alarms(where: str, answer: Mapping[str, Any], question: Mapping[str, Any], threshold: float) -> list[Accident]:
+def _alarms(where: str, answer: _Answer, question: _Question, threshold: float) -> list[Accident]:
     """The alarm of an answer, if it raises one; all of its fields are checked in either case."""
-    scores = _scores(where, answer["accident"], len(question["accident"]))
-    ids, positions = _who(where, answer["who"], question["actors"]), _where(where, answer["where"])
-    when = answer.get("when")
-    if when is not None and not _is_number(when, 0):
-        raise ResultsError(f"{where}: when: expected seconds from 0, or null, found {_shown(when)}; {_REMEDY}")
+    seconds, scores = len(question.accident), [float(each) for each in answer.accident]
+    if len(scores) != seconds:
+        raise ResultsError(
+            f"{where}: accident: expected {seconds} times true, false or a probability from 0 to 1, found "
+            f"{_shown(answer.accident)}; {_REMEDY}"
+        )
+    ids, positions, when = _who(where, answer.who, question.actors), _where(where, answer.where), answer.when
     best = int(np.argmax(scores))
     if scores[best] == 0 or scores[best] < threshold:
         return []
     if positions is None:
         raise ResultsError(f"{where}: where: is null, but an accident needs a place; {_REMEDY}")
     time = when if when is not None and best < when <= best + 1 else best + 0.5
-    return [Accident(positions=positions, time=float(time), score=scores[best], ids=ids)]
+    return [Accident(positions=positions, time=time, score=scores[best], ids=ids)]
 
 
-def _scores(where: str, given: object, seconds: int) -> list[float]:
-    scores = given if isinstance(given, list) else []
-    if len(scores) != seconds or not all(isinstance(each, bool) or _is_number(each, 0, 1) for each in scores):
-        raise ResultsError(
-            f"{where}: accident: expected {seconds} times true, false or a probability from 0 to 1, found "
-            f"{_shown(given)}; {_REMEDY}"
-        )
-    return [float(each) for each in scores]
-
-
-def _who(where: str, given: object, actors: Mapping[str, int]) -> tuple[int, int] | None:
+def _who(where: str, given: tuple[str | None, str | None] | None, actors: Mapping[str, int]) -> tuple[int, int] | None:
     """The actor ids of two names; None if one of them is not known."""
     if given is None:
         return None
-    if not isinstance(given, list) or len(given) != 2:
-        raise ResultsError(f"{where}: who: expected two names, or null, found {_shown(given)}; {_REMEDY}")
     for name in given:
-        if name is not None and (not isinstance(name, str) or name not in actors):
+        if name is not None and name not in actors:
             raise ResultsError(
                 f"{where}: who: {_shown(name)} is nobody in the question; write null for one that it does not show"
             )
@@ -212,26 +204,13 @@ def _who(where: str, given: object, actors: Mapping[str, int]) -> tuple[int, int
     return None if first is None or second is None else (first, second)
 
 
-def _where(where: str, given: object) -> FloatArray | None:
+def _where(where: str, given: list[Any] | None) -> FloatArray | None:
     """Two points (2, 2), metres, also of a single one; None for no place."""
     if given is None:
         return None
-    points = [given, given] if isinstance(given, list) and not any(isinstance(each, list) for each in given) else given
-    good = isinstance(points, list) and len(points) == 2 and all(_is_point(each) for each in points)
-    if not good:
-        raise ResultsError(
-            f"{where}: where: expected [x, y], or [[x, y], [x, y]], of metres up to {_FARTHEST:,.0f}, or null, found "
-            f"{_shown(given)}; {_REMEDY}"
-        )
-    return np.array(points, dtype=np.float64)
-
-
-def _is_point(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(_is_number(each, -_FARTHEST) for each in value)
-
-
-def _is_number(value: object, least: float, most: float = _FARTHEST) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
+    if isinstance(given[0], list) != isinstance(given[1], list):
+        raise ResultsError(f"{where}: where: expected [x, y], or [[x, y], [x, y]], found {_shown(given)}; {_REMEDY}")
+    return np.broadcast_to(np.array(given, dtype=np.float64), (2, 2)).copy()
 
 
 def _shown(value: object) -> str:

@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, get_args
 
@@ -69,6 +70,10 @@ class Questions(ShortRepr, Format):
     seed: str = "0"
 
     name: ClassVar[str] = "questions"
+    nothing: ClassVar[str] = (
+        "no question can be asked: scenarios lack labels, meta or an observer; unpack them, or choose other scenarios "
+        "or agents"
+    )
 
     def __post_init__(self) -> None:
         """Check the choices too."""
@@ -84,6 +89,10 @@ class Questions(ShortRepr, Format):
             raise ChoiceError(
                 "link: a symbolic link shows the name of the scenario, which may tell the answer; choose hard or copy"
             )
+
+    def sensors(self) -> tuple[tuple[str, str], ...]:
+        """The pictures that go with questions; who observes depends on the ego."""
+        return tuple(product(AGENTS, self.cameras))
 
     @property
     def _rules(self) -> AskRules:
@@ -169,10 +178,7 @@ def _by_id(paths: Sequence[Path]) -> Iterator[bytes]:
             places.append((line[_ID], number, first, len(line)))
             first += len(line)
     if not places:
-        raise NotAvailableError(
-            "no question can be asked: scenarios lack labels, meta or an observer; unpack them, or choose other "
-            "scenarios or agents"
-        )
+        raise NotAvailableError(Questions.nothing)
     for _, number, first, length in sorted(places):
         with paths[number].open("rb") as file:
             file.seek(first)

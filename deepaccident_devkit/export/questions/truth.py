@@ -11,7 +11,7 @@ import numpy as np
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.metrics.accident import box_truth
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.v2x.collisions import collision
+from deepaccident_devkit.v2x.collisions import collision, labelled_pair
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def unanswerable(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:
     if not len(actors):
         return "scenarios without labels"
     told = scenario["collision"]
-    if told is not None and not np.isin(told["ids"], actors).all():
+    if told is not None and labelled_pair(told, actors) is None:
         return "scenarios with an actor in the accident that no label shows"
     return None
 

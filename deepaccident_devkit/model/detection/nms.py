@@ -61,7 +61,7 @@ They were chosen for nuScenes' classes. No golden numbers test the `rotated` one
 
 
 def suppress(boxes: AnyArray, scores: AnyArray, slots: AnyArray, config: NmsConfig | None = None) -> IntArray:
-    """Rows of the boxes that stay, the best first.
+    """Rows of the boxes that stay, the best first; of equal scores by what is in the boxes, whatever their order.
 
     Slots do not protect each other: a truck suppresses a van of the same task, as in the release.
 
@@ -72,7 +72,7 @@ def suppress(boxes: AnyArray, scores: AnyArray, slots: AnyArray, config: NmsConf
         config: None for ours.
     """
     rules = config or NmsConfig()
-    order = np.argsort(-np.asarray(scores), kind="stable")
+    order = np.lexsort((*np.asarray(boxes).T[::-1], slots, -np.asarray(scores)))
     best_first = np.asarray(boxes, dtype=np.float64)[order]
     if rules.method == "circle":
         same = _near(best_first[:, :2], rules.threshold)

@@ -9,6 +9,7 @@ from typing import Final
 from torch import Tensor
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.reading import shortened
 
 _RENAMED: Final = (
     (r"patch_embed\.proj\.(.+)", r"patch_embed.projection.\1"),
@@ -51,8 +52,8 @@ def _renamed(name: str) -> str:
         if match:
             return match.expand(template)
     raise ConfigError(
-        f"expected names of Swin's official weights, such as 'layers.0.blocks.0.norm1.weight', found {name!r}; "
-        "if it is a file's content, give its entry 'model'"
+        "expected names of Swin's official weights, such as 'layers.0.blocks.0.norm1.weight', found "
+        f"{shortened(name)!r}; if it is a file's content, give its entry 'model'"
     )
 
 

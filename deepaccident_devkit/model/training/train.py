@@ -35,7 +35,7 @@ from deepaccident_devkit.model.training.schedule import freeze, generator_of, le
 from deepaccident_devkit.model.training.state import Progress, load_state, save_state
 from deepaccident_devkit.model.training.step import TrainingStep, training_batch, with_dropped_partners
 from deepaccident_devkit.model.training.validation import SCORE, validated, validation_samples
-from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.reading import fault_text, read_bytes
 from deepaccident_devkit.render.training import save_training
 
 logger = logging.getLogger(__name__)
@@ -136,8 +136,8 @@ def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
     if path.is_file():
         try:
             there = parsed_json(read_bytes(path, "bundle"))
-        except ValueError as error:
-            raise ConfigError(f"{path}: cannot be read ({error}); remove it, or train elsewhere") from error
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path}: cannot be read ({fault_text(error)}); remove it, or train elsewhere") from error
         told = json.loads(json.dumps(notes))
         differing = [name for name in told if there.get(name) != told[name]] if isinstance(there, dict) else [RUN]
         if differing:
@@ -166,7 +166,7 @@ class _Run:
     def trained(self, model: V2XFormer) -> Path:
         """Take all steps that are left."""
         optimizer = optimizer_of(model, self.config)
-        progress = load_state(self.folder, model, optimizer)
+        progress = load_state(self.folder, model, optimizer, self.config.steps)
         step = self._wrapped(model)
         tokens = validation_samples(self.dataset, self.config)
         if self.place.is_first:

@@ -24,7 +24,9 @@ from deepaccident_devkit.arrays import (
     readonly,
 )
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.handedness import flip_pose
+from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.cells.parts import OWN_BOX_ID
 from deepaccident_devkit.motion.config import MotionLabelConfig
@@ -51,7 +53,7 @@ class FrameBoxes(ShortRepr):
         category: (N,) int, position in `taxonomy.CATEGORIES`.
         visible: (N,) bool, whether any agent whose sight counts sees the actor (docs/released_code.md, Visibility and
             attributes).
-        ego_from_lidar: (4, 4) float64.
+        ego_from_lidar: (4, 4) float64; for a protocol with `pose="yaw"` to the ego's frame without its lean.
     """
 
     center: FloatArray
@@ -88,8 +90,8 @@ class FramePolygons(ShortRepr):
     """The polygons of one moment, in the order in which they are rasterised; arrays are read-only.
 
     Attributes:
-        corners: (n, 4, 2) float32, x and y of the footprints' corners in the moment's ego frame, metres,
-            right-handed.
+        corners: (n, 4, 2) float32 (float64 of boxes by `pose="yaw"`), x and y of the footprints' corners in the
+            moment's ego frame, metres, right-handed.
         key: (n,) int64, actor ids; the ego's own box is −101.
     """
 
@@ -98,7 +100,8 @@ class FramePolygons(ShortRepr):
 
     def __post_init__(self) -> None:
         """Check and freeze; raises GeometryError."""
-        corners = checked("FramePolygons.corners", self.corners, (None, 4, 2), np.float32)
+        double = getattr(self.corners, "dtype", None) == np.float64
+        corners = checked("FramePolygons.corners", self.corners, (None, 4, 2), np.float64 if double else np.float32)
         object.__setattr__(self, "corners", readonly(corners))
         object.__setattr__(self, "key", readonly(checked("FramePolygons.key", self.key, (len(corners),), np.int64)))
 
@@ -134,15 +137,15 @@ def box_polygons(
         _own_boxes(known, moved, boxes.pose, config) if config.draw_ego and is_vehicle else (moved[:0], number[:0])
     )
     drawn = _drawn(boxes, first=there[0], config=config)
-    others = moved[drawn]
-    if config.augmentation is not None:
-        others = _augmented(others, config.augmentation)
-        if not config.rules.own_box_not_augmented:
-            own = _augmented(own, config.augmentation)
+    others: AnyArray = _corners(_augmented(moved[drawn], config.augmentation))
+    if config.rules.pose == "yaw":
+        others = _leaning_corners(known, config.augmentation)[drawn]
+    if not config.rules.own_box_not_augmented:
+        own = _augmented(own, config.augmentation)
     frame = np.concatenate([own_frame, boxes.frame[drawn]])
     order = np.argsort(frame, kind="stable")
     key = np.concatenate([np.full(len(own), OWN_BOX_ID, dtype=np.int64), boxes.actor_id[drawn]])[order]
-    corners = _corners(np.concatenate([own, others])[order])
+    corners = np.concatenate([_corners(own), others])[order]
     ends = frame[order].searchsorted(number, side="right").tolist()
     for index, start, end in zip(there, [0, *ends], ends, strict=False):
         result[index] = FramePolygons(corners=corners[start:end], key=key[start:end])
@@ -258,8 +261,10 @@ def _moved(boxes: Float32Array, pose: Float32Array) -> Float32Array:
     return np.column_stack([xyz, boxes[:, 3:6], yaw])
 
 
-def _augmented(boxes: Float32Array, augmentation: Augmentation) -> Float32Array:
+def _augmented(boxes: Float32Array, augmentation: Augmentation | None) -> Float32Array:
     """mmdet3d's boxes turned, scaled and flipped; the flip swaps front and rear as old mmdet3d does."""
+    if augmentation is None:
+        return boxes
     turn = replace(augmentation, scale=1.0, flip=False).matrix
     moved = _moved(boxes, np.broadcast_to(flip_pose(turn).astype(np.float32), (len(boxes), 4, 4)))
     moved[:, :6] *= np.float32(augmentation.scale)
@@ -276,3 +281,14 @@ def _corners(boxes: Float32Array) -> Float32Array:
     x = around[..., 0] * cosine + around[..., 1] * sine + boxes[:, 0, None]
     y = around[..., 0] * -sine + around[..., 1] * cosine + boxes[:, 1, None]
     return np.stack([x, -y], axis=-1)
+
+
+def _leaning_corners(frames: Sequence[FrameBoxes], augmentation: Augmentation | None) -> FloatArray:
+    """(M, 4, 2) x forward, y left of the bottom corners of all frames' boxes, which turn with the whole rotation."""
+    corners = [
+        Boxes.from_arrays(each.center, np.abs(each.size), each.yaw, frame="lidar")  # labels may have negative sizes
+        .transform(trusted_se3(each.ego_from_lidar), "ego")
+        .bottom_corners()[..., :2]
+        for each in frames
+    ]
+    return np.concatenate(corners) @ (np.eye(4) if augmentation is None else augmentation.matrix)[:2, :2].T

@@ -171,8 +171,9 @@ def _covered(footprints: Footprints, config: MotionLabelConfig) -> CoveredCells:
 def raster_corners(corners: AnyArray, config: MotionLabelConfig) -> IntArray:
     """Native column and row (n, 4, 2) at which corners (n, 4, 2), x and y (left), metres, are rasterised."""
     rules = config.rules
+    given = corners if rules.pose == "yaw" else corners.astype(np.float32, copy=False)
     native = config.grid.with_orientation(rules.native)
-    x, y = corners[..., 0], corners[..., 1] if rules.right_handed else -corners[..., 1]
+    x, y = given[..., 0], given[..., 1] if rules.right_handed else -given[..., 1]
     columns_and_rows = (y, x) if native.orientation == "fiery" else (x, y)
     axes = reversed(axes_of(native))
     return np.stack([_steps(values, axis, rules) for values, axis in zip(columns_and_rows, axes, strict=True)], axis=-1)

@@ -144,7 +144,7 @@ class FrameCandidates:
             return "draw_ego is off"
         if config.only_vehicle and CATEGORIES[int(self._frame.category[row])] == "pedestrian":
             return "only_vehicle leaves out pedestrians"
-        if key == UNTRACKED_ID:
+        if key == UNTRACKED_ID and config.rules.sight == "released":
             return "filter_invisible is on, and untracked rows (id −1) count as seen by nobody"
         when = {
             "present": "at the present",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.explained.calib import calib_text
 from deepaccident_devkit.release.explained.label import label_text
@@ -56,6 +57,7 @@ def explain_file(path: Path, *, rows: int | None = 10) -> Explanation:
         MissingFileError: there is no such file.
         ReleaseError: it is of none of these kinds, or so damaged that nothing of it can be said.
     """
+    path = path_of(path)
     kind = _kind_of(path, read_content(path, "label", ReleaseError, _REMEDY))
     fault: ReleaseError | None = None
     if kind == "label":

@@ -14,6 +14,8 @@ from deepaccident_devkit.release.store.paths import (
     StorePath,
     checksums_compared,
     fetched,
+    is_folder,
+    leads_back,
     listed,
     real_path,
 )
@@ -27,6 +29,8 @@ __all__ = [
     "checksums_compared",
     "fetched",
     "index_places",
+    "is_folder",
+    "leads_back",
     "list_files_in",
     "listed",
     "open_dataroot",

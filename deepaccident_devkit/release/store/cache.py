@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import replacing, temporary_of
+from deepaccident_devkit.files import place_in, remove_in, temporary_of, write_bytes
 from deepaccident_devkit.reading import bytes_of, fault_text
 
 FOLDER_VARIABLE: Final = "DEEPACCIDENT_CACHE"
@@ -45,9 +45,13 @@ class FileCache:
         return cls(place.absolute(), most)
 
     def path_of(self, identity: str, name: str) -> Path:
-        """Where the copy of a file lies if it is there: `identity` tells it from all others, `name` is its own."""
+        """Where the copy of a file lies if it is there: `identity` tells it from all others, `name` is its own.
+
+        Raises:
+            OutputFolderError: it lies behind a link, which somebody put into the folder.
+        """
         digest = hashlib.blake2b(identity.encode(errors="surrogateescape"), digest_size=16).hexdigest()
-        return self.folder / digest[:2] / digest[2:] / name
+        return place_in(self.folder, f"{digest[:2]}/{digest[2:]}/{name}", opened=True)
 
     def found(self, path: Path, size: int) -> bool:
         """Whether a copy is there, whole; it counts as used now."""
@@ -67,8 +71,7 @@ class FileCache:
         """
         try:
             self._make_room(len(content))
-            with replacing(path) as temporary:
-                temporary.write_bytes(content)
+            write_bytes(path, content)
         except OSError as error:
             raise OSError(
                 error.errno,
@@ -89,7 +92,7 @@ class FileCache:
             if total <= _KEPT * self.most:
                 break
             with suppress(OSError):  # another process removes it too
-                path.unlink()
+                remove_in(self.folder, path.relative_to(self.folder))
                 path.parent.rmdir()
             total -= bytes_
 

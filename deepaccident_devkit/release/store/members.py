@@ -20,7 +20,7 @@ from deepaccident_devkit.errors import DatarootError, IndexStoreError
 from deepaccident_devkit.files import replacing
 from deepaccident_devkit.reading import irregular_text, shortened
 
-FORM: Final = 1
+FORM: Final = 2
 """Counts up whenever the file's form or its meaning changes."""
 _HEAD: Final = b"deepaccident_members"
 _NUMBERS: Final = np.dtype(

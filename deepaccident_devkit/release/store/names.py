@@ -9,7 +9,7 @@ from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 MINI_FOLDER: Final = "DeepAccident_mini"
 SPLIT_FOLDERS: Final = SPLITS
 SPLIT_FILE_FOLDER: Final = "split_txt_files"
-SCENARIO_TYPE: Final = re.compile(r"type\d+_subtype\d+_(accident|normal)")
+SCENARIO_TYPE: Final = re.compile(r"type\d+_subtype\d+_(?:accident|normal)")
 SPLIT_FILES: Final = tuple(f"{split}.txt" for split in (*SPLITS, *MINI_SPLITS))
 _FROM_MACOS: Final = "__MACOSX"
 """The folder that macOS adds to its archives."""

@@ -15,7 +15,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError
-from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.files import is_writable_folder, path_text
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import fault_text, open_file
 from deepaccident_devkit.release.store.members import FORM, Listing, Members, write_members
@@ -28,7 +28,7 @@ from deepaccident_devkit.release.store.names import (
     is_release_file,
     release_folder,
 )
-from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, listed
+from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, is_folder, listed
 from deepaccident_devkit.release.store.sources import UrlSource, asked
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.release.store.zips import list_zip
@@ -104,7 +104,7 @@ def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[
     identity = os.fsencode(located)
     if isinstance(located, Path):
         yield located.parent / INDEX_FOLDER / located.name if located.is_file() else located / INDEX_FOLDER
-        identity = os.fsencode(located.resolve())
+        identity = os.fsencode(os.path.realpath(located))  # `resolve` raises for a link to itself
     from platformdirs import user_cache_path
 
     yield user_cache_path("deepaccident_devkit") / hashlib.blake2b(identity, digest_size=8).hexdigest()
@@ -122,7 +122,7 @@ def places_of(root: ReleasePath) -> tuple[Path, ...]:
 
 def _located(dataroot: str | os.PathLike[str]) -> Path | str:
     """The absolute path of what a caller names, symbolic links as they are; or the URL."""
-    text = os.fspath(dataroot)
+    text = path_text(dataroot, "dataroot: expected a path or a URL", error=DatarootError)
     if "://" in text:
         parts = urlsplit(text)
         if parts.scheme != "file":
@@ -143,16 +143,17 @@ def _archives(path: Path) -> list[Path]:
         folder, depth = folders.pop()
         with suppress(OSError):
             for entry in listed(folder):
-                if entry.is_dir() and depth < _DEEPEST and not entry.name.startswith("."):
-                    folders.append((folder / entry.name, depth + 1))
-                elif entry.name.lower().endswith(_ENDING) and entry.is_file() and not entry.name.startswith("."):
-                    found.append(folder / entry.name)
+                inside = folder / entry.name
+                if is_folder(entry) and depth < _DEEPEST and not entry.name.startswith("."):
+                    folders.append((inside, depth + 1))
+                elif entry.name.lower().endswith(_ENDING) and inside.is_file() and not entry.name.startswith("."):
+                    found.append(inside)
     return sorted(found)
 
 
 def _has_scenarios(folder: Path) -> bool:
     with suppress(OSError):
-        return any(SCENARIO_TYPE.fullmatch(entry.name) and entry.is_dir() for entry in listed(folder))
+        return any(SCENARIO_TYPE.fullmatch(entry.name) and is_folder(entry) for entry in listed(folder))
     return False
 
 

@@ -168,6 +168,25 @@ def listed(folder: ReleasePath) -> list[Entry]:
     return [*folders, *files]
 
 
+def is_folder(entry: Entry, *, loops: bool = False) -> bool:
+    """Whether an entry is a folder, or a link whose end cannot be looked at; listing that one tells why.
+
+    Links that lead back (`leads_back`) are none, unless `loops`.
+    """
+    try:
+        return (loops or not leads_back(entry)) and entry.is_dir()
+    except OSError:
+        return True
+
+
+def leads_back(entry: Entry) -> bool:
+    """Whether an entry is a link that leads nowhere: its end is not there, is itself, or a folder that it lies in."""
+    if isinstance(entry, StoreEntry) or not entry.is_symlink():
+        return False
+    folder = Path(os.path.realpath(os.path.dirname(entry.path)))  # noqa: PTH120 - `Path.resolve` raises for links to themselves
+    return not os.path.exists(entry.path) or folder.is_relative_to(os.path.realpath(entry.path))  # noqa: PTH110
+
+
 def _fetched(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
     if not paths:
         return None

@@ -60,7 +60,7 @@ def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
     number_of: dict[str, int] = {}
     folder, names, rows = [], [], []
     for entry in entries:
-        above, _, name = entry.filename.rpartition("/")
+        above, _, name = entry.filename.replace("\\", "/").rpartition("/")  # old tools of Windows write backslashes
         if above not in folder_of:
             folder_of[above] = release_folder((*leading, *above.split("/")))
         found = folder_of[above]

@@ -18,6 +18,7 @@ from deepaccident_devkit.render.boxes import write_beside
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ _TIME_EDGES: Final = np.arange(-2.25, 2.3, 0.5)
 """Seconds: each bin has half a second, and the middle bin is around no error."""
 
 
+@in_own_settings
 def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Axes:
     """Render the accident accuracy over the distance that a prediction may be off, with the three official distances.
 
@@ -58,6 +60,7 @@ def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> 
     return with_light_grid(ax, "y")
 
 
+@in_own_settings
 def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
     """Render how many accidents are foreseen, predicted falsely and missed, at each allowed distance.
 
@@ -87,6 +90,7 @@ def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
     return with_light_grid(ax, "y")
 
 
+@in_own_settings
 def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time"], *, ax: Axes | None = None) -> Axes:
     """Render a histogram of how far off the predicted accidents are, for samples before an accident.
 
@@ -118,6 +122,7 @@ def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time
     return with_light_grid(ax, "y")
 
 
+@in_own_settings
 def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Axes:
     """Render precision over recall of alarms, beginning with the surest alarm.
 

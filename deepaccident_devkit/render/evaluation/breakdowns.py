@@ -10,6 +10,7 @@ from deepaccident_devkit.evaluation.metrics.headlines import LIMITS, Headline, h
 from deepaccident_devkit.render.axes import axes_or_new
 from deepaccident_devkit.render.colors import AGENT_COLORS, ESTIMATE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 UNKNOWN: Final = "not known"
 
 
+@in_own_settings
 def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes | None = None) -> Axes:
     """Render one headline number of each group as a bar, with its interval as a whisker.
 

@@ -10,6 +10,7 @@ from deepaccident_devkit.render.axes import figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, MUTED_COLOR, WARNING_COLOR
 from deepaccident_devkit.render.evaluation.panels import draw_nothing
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ _AXIS: Final = 0.6
 _TITLE: Final = 0.9
 
 
+@in_own_settings
 def render_comparison(comparison: Comparison, *, fig: Figure | None = None) -> Figure:
     """Render the difference b − a of each headline number, with its interval as a whisker; one panel for each unit.
 

@@ -14,6 +14,7 @@ from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import CATEGORY_COLORS, ESTIMATE_COLOR, SERIES_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 from deepaccident_devkit.text import choice
 
@@ -24,6 +25,7 @@ _DASHES: Final = ("-", "--", "-.", ":")
 """Styles that distinguish lines even in print without colours."""
 
 
+@in_own_settings
 def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0, ax: Axes | None = None) -> Axes:
     """Render precision over recall of one class, one line for each threshold.
 
@@ -61,6 +63,7 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
     return with_light_grid(ax, "both")
 
 
+@in_own_settings
 def render_average_precisions(result: DetectionResult, *, ax: Axes | None = None) -> Axes:
     """Render each class's average precision as a bar, the mean over thresholds and ranges.
 

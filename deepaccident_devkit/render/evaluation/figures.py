@@ -26,6 +26,7 @@ from deepaccident_devkit.render.evaluation import accident, detection, motion, p
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN, render_breakdown
 from deepaccident_devkit.render.evaluation.panels import PANEL
 from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
@@ -91,6 +92,7 @@ def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
     return write_figure(complete_figure(run, drawn), folder / f"{drawn.name}.png", dpi=_DPI, words=said)
 
 
+@in_own_settings
 def complete_figure(run: EvaluationRun, drawn: RunFigure) -> Figure:
     """A figure that names its task, protocol, devkit and release, and what a partial run lacks."""
     figure = detached_figure((PANEL[0], drawn.height))

@@ -12,6 +12,7 @@ from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SERIES_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 _PARTS: Final = {"iou": "IoU", "pq": "PQ", "sq": "SQ", "rq": "RQ"}
 
 
+@in_own_settings
 def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
     """Render IoU and the panoptic quality with its two factors, within each range.
 
@@ -47,6 +49,7 @@ def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
     return with_light_grid(ax, "y")
 
 
+@in_own_settings
 def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax: Axes | None = None) -> Axes:
     """Render the panoptic quality of each future frame, one line for each range.
 

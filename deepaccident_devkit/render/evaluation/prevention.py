@@ -17,6 +17,7 @@ from deepaccident_devkit.render.chips import place_chips
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, MUTED_COLOR, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
 from deepaccident_devkit.render.legends import draw_legend
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ _MOST: Final = 60.0
 """Braking seconds a minute."""
 
 
+@in_own_settings
 def render_prevention(result: PreventedResult, group: str | None = None, *, ax: Axes | None = None) -> Axes:
     """Render the share of accidents avoided over the braking seconds a minute, one line for each way of braking.
 

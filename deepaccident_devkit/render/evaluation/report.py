@@ -11,7 +11,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import path_of, place_in, write_bytes
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.evaluation import sections
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, save_figure
@@ -45,14 +45,16 @@ def save_report(
 
     Raises:
         ConfigError: the folder is a file.
+        OutputFolderError: its `figures` is a link.
     """
-    target = Path(folder)
+    target = path_of(folder)
     if target.exists() and not target.is_dir():
         raise ConfigError(f"{target}: is a file; give a folder")
     drawn = [*run_figures(run)]
     if dataset is not None and results is not None:
         drawn += sample_figures(run, dataset, results)
-    figures = [(each, save_figure(run, each, target / FIGURES_FOLDER)) for each in drawn]
+    pictures = place_in(target, FIGURES_FOLDER, opened=True)
+    figures = [(each, save_figure(run, each, pictures)) for each in drawn]
     write_bytes(target / REPORT_FILE, report_html(run, figures).encode())
     return target / REPORT_FILE
 

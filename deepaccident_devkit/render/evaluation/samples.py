@@ -24,6 +24,7 @@ from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS, RunFigur
 from deepaccident_devkit.render.evaluation.panels import PANEL
 from deepaccident_devkit.render.legends import draw_legend_of_fills
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -65,6 +66,7 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
     )
 
 
+@in_own_settings
 def draw_motion_outcome(
     prediction: MotionOutput, label: MotionLabels, *, frame: int | None = None, ax: Axes | None = None
 ) -> Axes:

@@ -12,6 +12,7 @@ from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, place_chips
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, OUTCOME_COLORS, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ _BIN: Final = 0.5
 """Seconds."""
 
 
+@in_own_settings
 def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Axes:
     """Render a histogram of the seconds of warning, of the recordings of accidents with a right alarm.
 
@@ -49,6 +51,7 @@ def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Ax
     return with_light_grid(ax, "y")
 
 
+@in_own_settings
 def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> Axes:
     """Render how well accidents are distinguished from other recordings before they happen, and reference predictors.
 
@@ -79,6 +82,7 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     return ax
 
 
+@in_own_settings
 def render_detection_rates(result: WarningResult, *, ax: Axes | None = None) -> Axes:
     """Render which share of accidents has a right alarm so many seconds before the impact, or earlier.
 
@@ -104,6 +108,7 @@ def render_detection_rates(result: WarningResult, *, ax: Axes | None = None) -> 
     return ax
 
 
+@in_own_settings
 def render_false_alarms(result: WarningResult, *, ax: Axes | None = None) -> Axes:
     """Render the false alarms a minute of each kind of recording.
 
@@ -130,6 +135,7 @@ def render_false_alarms(result: WarningResult, *, ax: Axes | None = None) -> Axe
     return ax
 
 
+@in_own_settings
 def render_warning_curve(result: WarningResult, *, ax: Axes | None = None) -> Axes:
     """Render the detection rate over the false alarms a minute, one point for each least score of alarms.
 

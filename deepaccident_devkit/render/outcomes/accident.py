@@ -19,6 +19,7 @@ from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import INSIDE, draw_legend
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.trails import draw_trail
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ FORESEEN_COLOR: Final = "black"
 """Whether it is right is what the picture shows."""
 
 
+@in_own_settings
 def draw_accident_outcome(
     compared: ComparedAccidents,
     truth: BoxTruth | None = None,
@@ -86,8 +88,7 @@ def alarm_words(alarm: Accident) -> str:
 
 def difference_words(compared: ComparedAccidents) -> str:
     """The true accident, and on another line the errors of the surest alarm: of both places in sum, of the time."""
-    true = compared.true
-    comes = "no accident comes" if true is None else f"an accident comes in {true.time:.1f} s"
+    true, comes = compared.true, coming_words(compared)
     if not compared.predicted:
         return f"{comes}, none is foreseen"
     alarm = compared.predicted[0]
@@ -95,6 +96,13 @@ def difference_words(compared: ComparedAccidents) -> str:
         return f"{comes}, one is foreseen in {alarm.time:.1f} s"
     off = position_difference(alarm.positions, true.positions)
     return f"{comes};\nforeseen {off:.1f} m off in sum, {alarm.time - true.time:+.1f} s"
+
+
+def coming_words(compared: ComparedAccidents) -> str:
+    """Whether an accident comes, and when."""
+    if compared.unplaced is not None:
+        return f"an accident comes in {compared.unplaced:.1f} s that no label shows both actors of"
+    return "no accident comes" if compared.true is None else f"an accident comes in {compared.true.time:.1f} s"
 
 
 def verdict_words(result: AccidentResult) -> str:

@@ -34,6 +34,7 @@ from deepaccident_devkit.render.outcomes.verdicts import (
     Verdict,
     sample_verdict,
 )
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
 from deepaccident_devkit.text import choice
@@ -58,6 +59,7 @@ _FILL: Final = 0.3
 """How opaque the ground of instances is."""
 
 
+@in_own_settings
 def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, and which cameras and frame
     dataset: Dataset,
     sample: RowArgument,
@@ -118,6 +120,7 @@ def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, an
     return settled(fig)
 
 
+@in_own_settings
 def draw_outcome_in_camera(
     dataset: Dataset, verdict: Verdict, camera: str, *, frame: int | None = None, ax: Axes | None = None
 ) -> Axes:

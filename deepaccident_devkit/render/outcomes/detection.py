@@ -21,6 +21,7 @@ from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_fro
 from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend_of_fills
+from deepaccident_devkit.render.styles import in_own_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,6 +34,7 @@ DASHED: Final = (0, (2, 1))
 """The lines around true boxes and instances that are missed."""
 
 
+@in_own_settings
 def draw_detection_outcome(
     prediction: DetectedBoxes,
     truth: Boxes,

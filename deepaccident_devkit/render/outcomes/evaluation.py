@@ -20,7 +20,7 @@ from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.motion_cells import draw_edge
 from deepaccident_devkit.render.motion_maps import maps_of_labels
-from deepaccident_devkit.render.outcomes.accident import ACCIDENT_LAYERS, draw_accident_outcome
+from deepaccident_devkit.render.outcomes.accident import ACCIDENT_LAYERS, coming_words, draw_accident_outcome
 from deepaccident_devkit.render.outcomes.detection import DETECTION_LAYERS, WINDOW, draw_detection_outcome, draw_true
 from deepaccident_devkit.render.outcomes.motion import MOTION_LAYERS, draw_motion_side
 from deepaccident_devkit.render.outcomes.verdicts import (
@@ -31,6 +31,7 @@ from deepaccident_devkit.render.outcomes.verdicts import (
     sample_verdict,
 )
 from deepaccident_devkit.render.roles import collider_ids
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
@@ -46,6 +47,7 @@ _POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
 _SIZE: Final = (12.4, 6.9)
 
 
+@in_own_settings
 def render_evaluation(
     dataset: Dataset,
     sample: RowArgument,
@@ -117,7 +119,7 @@ def _draw_accident(verdict: AccidentVerdict, shown: frozenset[Layer], left: Axes
     limits = right.get_xlim(), right.get_ylim()
     draw_accident_outcome(ComparedAccidents(true=true, predicted=()), verdict.truth, layers=shown, ax=left)
     left.set(xlim=limits[0], ylim=limits[1])
-    left.set_title("truth" if true else "truth: no accident comes", fontsize=SMALLEST_TEXT)
+    left.set_title("truth" if true else f"truth: {coming_words(verdict.compared)}", fontsize=SMALLEST_TEXT)
 
 
 def _draw_detection(

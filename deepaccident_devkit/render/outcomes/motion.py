@@ -21,6 +21,7 @@ from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend_of_fills
 from deepaccident_devkit.render.motion_cells import draw_trail_of
 from deepaccident_devkit.render.motion_maps import MotionMaps, maps_of_labels, maps_of_output
+from deepaccident_devkit.render.styles import in_own_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,6 +95,7 @@ def motion_outcome(
     return MotionOutcome(true=true, predicted=predicted, matches=matches, extent=extent)
 
 
+@in_own_settings
 def draw_motion_side(
     outcome: MotionOutcome, side: Side, *, layers: Iterable[Layer] | None = None, ax: Axes | None = None
 ) -> Axes:

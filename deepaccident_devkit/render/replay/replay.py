@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.render.colors import (
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
@@ -98,7 +98,7 @@ def render_replay(
         EvaluationError: the prediction is neither of motion nor of accidents.
         SensorFileError: an image or a point cloud cannot be read.
     """
-    target = Path(path).expanduser()
+    target = path_of(path)
     if target.is_dir():
         raise ChoiceError(f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}")
     check_picture_settings(image_width, quality)

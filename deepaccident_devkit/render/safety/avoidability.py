@@ -12,6 +12,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.render.axes import figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SERIES_COLORS
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.safety import OUTCOMES, AvoidabilityReport, OutcomeShares
 from deepaccident_devkit.safety.avoidability_shares import GROUPS
 from deepaccident_devkit.text import choice
@@ -38,6 +39,7 @@ _ROWS: Final[Mapping[str, Callable[[OutcomeShares], FloatArray]]] = {
 """Label of a row of panels → (L, K) values."""
 
 
+@in_own_settings
 def render_avoidability(report: AvoidabilityReport, group: str = GROUPS[0], *, fig: Figure | None = None) -> Figure:
     """Render over the seconds of warning which share of accidents is avoided, and how fast the two still collide.
 

@@ -12,6 +12,7 @@ from deepaccident_devkit.render.axes import figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, MUTED_COLOR, OWN_COLOR, SERIES_COLORS
 from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, LeadTimeLedger, MeanTime
 from deepaccident_devkit.safety.ledger_report import CAVEAT
 from deepaccident_devkit.taxonomy import AGENTS
@@ -26,6 +27,7 @@ _DOT: Final = 5.5
 """Points."""
 
 
+@in_own_settings
 def render_lead_times(ledger: LeadTimeLedger, *, fig: Figure | None = None) -> Figure:
     """Render the mean lead time of each of the sixteen sets of agents, and the partners' mean Shapley values.
 

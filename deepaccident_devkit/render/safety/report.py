@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.files import plain_names, writable_folder, write_bytes
+from deepaccident_devkit.files import place_in, plain_names, writable_folder, write_bytes
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.axes import detached_figure
@@ -81,6 +81,7 @@ def save_safety_report(
 
     Raises:
         ConfigError: `folder` cannot be written to, or is not one.
+        OutputFolderError: its `figures` or `replays` is a link.
         ChoiceError: `replays` is negative, or `workers` is less than 1.
         WorkerError: a worker was killed, or cannot do the work.
     """
@@ -90,7 +91,7 @@ def save_safety_report(
     written = report.to_csv(folder)
     written.append(folder / "safety.json")
     write_bytes(written[-1], report.to_json().encode())
-    drawn, pictures = list(_figures(report)), folder / "figures"
+    drawn, pictures = list(_figures(report)), place_in(folder, "figures", opened=True)
     figures = [(each, write_figure(each.draw(), pictures / f"{each.name}.png", dpi=_DPI)) for each in drawn]
     names = {} if dataset is None else replay_names(_hardest(report, replays))
     how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
@@ -154,7 +155,7 @@ def _make_replays(dataset: Dataset, folder: Path, names: Mapping[str, str], **ho
 
 def _make_replay(dataset: Dataset, folder: Path, named: tuple[str, str]) -> str | None:
     scenario, name = named
-    return tried_replay(dataset, scenario, folder / name)
+    return tried_replay(dataset, scenario, place_in(folder, name))
 
 
 def _figures(report: SafetyReport) -> Iterator[_Drawn]:

@@ -14,7 +14,7 @@ from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chi
 from deepaccident_devkit.render.colors import MUTED_COLOR, OWN_COLOR, SERIES_COLORS
 from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.roles import actor_color, short_name
-from deepaccident_devkit.render.styles import has_tokens
+from deepaccident_devkit.render.styles import has_tokens, in_own_settings
 from deepaccident_devkit.safety import TwinDiff
 from deepaccident_devkit.taxonomy import CATEGORIES, frame_timestamp
 
@@ -31,6 +31,7 @@ _MARGIN: Final = 6.0
 """Metres around them."""
 
 
+@in_own_settings
 def render_twins(diff: TwinDiff, *, fig: Figure | None = None) -> Figure:
     """Render an accident (filled boxes, solid lines) over its twin (dashed).
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.video.views import OwnView, Scene, names_at, views_of
@@ -72,7 +73,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         MissingExtraError: nothing here can write MP4.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    target, (width, height) = Path(path).expanduser(), size
+    target, (width, height) = path_of(path), size
     check_target(target, size=(width, height), fps=fps)
     views = views_of(what, layers)
     record = dataset.get("scenario", scenario)

@@ -21,6 +21,7 @@ from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
 from deepaccident_devkit.render.pair import PAIR_LAYERS
 from deepaccident_devkit.render.pictures import figure_of_pixels
 from deepaccident_devkit.render.roles import in_drawing_order
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -180,6 +181,7 @@ class Scene:
             left = right
         return np.hstack(parts)
 
+    @in_own_settings
     def _drawn(self, view: View, moment: Moment, width: int) -> ByteArray:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from inspect import cleandoc
-from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.reading import fault_text, read_bytes
 from deepaccident_devkit.synth.spec.checks import check_scenario
 from deepaccident_devkit.synth.spec.choices import default_of, key_of
@@ -31,10 +31,10 @@ def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
         ConfigError: there is no such file, or it is no possible scenario; the message names line, field and remedy.
     """
     try:
-        text = read_bytes(Path(path), "spec").decode()
+        text = read_bytes(path_of(path), "spec").decode()
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file; give the path of a scenario file (docs/scenarios.md)") from error
-    except (OSError, ValueError) as error:  # a ValueError also of a name with a null character
+    except (OSError, ValueError) as error:
         told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({error})"
         raise ConfigError(f"{path}: {told}; give a YAML file in UTF-8") from error
     if len(text) > _MOST_CHARACTERS:

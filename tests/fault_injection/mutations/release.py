@@ -75,6 +75,19 @@ def _files(place: Place) -> list[Path]:
 
 
 @GROUP.kind()
+def type_folder_unpacked_beside(place: Place, rng: np.random.Generator) -> str:
+    """An agent's files are in a folder beside the scenario type's, as a second download is unpacked."""
+    name = place.scenario.scenario_type + str(rng.choice(["-001", " (1)", " 2", "-20240101T000000Z-001"]))
+    agent = place.any_agent(rng)
+    for path in _files(place):
+        if agent in path.parts:
+            below = path.relative_to(place.root / place.scenario.scenario_type)
+            place.write(place.root / name / below, path.read_bytes())
+            place.remove(path)
+    return f"{name}: {agent}"
+
+
+@GROUP.kind()
 def split_line_of_one_word(place: Place, rng: np.random.Generator) -> str:
     """A split file has a line with a single word."""
     return _append(place, str(rng.choice(["train.txt", "val.txt"])), place.scenario.name.encode() + b"\n")

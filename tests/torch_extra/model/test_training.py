@@ -25,7 +25,7 @@ from torch_extra.model.small_model import RUN, small, small_released, trained
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
 from deepaccident_devkit.export.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
-from deepaccident_devkit.model.checkpoint import BEST, FINAL, LAST, load_weights, read_weights
+from deepaccident_devkit.model.checkpoint import BEST, FINAL, LAST, load_weights, read_weights, write_weights
 from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.entry import ModelInputs, mirrored_boxes, model_inputs
 from deepaccident_devkit.model.network import V2XFormer
@@ -35,6 +35,7 @@ from deepaccident_devkit.model.training.data import Moments, batches
 from deepaccident_devkit.model.training.log import add_to_log, cut_log, read_log
 from deepaccident_devkit.model.training.place import checked_device
 from deepaccident_devkit.model.training.schedule import freeze, generator_of, learning_rate, optimizer_of, positions
+from deepaccident_devkit.model.training.state import load_state
 from deepaccident_devkit.model.training.step import TrainingStep, training_batch, with_dropped_partners
 
 SHORT = replace(RUN, steps=2, validation=None, save_every=1)
@@ -372,6 +373,59 @@ def test_a_checkpoint_of_another_run_is_refused(da: DeepAccident, whole: Path, t
         trained(da, tmp_path)
 
 
+def scaled(name: str, factor: float) -> Any:
+    return lambda held, _: held.update({name: held[name] * factor})
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda _, notes: notes.update(step="6"), r"expected `int`, got `str` - at `\$\.step`"),
+        (lambda _, notes: notes.update(step=-1), r"expected `int` >= 0 - at `\$\.step`"),
+        (lambda _, notes: notes.update(step=10**30), r"at `\$\.step`|has 10+ steps"),
+        (lambda _, notes: notes.update(step=7), "it has 7 steps, and the run 6"),
+        (lambda _, notes: notes.pop("step"), "missing required field `step`"),
+        (lambda _, notes: notes.update(best=[1]), r"got `array` - at `\$\.best`"),
+        (lambda _, notes: notes.update(best=1e300), r"at `\$\.best`"),
+        (
+            lambda held, _: held.update({"optimizer.x.step": torch.ones(())}),
+            r"'optimizer\.x\.step' is missing, or should",
+        ),
+        (lambda held, _: held.update({"x" * 10**6: torch.ones(())}), r"'x{10,60} … x{10,60}' is missing, or should"),
+        (lambda held, _: held.pop("optimizer.0.exp_avg"), r"'optimizer\.0\.exp_avg' is missing"),
+        (lambda held, _: held.pop(next(iter(held))), "is missing, or should not be there"),
+        (lambda held, _: held.update({"optimizer.0.exp_avg": torch.ones(3)}), r"optimizer\.0\.exp_avg is \(3,\) of"),
+        (
+            lambda held, _: held.update({"optimizer.0.step": torch.ones((), dtype=torch.int8)}),
+            r"of torch\.int8, not \(\)",
+        ),
+        (scaled("optimizer.0.step", -1), r"its optimizer has -\d+\.0 steps of 6"),
+        (scaled("optimizer.0.step", float("nan")), "its optimizer has nan steps"),
+        (scaled("optimizer.0.step", 100), "its optimizer has"),
+    ],
+)
+def test_a_changed_checkpoint_is_refused(whole: Path, tmp_path: Path, change: Any, told: str) -> None:
+    weights = read_weights(whole / LAST)
+    held, notes = dict(weights.tensors), dict(weights.meta)
+    change(held, notes)
+    write_weights(tmp_path / LAST, held, notes)
+    model = V2XFormer(small())
+    with pytest.raises(ConfigError, match=rf"last\.safetensors: is no checkpoint of this run \(.*{told}") as error:
+        load_state(tmp_path, model, optimizer_of(model, RUN), RUN.steps)
+    assert len(str(error.value)) < 600
+
+
+@pytest.mark.parametrize("name", ["run.json", "log.jsonl"])
+def test_too_large_files_of_a_run_are_refused(
+    da: DeepAccident, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    for path in whole.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / name).write_bytes(b" " * (65 << 20))
+    with pytest.raises(ConfigError, match=rf"{name}: .*; remove "):
+        trained(da, tmp_path)
+
+
 def test_a_run_begins_from_weights(da: DeepAccident, whole: Path, tmp_path: Path) -> None:
     said: list[str] = []
     trained(da, tmp_path, replace(SHORT, learning_rate=1e-30, weight_decay=0), weights=whole / BEST, say=said.append)
@@ -479,10 +533,24 @@ def test_the_log_is_read_up_to_a_line_that_is_cut_off(tmp_path: Path) -> None:
     assert [row["step"] for row in read_log(tmp_path)] == [1, 2, 3]
     cut_log(tmp_path, 2)
     assert path.read_bytes() == b'{"step": 1}\n{"step": 2}\n'
-    for line in (b"no json\n", b"[1]\n", b'{"loss": 1}\n', b'{"step": "1"}\n'):
+    for line in (b"no json\n", b"[1]\n", b'{"loss": 1}\n', b'{"step": "1"}\n', b'{"step": 1, "losses": [1]}\n'):
         path.write_bytes(b'{"step": 1}\n' + line)
-        with pytest.raises(ConfigError, match=r"log\.jsonl:2: expected a JSON object with a step; remove the line"):
+        with pytest.raises(
+            ConfigError, match=r"log\.jsonl:2: expected a JSON object with a step \(.*; remove the line"
+        ):
             read_log(tmp_path)
+
+
+@pytest.mark.parametrize("linked", [Path.symlink_to, Path.hardlink_to])
+def test_a_run_adds_nothing_to_a_file_elsewhere(tmp_path: Path, linked: Callable[[Path, Path], None]) -> None:
+    elsewhere, folder = tmp_path / "elsewhere.jsonl", tmp_path / "run"
+    folder.mkdir()
+    elsewhere.write_bytes(b'{"step": 1}\n')
+    linked(folder / "log.jsonl", elsewhere)
+    cut_log(folder, 9)  # as a run begins
+    add_to_log(folder, {"step": 2})
+    assert [row["step"] for row in read_log(folder)] == [1, 2]
+    assert elsewhere.read_bytes() == b'{"step": 1}\n'
 
 
 @pytest.mark.parametrize(

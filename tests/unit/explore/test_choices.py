@@ -103,6 +103,22 @@ def test_what_makes_no_sense_is_left_out(given_: list[tuple[str, str]]) -> None:
     assert Choices.of(given_) == Choices()
 
 
+def test_an_address_asks_for_no_more_than_a_page_has(scenarios: Scenarios) -> None:
+    """Whoever made it: values that no facet has are few and short."""
+    many = [f"{kind}{number}" for number in range(4000) for kind in ("T", "Town0")]
+    asked = [(name, value) for name in (*FIELDS, "q", "sort", "order", "page") for value in (*many, "x" * 60_000)]
+    facets = {each.name: each.values for each in scenarios.facets()}
+    towns = [("town", value) for value in facets["town"]]
+    choices = Choices.of([*asked, *towns, *towns], scenarios)
+    assert set(facets["town"]) <= set(choices.facets["town"])
+    assert sum(value not in facets.get(name, ()) for name, each in choices.facets.items() for value in each) == 100
+    for each in (choices, Choices.of(asked), Choices.of([("q", ";".join(many))], scenarios)):
+        assert sum(map(len, each.facets.values())) <= sum(map(len, facets.values())) + 100
+        assert len(each.filters) <= len(FIELDS) + 100
+        assert len(each.address()) < 20_000
+        assert max(map(len, [each.sort, *each.filters])) < 5_000
+
+
 def test_a_sort_puts_unknown_values_last_in_both_orders(scenarios: Scenarios) -> None:
     for column in ("lead", "lead_all", "min_ttc", "accident_visibility", "num_frames"):
         numbers = scenarios.numbers(column)

@@ -5,7 +5,9 @@ import io
 import json
 import re
 import shutil
+import threading
 from collections.abc import Iterator
+from inspect import iscoroutinefunction
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,6 +21,7 @@ from replay_page import accident, data_of, normal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.explore import Explorer, make_app
+from deepaccident_devkit.explore.pages import scenarios
 from deepaccident_devkit.explore.pages.scenario import PARTS
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.replay.recording import recording_of
@@ -47,6 +50,25 @@ def image(answer: Answer) -> Image.Image:
     assert answer.status == 200
     assert answer.headers["content-type"] in ("image/jpeg", "image/png")
     return Image.open(io.BytesIO(answer.body))
+
+
+def test_no_page_is_made_in_the_servers_own_thread(app: Any, explorer: Explorer, monkeypatch: Any) -> None:
+    """It answers all others meanwhile."""
+    found = scenarios.found_by
+    threads = []
+    monkeypatch.setattr(
+        scenarios, "found_by", lambda *given: threads.append(threading.current_thread()) or found(*given)
+    )
+    query = "&".join(f"town=T{number}" for number in range(4000))
+    whole = get(app, "/").text
+    for address in (f"/?{query}", f"/?{query}&view=table", f"/selection.txt?{query}", f"/release/statistics?{query}"):
+        answer = get(app, address)
+        assert answer.status == 200
+        assert len(answer.text) < len(whole) + 200_000
+    assert len(threads) == 4
+    assert threading.main_thread() not in threads
+    quick = {"with_slash", "_answer", "_waiting"}
+    assert {route.endpoint.__name__ for route in app.routes if iscoroutinefunction(route.endpoint)} == quick
 
 
 def test_the_page_plays_what_the_replay_plays(app: Any, here: str, da: DeepAccident, tmp_path: Path) -> None:

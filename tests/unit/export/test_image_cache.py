@@ -1,5 +1,6 @@
 """Resized images in a folder: what is written, what is read back, and what is refused."""
 
+import json
 import pickle
 import shutil
 from dataclasses import replace
@@ -155,6 +156,70 @@ def test_a_damaged_file_is_refused(da: DeepAccident, cache: ImageCache, tmp_path
         path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(SensorFileError, match=r"\.images: .*; remove the cache of images and make it again"):
         ImageCache(tmp_path / "out").load(IMAGES, da, cameras_of(da)[0])
+
+
+def headed(rows: int, cameras: int, *table: int) -> bytes:
+    return b"DAimages" + np.array([rows, cameras, *table], dtype="<i8").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (headed(1 << 62, 0), "has 0 cameras, and its cache 6"),
+        (headed(0, 0), "has 0 cameras"),
+        (headed(1, 7, *range(14)), "has 7 cameras"),
+        (headed(-1, 6), "is cut off"),
+        (headed(1 << 60, 6), "its table takes more than|its table"),
+        (headed(1, 6, *[0, 1 << 40] * 6), "is cut off"),
+    ],
+)
+def test_a_file_of_another_cache_is_refused(
+    da: DeepAccident, cache: ImageCache, tmp_path: Path, content: bytes, told: str
+) -> None:
+    shutil.copytree(cache.folder, tmp_path / "out")
+    for path in (tmp_path / "out").glob("*.images"):
+        path.write_bytes(content)
+    with pytest.raises(SensorFileError, match=rf"\.images: .*({told}).*; remove the cache of images and make it again"):
+        ImageCache(tmp_path / "out").load(IMAGES, da, cameras_of(da)[0])
+
+
+def test_an_image_that_would_be_too_large_is_refused(da: DeepAccident, cache: ImageCache, tmp_path: Path) -> None:
+    shutil.copytree(cache.folder, tmp_path / "out")
+    for path in (tmp_path / "out").glob("*.images"):
+        path.write_bytes(headed(1, 6, *[0, 33 << 20] * 6))
+        with path.open("r+b") as file:
+            file.truncate(40 << 20)
+    with pytest.raises(SensorFileError, match=r"an image takes .* limit for image"):
+        ImageCache(tmp_path / "out").load(IMAGES, da, cameras_of(da)[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "place"),
+    [
+        ("images", {}, "its images have no cameras"),
+        ("images", {"resize": [18, 30], "crop": None, "decode": "full"}, "its images have no cameras"),
+        ("images", {"resize": [18, 30], "crop": None, "cameras": [], "decode": "full"}, "cameras: expected a tuple"),
+        ("images", {"resize": [18, "1"], "crop": None, "cameras": [], "decode": "full"}, "images\\.resize\\[1\\]"),
+        ("images", [1], "at `\\$\\.images`"),
+        ("codec", "x" * 1_000_000, "invalid enum value 'x+ … x+"),
+        ("agents", [], "at `\\$\\.agents`"),
+        ("agents", "ego_vehicle", "at `\\$\\.agents`"),
+        ("agents", ["x" * 1_000_000], "invalid enum value"),
+        ("version", 1, "at `\\$\\.version`"),
+        ("version", None, "at `\\$\\.version`"),
+    ],
+)
+def test_changed_settings_are_refused(cache: ImageCache, tmp_path: Path, name: str, value: Any, place: str) -> None:
+    shutil.copytree(cache.folder, tmp_path / "out")
+    path = tmp_path / "out" / "cache.manifest.json"
+    told = json.loads(path.read_text())
+    told["settings"][name] = value
+    path.write_text(json.dumps(told))
+    with pytest.raises(
+        ConfigError, match=rf"images_cache: .* holds no cache of images \(.*{place}.*\); make one"
+    ) as error:
+        ImageCache(tmp_path / "out")
+    assert len(str(error.value)) < 600
 
 
 def test_impossible_caches() -> None:

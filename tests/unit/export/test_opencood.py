@@ -11,10 +11,11 @@ import pytest
 from opencood_reader import agents_of, counts_of, facts_of, points_of, timestamps_of, world_from
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 PLACES = dict(zip(("1", "2", "3", "4", "-1"), AGENTS, strict=True))
 
@@ -163,12 +164,57 @@ def test_a_partial_release_is_written_and_counted(da_partial: DeepAccident, tmp_
     assert made.tally.left_out["point clouds that are not in this release"] == frames
 
 
+@pytest.mark.parametrize(
+    ("gone", "agents", "moments", "warned"),
+    [
+        ({"ego_vehicle": [2]}, ["1", "3"], ["000001", "000003"], False),
+        ({"ego_vehicle": [1, 2], "other_vehicle": [2]}, ["1", "3"], ["000003"], True),
+        ({"other_vehicle": [1, 2, 3]}, ["1"], ["000001", "000002", "000003"], False),
+        ({"ego_vehicle": [1], "other_vehicle": [2, 3]}, [], [], True),
+    ],
+)
+def test_all_agents_have_the_same_moments_and_each_its_cloud(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    gone: dict[str, list[int]],
+    agents: list[str],
+    moments: list[str],
+    warned: bool,
+) -> None:
+    """Of three moments of two agents in each of three scenarios; loaders take no cloud for one without points."""
+    wanted = SmallRelease(agents=("ego_vehicle", "other_vehicle"), channels=("lidar01", "Camera_Front"))
+    write_small_release(tmp_path / "release", wanted)
+    for agent, numbers in gone.items():
+        for number in numbers:
+            for path in (tmp_path / "release").glob(f"*/{agent}/lidar01/*/*_{number:03d}.npz"):
+                path.unlink()
+    dataset = DeepAccident("v1", tmp_path / "release", verbose=False)
+    whole = export_release(dataset, tmp_path / "whole", OpenCood(without_clouds=True), workers=1)
+    assert whole.plan.samples == 6 * len(dataset.scenario)
+    if not agents:
+        with pytest.raises(NotAvailableError, match="no moment of these scenarios and agents has its point clouds"):
+            export_release(dataset, tmp_path / "out", OpenCood(), workers=1)
+        return
+    made = export_release(dataset, tmp_path / "out", OpenCood(), workers=1)
+    folders = [path.parent for path in made.folder.glob("*/*/data_protocol.yaml")]
+    assert len(folders) == len(dataset.scenario)
+    for folder in folders:
+        assert agents_of(folder) == agents
+        for agent in agents:
+            assert timestamps_of(folder, agent) == moments
+            assert all((folder / agent / f"{moment}.pcd").exists() for moment in moments)
+    written = len(agents) * len(moments) * len(folders)
+    assert made.plan.samples == written
+    assert made.tally.left_out["samples of agents or moments without point clouds"] == whole.plan.samples - written
+    assert ("most of the export" in caplog.text) == warned
+
+
 def test_without_labels_there_are_poses_and_clouds(own_release: Path, tmp_path: Path) -> None:
     labels = sorted(own_release.rglob("label/*/*.txt"))
     for path in labels:
         path.unlink()
     dataset = DeepAccident("v1", own_release, verbose=False)
-    made = export_release(dataset, tmp_path / "out", OpenCood(agents=("ego_vehicle",)))
+    made = export_release(dataset, tmp_path / "out", OpenCood(agents=("ego_vehicle",), without_clouds=True))
     assert made.tally.left_out["labels that are not in this release"] == len(dataset.scenario) * 4
     (folder, *_) = made.folder.glob("*/*/1")
     facts = facts_of(folder.parent, "1", "000002")

@@ -111,10 +111,15 @@ def test_velocities_are_the_labels_own_but_for_a_sign(da: DeepAccident, exported
     assert info["gt_names"].tolist() == [line[0] for line in lines]
 
 
-def test_scenarios_without_all_agents_are_left_out_and_counted(da_partial: DeepAccident, tmp_path: Path) -> None:
-    made = export_release(da_partial, tmp_path / "out", ReleasedInfos())
-    assert made.tally.left_out == {"scenarios without all five agents": len(da_partial.scenario)}
-    assert not list(made.folder.glob("*.pkl"))
+def test_scenarios_without_all_agents_are_left_out_and_counted(
+    da: DeepAccident, release_root: Path, tmp_path: Path
+) -> None:
+    lacking, *_ = (record["token"] for record in da.scenario if record["split"] == "train")
+    shutil.copytree(release_root, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident"))
+    for folder in (tmp_path / "release").glob(lacking.replace("/", "/infrastructure/*/")):
+        shutil.rmtree(folder)
+    made = export_release(DeepAccident("v1", tmp_path / "release", verbose=False), tmp_path / "out", ReleasedInfos())
+    assert made.tally.left_out["scenarios without all five agents"] == 1
 
 
 def test_scenarios_of_no_split_or_without_labels_are_left_out_and_counted(own_release: Path, tmp_path: Path) -> None:

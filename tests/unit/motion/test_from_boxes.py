@@ -36,6 +36,20 @@ def labels(frames, motion=STILL, **changes):
     return motion_labels_from_boxes(frames, motion, MotionLabelConfig(**changes))
 
 
+@pytest.mark.parametrize("augmentation", [None, Augmentation(rotation=0.2, scale=1.1, flip=True)])
+def test_without_a_lean_both_rules_of_poses_give_the_same_corners(augmentation: Augmentation | None) -> None:
+    rows = ((10, -5, 7, 0, 1), (-3, 8, 8, 0, 1), (0, 30, 9, 0, 1))
+    boxes = frame(*rows, lidar=SE3.from_yaw(0.3, (1.0, -2.0, 0.5)))
+    size = boxes.size * ([1, 1, 1], [2, 1, 1], [-1, -1, 1])  # a release may have negative ones
+    boxes = replace(boxes, yaw=np.array([0.4, -2.0, 3.0]), size=size)
+    found = []
+    for pose in ("whole", "yaw"):
+        config = MotionLabelConfig(augmentation=augmentation, draw_ego=False, protocol=replace(RELEASED, pose=pose))
+        (polygons,) = box_polygons([boxes], config)
+        found.append([np.array(sorted(each.tolist())) for each in polygons.corners])
+    assert_allclose(found[1], found[0], atol=1e-4)
+
+
 def test_a_car_lies_where_it_is_and_so_does_its_centre() -> None:
     """Centre (10, −5): columns 120 ± 4, rows 90 ± 2, cell edges rounded up half a cell as the released code does."""
     made = labels([frame((10, -5, 7, 0, 1))] * 5, draw_ego=False)

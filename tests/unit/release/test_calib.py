@@ -110,6 +110,11 @@ def with_item(key: str, place: tuple[int, int], value: float) -> Callable[[RawCa
         (changed("ego_to_world", lambda _: "eye"), "ego_to_world: .*found str"),
         (with_item("ego_to_world", (0, 0), np.nan), "ego_to_world: holds NaN or infinity"),
         (with_item("ego_to_world", (0, 3), np.inf), "ego_to_world: holds NaN or infinity"),
+        (with_item("ego_to_world", (0, 3), -1e300), "ego_to_world: holds NaN or infinity, or a number beyond 1e"),
+        (
+            with_item("intrinsic_Camera_Front", (1, 2), 1e39),
+            "intrinsic_Camera_Front: holds NaN or infinity, or a",
+        ),
         (with_item("lidar_to_Camera_Front", (2, 1), np.inf), "lidar_to_Camera_Front: holds NaN or infinity"),
         (with_item("intrinsic_Camera_Front", (0, 0), np.nan), "intrinsic_Camera_Front: holds NaN or infinity"),
         (with_item("lidar_to_ego", (0, 0), 1e200), "lidar_to_ego: its rotation is not orthonormal"),

@@ -161,9 +161,7 @@ def test_of_many_files_the_first_faulty_one_is_named(write) -> None:
 
 
 WORDS = st.one_of(
-    st.floats(allow_nan=False, allow_infinity=False).flatmap(
-        lambda x: st.sampled_from([repr(x), f"{x:.17g}", f"{x:.25e}", f"{x:E}", f"{x:.3e}"])
-    ),
+    st.floats(-1e9, 1e9).flatmap(lambda x: st.sampled_from([repr(x), f"{x:.17g}", f"{x:.25e}", f"{x:E}", f"{x:.3e}"])),
     st.from_regex(r"-?[0-9]{1,25}(\.[0-9]{0,25})?([eE][+-]?[0-9]{1,2})?", fullmatch=True),
     st.from_regex(r"-?\.[0-9]{1,25}", fullmatch=True),
     st.floats(-2.3e-308, 2.3e-308).map(repr),
@@ -176,18 +174,17 @@ WORDS = st.one_of(
             "5e-324",
             "2.4703282292062327208e-324",
             "2.2250738585072011e-308",
-            "1.7976931348623157e308",
-            "9007199254740993",
-            "9007199254740992.99999999999999999",
-            "9007199254740993.00000000000000001",
+            "900719925.47409930",
+            "900719925.4740992999999999999999",
+            "1000000000",
             "00012.50",
             "0.1000000000000000055511151231257827021181583404541015625",
-            "1e23",
-            "8.5e22",
-            "7.2057594037927933e16",
+            "1e-23",
+            "8.5e-22",
+            "7.2057594037927933e-16",
         ]
     ),
-).filter(lambda word: math.isfinite(float(word)))
+).filter(lambda word: abs(float(word)) <= 1e9)
 
 
 @settings(max_examples=20)
@@ -199,7 +196,7 @@ def test_numbers_are_what_float_says_to_the_bit(tmp_path_factory: pytest.TempPat
     assert_array_equal(numbers_of(read_label(path, raw=True)).view(np.int64), want.view(np.int64))
 
 
-@pytest.mark.parametrize("word", ["nan", "NaN", "NAN", "-nan", "inf", "-inf", "Infinity", "1e999"])
+@pytest.mark.parametrize("word", ["nan", "NaN", "NAN", "-nan", "inf", "-inf", "Infinity", "1e999", "-1e300", "1e39"])
 def test_a_velocity_that_is_no_number_is_unknown(write, word: str) -> None:
     for raw in (False, True):
         labels = read_label(write(f"{HEADER}\n{PARKED.replace('0.0 0.0', f'{word} 2.5')}"), raw=raw)
@@ -228,6 +225,8 @@ def test_arrays_are_read_only(write) -> None:
         (f"{HEADER}\n{PARKED.replace('-0.000518', 'inf')}", r":2: yaw is 'inf', expected a finite number"),
         (f"{HEADER}\n{PARKED.replace('1.381', '-Infinity')}", r":2: h is '-Infinity', expected a finite number"),
         (f"{HEADER}\n{PARKED.replace('-19.789', '1e400')}", r":2: y is '1e400', expected a finite number"),
+        (f"{HEADER}\n{PARKED.replace('-19.789', '-1e300')}", r":2: y is '-1e300', expected a finite number up to 1e"),
+        (f"{HEADER}\n{PARKED.replace('1.381', '1e39')}", r":2: h is '1e39', expected a finite number up to 1e"),
         (f"{HEADER}\n{PARKED.replace('-0.882', 'low')}", r":2: z is 'low', expected a number"),
         (f"{HEADER}\n{PARKED.replace('-0.882', '1_0')}", r":2: z is '1_0', expected a number"),
         (f"{HEADER}\n{PARKED.replace('0.0 0.0', '0.0 ?')}", r":2: vy is '\?', expected a number"),

@@ -4,7 +4,8 @@ import pytest
 
 from deepaccident_devkit.errors import DatarootError, VersionError
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.release.layout import frame_numbers, frame_sizes
+from deepaccident_devkit.release.layout import frame_numbers, frame_sizes, left_aside
+from deepaccident_devkit.release.store import open_dataroot
 
 ACCIDENT, NORMAL = "type1_subtype1_accident", "type1_subtype2_normal"
 NAME, OTHER = "Town03_type001_subtype0001_scenario00024", "Town10HD_type001_subtype0001_scenario00014"
@@ -191,16 +192,56 @@ def test_frame_sizes_are_those_of_files_with_a_number(tmp_path: Path) -> None:
     assert frame_sizes(tmp_path / "gone", "txt") == frame_sizes(folder / "notes.txt", "txt") == {}
 
 
-def test_a_link_to_itself_is_an_error_that_names_it(root: Path) -> None:
+def test_links_that_lead_to_themselves_or_back_hold_nothing(root: Path) -> None:
     scenario(root)
-    for name in ("notes", "train.txt", "type2_subtype1_accident"):
-        (root / name).symlink_to(name)
-    with pytest.raises(DatarootError, match=r"type2_subtype1_accident: cannot be listed \(.*\); unpack"):
-        find_release(root)
-    (root / "type2_subtype1_accident").unlink()
+    ego = root / ACCIDENT / "ego_vehicle"
+    loops = [root / name for name in ("notes", "train.txt", "train", "type2_subtype1_accident")]
+    loops += [root / ACCIDENT / "infrastructure", ego / "label"]
+    for path in loops:
+        path.symlink_to(path.name)
+    back = {root / "val": root, root / "type1_subtype2_accident": root, root / ACCIDENT / "other_vehicle": ego.parent}
+    for path, end in back.items():
+        path.symlink_to(end)
+    assert found(root) == [("", f"{ACCIDENT}/{NAME}")]
     assert find_release(root).split_files == {"train": root / "train.txt"}
-    link = root / ACCIDENT / "ego_vehicle" / "calib" / "loop"
-    link.symlink_to(link.name)
-    assert [found.name for found in find_release(root).scenarios] == [NAME, "loop"]
-    with pytest.raises(DatarootError, match=r"loop: cannot be listed"):
-        frame_numbers(link, "pkl")
+    with pytest.raises(DatarootError, match=r"label: cannot be listed"):  # told for each scenario
+        frame_numbers(loops[-1], "txt")
+    assert dict(left_aside(root)) == dict.fromkeys([*loops, *back])
+
+
+@pytest.mark.parametrize("name", ["root", "root.zip"])
+def test_a_dataroot_that_links_to_itself(root: Path, name: str) -> None:
+    link = root / name
+    link.symlink_to(name)
+    with pytest.raises(DatarootError, match=rf"{link}: is a link that leads nowhere; give the folder"):
+        find_release(open_dataroot(link))
+    with pytest.raises(DatarootError, match=rf"{root}: no scenario found; {link} is a link"):
+        find_release(open_dataroot(root))
+
+
+COPIES = ("{}-001", "{} (1)", "{} 2", "{}-20240101T000000Z-001", "{} - Copy", "Copy of {}", "{}_old", "{}.1")
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_folders_that_look_like_those_of_a_release_are_named(root: Path, copy: str) -> None:
+    kinds = root / ACCIDENT / "ego_vehicle_behind"
+    expected = {
+        root / copy.format(NORMAL): NORMAL,
+        root / "val" / copy.format(NORMAL): NORMAL,
+        kinds.with_name(copy.format(kinds.name)): kinds.name,
+        kinds.with_name(copy.format("meta")): "meta",
+        kinds / copy.format("Camera_FrontLeft"): "Camera_FrontLeft",
+        kinds / copy.format("calib"): "calib",
+    }
+    for folder in expected:
+        folder.mkdir(parents=True)
+    scenario(root / copy.format("train"))
+    scenario(root / copy.format("DeepAccident_mini") / "DeepAccident_mini")
+    expected |= {root / copy.format(name): name for name in ("train", "DeepAccident_mini")}
+    with pytest.raises(DatarootError, match=rf"^{root}: no scenario found; {root}.* looks like .*: rename it"):
+        find_release(root)
+    scenario(root, agents=("ego_vehicle_behind", "veh1"))
+    (root / copy.format("test")).mkdir()  # holds no scenario
+    aside = dict(left_aside(root))
+    assert (aside.pop(root / ACCIDENT / "veh1") or "").startswith("an agent, of which the release has ego_vehicle, ego")
+    assert aside == expected

@@ -148,6 +148,7 @@ def test_a_pair_with_an_untracked_id_is_no_collision(write) -> None:
         (ACCIDENT.replace("1236 car", "x36 car"), ":1: first id: expected an integer, found 'x36'"),
         (ACCIDENT.replace("1237 car", "12.5 car"), ":1: second id: expected an integer, found '12.5'"),
         (ACCIDENT.replace("6790.168605131015", "hard"), ":1: impact: expected a finite number, found 'hard'"),
+        (ACCIDENT.replace("6790.168605131015", "1e300"), ":1: impact: expected a finite number, found '1e300'"),
         (ACCIDENT.replace("6790.168605131015", "nan"), ":1: impact: expected a finite number, found 'nan'"),
         ("\n\n" + ACCIDENT.replace("78", "many"), ":3: simulated frames: expected an integer, found 'many'"),
         (ACCIDENT.replace("ego_behind other", "ego_behind"), ":2: expected two of ego, ego_behind, .*'ego_behind_b"),

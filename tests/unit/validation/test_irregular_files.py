@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import DatarootError, ReleaseError, SensorFileError
+from deepaccident_devkit.errors import ReleaseError, SensorFileError
 from deepaccident_devkit.release import (
     read_bev,
     read_calib,
@@ -89,11 +89,11 @@ def test_links_to_themselves_are_findings(small: Path, pattern: str, code: str) 
     assert "Too many levels of symbolic links" in found[0].what
 
 
-def test_a_scenario_type_that_is_a_link_to_itself_is_an_error(small: Path) -> None:
+def test_a_scenario_type_that_is_a_link_to_itself_is_a_note(small: Path) -> None:
     (small / "type2_subtype1_normal").symlink_to("type2_subtype1_normal")
-    for look in (validate_release, lambda root: DeepAccident(dataroot=root, on_error="skip", verbose=False)):
-        with pytest.raises(DatarootError, match=r"type2_subtype1_normal: cannot be listed"):
-            look(small)
+    (note,) = [one for one in validate_release(small, workers=1).findings if one.scenario is None]
+    assert (note.code, note.severity, Path(note.where).name) == ("link-leads-nowhere", "note", "type2_subtype1_normal")
+    assert len(DeepAccident(dataroot=small, workers=1, verbose=False).scenario) == 1
 
 
 def test_a_link_to_a_folder_above_goes_no_deeper(small: Path) -> None:

@@ -220,6 +220,25 @@ def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
     )
     known = {finding.code for finding in report.findings if finding.known}
     assert {"sheer-curtain", "no-collision-in-accident", "meta-incomplete"} <= known
+    for number, code, is_known in ((28, "known-collision-in-normal", True), (27, "collision-in-normal", False)):
+        name = f"Town07_type001_subtype0002_scenario000{number}"
+        root = tiny.write_tiny_release(tmp_path / str(number), scenario_type="type1_subtype2_normal", name=name)
+        (finding,) = [each for each in validate_release(root).findings if "collision" in each.code]
+        assert (finding.code, finding.known, finding.severity == "note") == (code, is_known, is_known)
+
+
+def test_what_is_left_aside_is_named(tmp_path: Path) -> None:
+    root = tiny.write_tiny_release(tmp_path / "release")
+    copy, loop = root / f"{tiny.TYPE} (1)", root / tiny.TYPE / "loop"
+    tiny.write_tiny_release(copy.parent, scenario_type=copy.name)
+    loop.symlink_to(root)
+    told = [found for found in validate_release(root, workers=1).findings if found.scenario is None]
+    assert [(found.code, found.severity, found.where) for found in told] == [
+        ("folder-left-aside", "warning", str(copy)),
+        ("link-leads-nowhere", "note", str(loop)),
+    ]
+    assert told[0].what == f"is not read; it looks like {tiny.TYPE}"
+    assert [found for found in validate_release(root, scenarios=[tiny.TOKEN]).findings if not found.scenario] == []
 
 
 @pytest.mark.slow
@@ -257,6 +276,8 @@ def test_images_out_of_sequence() -> None:
         foreign = {**smooth, frame: rng.uniform(0, 255, (18, 32, 3))}
         assert out_of_sequence(foreign) == [frame]
     assert out_of_sequence({1: smooth[1], 2: foreign[8]}) == []  # two pictures have no sequence
+    assert out_of_sequence({1: smooth[1], 2: smooth[2], 28: foreign[8], 29: smooth[3], 51: smooth[1]}) == []
+    assert out_of_sequence({**smooth, 20: foreign[8], 31: smooth[1], 32: foreign[8], 33: smooth[3]}) == [32]
 
 
 @pytest.mark.parametrize(("place", "is_told"), [(0, True), (-1, False)])

@@ -33,14 +33,16 @@ from deepaccident_devkit.evaluation.metrics.alarms.raised import (
     within_horizon,
 )
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, UNPLACED_NOTE, AccidentContext, BoxTruth
 from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.text import settle_choices
 
-_LEFT_OUT = ("unjudged", "beyond", "at_impact")
+_ASIDE = ("at_impact", "unplaced")
+"""Why nothing else of a sample counts."""
+_LEFT_OUT = ("unjudged", "beyond", *_ASIDE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +62,8 @@ class BoxAccidentResult(AccidentResult):
         unjudged: alarms that nothing can refute: no accident is known, and they are for a time after the recording.
         beyond: alarms for later than the horizon, which do not count.
         at_impact: samples at the impact itself, where nothing is foreseen any more; they are left out of all else.
+        unplaced: samples before an accident of which no label shows both actors (meta names one that has none, or one
+            twice); likewise.
     """
 
     precision: float | None
@@ -70,6 +74,7 @@ class BoxAccidentResult(AccidentResult):
     unjudged: int
     beyond: int
     at_impact: int
+    unplaced: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +146,8 @@ class BoxAccidents:
         Returns:
             `positive`: whether an accident comes; `named`: whom the boxes bring nearer to each other than the danger
             distance (of `NAMED`); `alarms`: the surest first; `unjudged` and `beyond`: how many were left out, and how
-            many do not count; `at_impact`: whether the impact is now, so that nothing else of the sample counts.
+            many do not count; `at_impact` and `unplaced`: whether the impact is now, or comes but cannot be compared
+            with, so that nothing else of the sample counts.
 
         Raises:
             EvaluationError: the context has no truth, or the prediction is neither maps nor accidents.
@@ -163,6 +169,7 @@ class BoxAccidents:
             "unjudged": len(within) - len(judged),
             "beyond": len(raised) - len(within),
             "at_impact": truth.accident is not None and truth.accident.time < SLACK,
+            "unplaced": truth.is_unplaced,
         }
 
     def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
@@ -175,6 +182,8 @@ class BoxAccidents:
         at = base.within[self.scoring.errors_at]
         late = given["beyond"]
         beyond = [f"{late} alarms are for later than the horizon and do not count"] if late else []
+        if given["unplaced"]:
+            beyond.append(UNPLACED_NOTE.format(given["unplaced"]))
         return BoxAccidentResult(
             **{each.name: getattr(base, each.name) for each in fields(AccidentResult) if each.name != "notes"},
             notes=(*base.notes, *beyond),
@@ -195,7 +204,7 @@ class BoxAccidents:
 
         Returns:
             `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
-            `false_samples`: how many raise an alarm without an accident to come; `unjudged`, `beyond`, `at_impact`.
+            `false_samples`: how many raise an alarm without an accident to come; and of `_LEFT_OUT` each.
         """
         given = [each if "tally" in each else self._tallied(each) for each in counts]
         return {
@@ -206,11 +215,11 @@ class BoxAccidents:
         }
 
     def _tallied(self, sample: Counts) -> dict[str, Any]:
-        if sample["at_impact"]:
+        if any(sample[name] for name in _ASIDE):
             return (
                 {"tally": united([]), "alarms": [], "lateness": []}
                 | dict.fromkeys(("false_samples", *_LEFT_OUT), 0)
-                | {"at_impact": 1}
+                | {name: int(sample[name]) for name in _ASIDE}
             )
         alarms: Sequence[Alarm] = sample["alarms"]
         hit = self.scoring.hit(alarms, self.scoring.errors_at) if sample["positive"] else None
@@ -219,9 +228,8 @@ class BoxAccidents:
             "alarms": [[alarm["score"], alarm is hit] for alarm in alarms],
             "lateness": [] if hit is None else [hit["time"]],
             "false_samples": int(bool(alarms) and not sample["positive"]),
-            "unjudged": sample["unjudged"],
-            "beyond": sample["beyond"],
-            "at_impact": 0,
+            **{name: sample[name] for name in ("unjudged", "beyond")},
+            **dict.fromkeys(_ASIDE, 0),
         }
 
     def _is_judged(self, accident: Accident, truth: BoxTruth) -> bool:

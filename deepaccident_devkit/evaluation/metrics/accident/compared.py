@@ -31,10 +31,12 @@ class ComparedAccidents(ShortRepr):
     Attributes:
         true: the accident to come, by the protocol; None without one.
         predicted: the accidents foreseen, one for each alarm, or for each prediction with one.
+        unplaced: seconds to an impact within the horizon that no place is known of (`BoxTruth.unplaced`); None without.
     """
 
     true: Accident | None
     predicted: tuple[Accident, ...]
+    unplaced: float | None = None
 
 
 def compared_accidents(
@@ -64,7 +66,8 @@ def compared_accidents(
             "context: the protocol 'boxes' needs its truth; make it with accident_context(…, horizon)"
         )
     alarms = named_alarms(given, label, context.truth, protocol)
-    return ComparedAccidents(true=true, predicted=tuple(alarm for alarm, _ in alarms))
+    unplaced = context.truth.unplaced if context.truth.is_unplaced else None
+    return ComparedAccidents(true=true, predicted=tuple(alarm for alarm, _ in alarms), unplaced=unplaced)
 
 
 def _released(

@@ -18,6 +18,7 @@ from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.geometry.footprints import gaps
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
+from deepaccident_devkit.v2x.collisions import labelled_pair
 from deepaccident_devkit.v2x.seen import seen_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
@@ -25,6 +26,10 @@ RELEASED_HORIZON: Final = 2.0
 """Seconds that the released models look ahead."""
 SLACK: Final = FRAME_PERIOD / 2
 """Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
+UNPLACED_NOTE: Final = (
+    "{} samples are of accidents of which no label shows both actors (meta names one without a label, or one twice); "
+    "they are left out"
+)
 _MOVES: Final = 0.5
 """Metres that an actor must cover in the window to count as moving."""
 Involvement = Literal["ego_involved", "bystander", "infrastructure"]
@@ -42,9 +47,12 @@ class BoxTruth(FrozenArrays):
         actor_id: (A,) int64, ascending.
         footprint: (F, A, 5) float64 x forward, y left, length, width, yaw in the present ego frame, metres and radians;
             NaN where nobody annotated the actor.
-        accident: the accident within the horizon, by meta: the pair at the impact; None without one.
-        impact: the same at any time ahead; None also if it is beyond the horizon and no label shows one of the pair.
+        accident: the accident within the horizon, by meta: the pair at the impact; None without one, or if it is
+            `unplaced`.
+        impact: the same at any time ahead.
         horizon: seconds that predictions look ahead: a later alarm does not count. Infinite without a limit.
+        unplaced: seconds to an impact, at any time ahead, of which no label shows both actors, so that no prediction
+            can be compared with it; None without one.
     """
 
     time: FloatArray
@@ -53,6 +61,12 @@ class BoxTruth(FrozenArrays):
     accident: Accident | None
     impact: Accident | None = None
     horizon: float = math.inf
+    unplaced: float | None = None
+
+    @property
+    def is_unplaced(self) -> bool:
+        """Whether an accident comes within the horizon that is `unplaced`."""
+        return self.unplaced is not None and self.unplaced <= self.horizon + SLACK
 
     def tracks(self, seconds: float, frames: int) -> InstanceTracks:
         """The actors' centres at so many frames, so many seconds apart, from the present on; NaN beyond the window."""
@@ -182,8 +196,7 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
 
     Raises:
         TokenError: no such sample.
-        NotAvailableError: the sample has no label, the scenario has no meta file, or no label ever shows one of the
-            pair.
+        NotAvailableError: the sample has no label, or the scenario has no meta file.
     """
     there = labelled_sample(dataset, sample)
     scenario = dataset.get("scenario", there["scenario_token"])
@@ -204,19 +217,18 @@ def _box_truth(
     actors, which = np.unique(tracks.actor_id[inside], return_inverse=True)
     footprint = np.full((last - present + 1, len(actors), 5), np.nan)
     footprint[tracks.index[inside] - present, which] = footprints[inside]
-    time_to_impact, impact = there["time_to_impact"], None
-    within = time_to_impact is not None and time_to_impact <= horizon + SLACK
-    if time_to_impact is not None and (within or np.isin(scenario["collision"]["ids"], tracks.actor_id).all()):
-        first, second = scenario["collision"]["ids"]
-        positions = [_last_position(tracks, footprints, actor, scenario["token"]) for actor in (first, second)]
-        impact = Accident(positions=np.array(positions), time=time_to_impact, ids=(first, second))
+    ahead, pair, impact = there["time_to_impact"], labelled_pair(scenario["collision"], tracks.actor_id), None
+    if ahead is not None and pair is not None:
+        rows = [np.flatnonzero(tracks.actor_id == actor)[-1] for actor in pair]
+        impact = Accident(positions=footprints[rows, :2], time=ahead, ids=pair)
     return BoxTruth(
         time=np.arange(last - present + 1) * FRAME_PERIOD,
         actor_id=actors,
         footprint=footprint,
-        accident=impact if within else None,
+        accident=None if impact is None or impact.time > horizon + SLACK else impact,
         impact=impact,
         horizon=horizon,
+        unplaced=ahead if impact is None else None,
     )
 
 
@@ -229,14 +241,6 @@ def labelled_sample(dataset: Dataset, sample: RowArgument) -> Any:
             "choose a labelled sample"
         )
     return record
-
-
-def _last_position(tracks: ScenarioTracks, footprints: FloatArray, actor: int, scenario: str) -> FloatArray:
-    rows = np.flatnonzero(tracks.actor_id == actor)
-    if not len(rows):
-        raise NotAvailableError(f"{scenario}: no label shows actor {actor}, who collides; leave its samples out")
-    position: FloatArray = footprints[rows[-1], :2]
-    return position
 
 
 def _twin_of(dataset: Dataset, scenario: Mapping[str, Any]) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, as_numbers, checked
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
@@ -118,6 +118,15 @@ class BoxColumns:
     def select(self, which: AnyArray) -> BoxColumns:
         """The boxes that a mask or an array of rows picks."""
         return BoxColumns(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
+
+    @property
+    def surest_first(self) -> IntArray:
+        """(N,) rows by falling score, equal ones by what is in the boxes: the same boxes in any order of the rows."""
+        return np.lexsort(
+            np.column_stack([-self.score, self.category, self.center, self.size, self.yaw, self.velocity, self.own]).T[
+                ::-1
+            ]
+        )
 
     def rounded(self) -> BoxColumns:
         """The same boxes in single precision; scores stay."""

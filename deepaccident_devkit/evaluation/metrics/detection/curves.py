@@ -22,7 +22,7 @@ class Cell:
 
     Attributes:
         truths: (S,) how many true boxes of each sample count.
-        scores: (N,) of the detections that come into it, falling; equal ones by sample, then as given.
+        scores: (N,) of the detections that come into it, falling; equal ones by sample, then as `rows_taken` has them.
         sample: (N,) the sample of each.
         detected: (N,) 1 where the detection counts.
         tp: (N,) how many more true boxes are found with this detection (0 or 1).

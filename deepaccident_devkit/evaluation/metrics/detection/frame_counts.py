@@ -101,8 +101,8 @@ def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionP
     """Match one sample's detections with its true boxes, both in the protocol's frame, and count."""
     if protocol.single_precision:
         detections, truth = detections.rounded(), truth.rounded()
-    truth = _only(truth, truth_taken(truth, protocol))
-    detections = _only(detections, inside_area(detections, protocol))
+    truth = truth.select(rows_taken(truth, truth_taken(truth, protocol), protocol))
+    detections = detections.select(rows_taken(detections, inside_area(detections, protocol), protocol))
     if protocol.unknown_velocity_is_zero:
         truth = _standing_if_unknown(truth)
     codes, true_codes = class_codes(detections, protocol), class_codes(truth, protocol)
@@ -214,8 +214,13 @@ def _extend(columns: Sequence[list[Any]], *more: Iterable[Any]) -> None:
         column.extend(values)
 
 
-def _only(boxes: BoxColumns, which: BoolArray) -> BoxColumns:
-    return boxes if which.all() else boxes.select(which)
+def rows_taken(boxes: BoxColumns, which: BoolArray, protocol: DetectionProtocol) -> IntArray:
+    """The rows that a mask picks, in the order that decides between equal scores and equal distances.
+
+    For matching `by_truth` that is the order given; for `by_score` it does not depend on the order given.
+    """
+    rows = np.flatnonzero(which)
+    return rows if protocol.matching == "by_truth" else rows[boxes.select(rows).surest_first]
 
 
 def truth_taken(truth: BoxColumns, protocol: DetectionProtocol) -> BoolArray:

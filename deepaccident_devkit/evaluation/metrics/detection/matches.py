@@ -10,7 +10,13 @@ import numpy as np
 from deepaccident_devkit.arrays import FrozenArrays, IntArray
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.detection.boxes import DetectedBoxes, columns_of
-from deepaccident_devkit.evaluation.metrics.detection.frame_counts import Ring, inside_area, ring_of, truth_taken
+from deepaccident_devkit.evaluation.metrics.detection.frame_counts import (
+    Ring,
+    inside_area,
+    ring_of,
+    rows_taken,
+    truth_taken,
+)
 from deepaccident_devkit.evaluation.metrics.detection.matching import nearest_by_score, nearest_by_truth
 from deepaccident_devkit.evaluation.metrics.detection.protocols import DetectionProtocol, detection_protocol
 from deepaccident_devkit.geometry import Boxes
@@ -62,8 +68,8 @@ def detection_matches(
     detected, true = columns_of(prediction.boxes, prediction.scores), columns_of(truth)
     if rules.single_precision:
         detected, true = detected.rounded(), true.rounded()
-    rows = np.flatnonzero(inside_area(detected, rules))
-    true_rows = np.flatnonzero(truth_taken(true, rules))
+    rows = rows_taken(detected, inside_area(detected, rules), rules)
+    true_rows = rows_taken(true, truth_taken(true, rules), rules)
     detected, true = detected.select(rows), true.select(true_rows)
     pairs: list[tuple[int, int]] = []
     unmatched: set[int] = set()
@@ -72,16 +78,16 @@ def detection_matches(
         ring = ring_of(detected, true, rules, position)
         holder = _holders(ring, rules, rules.thresholds.index(chosen))
         counts, true_counts = ring.counts, ring.truth_counts
-        pairs += [(by, one) for one, by in holder.items() if counts[by] and true_counts[one]]
+        pairs += [(rows[by], true_rows[one]) for one, by in holder.items() if counts[by] and true_counts[one]]
         unmatched |= {*np.flatnonzero(counts).tolist()} - {*holder.values()}
         missed |= {*np.flatnonzero(true_counts).tolist()} - {*holder}
     matched = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     return DetectionMatches(
         threshold=chosen,
-        detection=rows[matched[:, 0]],
-        truth=true_rows[matched[:, 1]],
-        false=rows[sorted(unmatched)],
-        missed=true_rows[sorted(missed)],
+        detection=matched[:, 0],
+        truth=matched[:, 1],
+        false=np.sort(rows[list(unmatched)]),
+        missed=np.sort(true_rows[list(missed)]),
     )
 
 

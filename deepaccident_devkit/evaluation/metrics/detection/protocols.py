@@ -66,8 +66,9 @@ class DetectionProtocol:
         small_thresholds: those of cyclists, motorcycles and pedestrians; None for the same.
         threshold_included: what is exactly at the threshold matches.
         matching: `by_truth`: each true box in the label's order takes the nearest detection (and, to choose the points
-            of the curve, the one with the highest score); `by_score`: each detection in the order of scores takes the
-            nearest true box.
+            of the curve, the one with the highest score, of equal ones the first); `by_score`: each detection in the
+            order of scores takes the nearest true box. Equal scores are then in the order of the samples' tokens, and
+            in a sample in that of what is in the boxes, so that the order of the boxes does not count.
         curve: how precision and recall become an average precision: `released`: the mean precision at the scores at
             which recall first exceeds multiples of 1/points (0 where it never does, no envelope); `nuscenes`:
             interpolated at `points` levels of recall from 0 to 1; `voc`: the area under the envelope.

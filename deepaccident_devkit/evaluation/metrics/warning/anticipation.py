@@ -24,6 +24,7 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
     ScoresOf,
     by_group,
     drives_of,
+    left_out_notes,
     parts_of,
     series_of,
     twin_pairs,
@@ -258,8 +259,6 @@ def _notes(counts: Collection[Counts], drives: Sequence[Drive], rules: CleanWarn
             "the operating point is that of a recall of 0.8, or the highest, on these very recordings; choose it on "
             "another split with --threshold-from, or give it with --switch threshold=…"
         )
-    beyond = sum(each["beyond"] for each in counts)
-    if beyond:
-        yield f"{beyond} alarms are for later than the horizon and do not count"
+    yield from left_out_notes(counts)
     if drives and not any(each["references"] for each in counts):
         yield "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"

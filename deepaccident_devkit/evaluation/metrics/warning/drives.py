@@ -14,10 +14,10 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.alarms.truth import REFERENCES, Involvement
+from deepaccident_devkit.evaluation.metrics.alarms.truth import REFERENCES, UNPLACED_NOTE, Involvement
 from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.warning.recordings import Kind, surest
+from deepaccident_devkit.evaluation.metrics.warning.recordings import UNPLACED, Kind, surest
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -71,12 +71,24 @@ def parts_of(counts: Collection[Counts]) -> list[Sequence[Counts]]:
 
 
 def drives_of(parts: Sequence[Collection[Counts]]) -> list[Drive]:
-    """The recordings of each part's samples, by name."""
+    """The recordings of each part's samples, by name; those of unplaced accidents (`recordings.UNPLACED`) left out."""
     return [
         _drive(name, list(those), part)
         for part, counts in enumerate(parts)
-        for name, those in groupby(sorted(counts, key=_PLACE), key=itemgetter("recording"))
+        for name, those in groupby(
+            sorted((each for each in counts if each["kind"] != UNPLACED), key=_PLACE), key=itemgetter("recording")
+        )
     ]
+
+
+def left_out_notes(samples: Collection[Counts]) -> Iterator[str]:
+    """What is said of samples and alarms that do not count."""
+    unplaced = sum(each["kind"] == UNPLACED for each in samples)
+    if unplaced:
+        yield UNPLACED_NOTE.format(unplaced)
+    beyond = sum(each["beyond"] for each in samples)
+    if beyond:
+        yield f"{beyond} alarms are for later than the horizon and do not count"
 
 
 def series_of(drives: Sequence[Drive], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:

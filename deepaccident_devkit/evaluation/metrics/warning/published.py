@@ -15,6 +15,7 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
     ScoresOf,
     by_group,
     drives_of,
+    left_out_notes,
     parts_of,
     series_of,
 )
@@ -81,7 +82,7 @@ class FieldWarnings(WarningRules):
             for predictor in (PREDICTORS if references else PREDICTORS[:1])
         }
         given = made.pop(GIVEN)
-        notes = [f"{name}: {each.note}" for name, each in given.items() if each.note]
+        notes = [*left_out_notes(samples), *(f"{name}: {each.note}" for name, each in given.items() if each.note)]
         return FieldResult(
             samples=len(samples),
             figures=given,

@@ -30,19 +30,22 @@ Kind = Literal["accident", "twins", "others"]
 Tally = Mapping[str, Any]
 """Of some recordings, as JSON holds it; `united` adds several up.
 
-Numbers: `samples`, `alarms`, `right` (alarms that are), `unjudged`, `beyond`. `step`: frames, the smallest from a
-sample to the next one of its recording; None where no recording has two. For each `Kind` under its name: `recordings`,
-`alarmed` (those with a false alarm), `seen` (samples before the impact whose alarms are judged), `frames` (that the
-samples of recordings with several stand for), `lone` (recordings of a single sample), `false` (the score of the surest
-false alarm of each sample that has one) and `lasting` (the lower one of two such scores, of samples next to each
-other). Of accidents: `reach`, `first` and `steady`: frames before the impact of the first sample, of the first right
-alarm, and of that from which on each sample has one, of each recording that has it; `gains`: rows of score, how many
-frames more the first right alarm is before the impact if alarms of this score count too, and whether it is the
+Numbers: `samples`, `alarms`, `right` (alarms that are), `unjudged`, `beyond`, `unplaced` (samples). `step`: frames, the
+smallest from a sample to the next one of its recording; None where no recording has two. For each `Kind` under its
+name: `recordings`, `alarmed` (those with a false alarm), `seen` (samples before the impact whose alarms are judged),
+`frames` (that the samples of recordings with several stand for), `lone` (recordings of a single sample), `false` (the
+score of the surest false alarm of each sample that has one) and `lasting` (the lower one of two such scores, of samples
+next to each other). Of accidents: `reach`, `first` and `steady`: frames before the impact of the first sample, of the
+first right alarm, and of that from which on each sample has one, of each recording that has it; `gains`: rows of score,
+how many frames more the first right alarm is before the impact if alarms of this score count too, and whether it is the
 recording's surest; `reached` and `in_time`: for each lead, the curve's at last, how many recordings have samples as
 early, and the score of the surest right alarm as early of each that has one.
 """
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-_NUMBERS: Final = ("samples", "alarms", "right", "unjudged", "beyond")
+UNPLACED: Final = "unplaced"
+"""In place of the kind: somebody collides, but no label shows with whom (`BoxTruth.unplaced`); such samples are counted
+and left out, since no alarm in them can be called right or false."""
+_NUMBERS: Final = ("samples", "alarms", "right", "unjudged", "beyond", UNPLACED)
 _KIND_NUMBERS: Final = ("recordings", "alarmed", "seen", "frames", "lone")
 _LISTS: Final = ("reach", "first", "steady", "gains")
 
@@ -57,7 +60,8 @@ def sample_counts(
     """What one sample adds, the same for all warning protocols.
 
     Returns:
-        `recording`: scenario and agent; `frame`: its number there; `kind` and `involvement` of the recording; `ahead`:
+        `recording`: scenario and agent; `frame`: its number there; `kind` (or `UNPLACED`) and `involvement` of the
+        recording; `ahead`:
         recorded frames to the impact, None without one; `to_end`: the same, of a twin to the accident's impact;
         `alarms`: [score, whether it is right], the surest first; `unjudged`: scores of those that nothing can refute;
         `beyond`: how many are for later than the horizon, and so none; `references`: of each of `REFERENCES` the scores
@@ -75,7 +79,7 @@ def sample_counts(
         )
     raised = named_alarms(checked_prediction(prediction), label, truth, rules)
     within = within_horizon(raised, truth)
-    ahead, kind = context.time_to_impact, _kind(context)
+    ahead, kind = context.time_to_impact, _kind(context) if truth.unplaced is None else UNPLACED
     judged = [each for each in within if ahead is not None or each[0].time <= to_end + SLACK]
     end = context.time_to_twin_impact if kind == "twins" else ahead
     return {
@@ -95,7 +99,7 @@ def sample_counts(
     }
 
 
-def surest(alarms: Sequence[Sequence[float]], kind: Kind) -> list[float | None]:
+def surest(alarms: Sequence[Sequence[float]], kind: str) -> list[float | None]:
     """The scores of the surest right alarm and of the surest one, None for none; [score, whether it is right] of each.
 
     Where nobody collides no alarm is right, and both are of the surest one.
@@ -109,12 +113,13 @@ def tally_of(counts: Collection[Counts], protocol: WarningProtocol) -> Tally:
 
     In accident recordings samples at the impact or after it are left out, since no alarm warns there any more.
     """
-    samples = [each for each in counts if "recording" in each]
+    samples = [each for each in counts if "recording" in each and each["kind"] != UNPLACED]
+    unplaced = {**united([], protocol), UNPLACED: sum(each.get("kind") == UNPLACED for each in counts)}
     of_recordings = [
         _recording_tally(list(those), protocol)
         for _, those in groupby(sorted(samples, key=itemgetter("recording", "frame")), key=itemgetter("recording"))
     ]
-    return united([*of_recordings, *(each for each in counts if "recording" not in each)], protocol)
+    return united([unplaced, *of_recordings, *(each for each in counts if "recording" not in each)], protocol)
 
 
 def united(tallies: Sequence[Tally], protocol: WarningProtocol) -> Tally:
@@ -189,6 +194,7 @@ def _recording_tally(given: Sequence[Counts], protocol: WarningProtocol) -> Tall
         "right": sum(right for _, right in alarms),
         "unjudged": len(unjudged),
         "beyond": sum(each["beyond"] for each in given),
+        UNPLACED: 0,
         "step": step,
         **nothing,
         kind: _false_alarms(samples, step),

@@ -11,11 +11,12 @@ from typing import ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays
+from deepaccident_devkit.evaluation.metrics.alarms.truth import UNPLACED_NOTE
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
-from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS, Tally, kind_united
+from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS, UNPLACED, Tally, kind_united
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _PER_SECOND: Final = round(1 / FRAME_PERIOD)
@@ -229,6 +230,8 @@ def _notes(tally: Tally, protocol: WarningProtocol) -> Iterator[str]:
             yield f"only {reached} of {accidents} accident recordings have samples {lead:g} s before the impact"
     if tally["unjudged"]:
         yield f"{tally['unjudged']} alarms are for later than their recording goes on and were left out"
+    if tally[UNPLACED]:
+        yield UNPLACED_NOTE.format(tally[UNPLACED])
     if tally["beyond"]:
         yield f"{tally['beyond']} alarms are for later than the horizon and do not count"
     lone = sum(tally[kind]["lone"] for kind in KINDS)

@@ -9,6 +9,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
 from deepaccident_devkit.geometry import Boxes
 
 _FEWEST: Final = 10
@@ -29,7 +30,7 @@ _TILTED: Final = 0.2
 
 def box_counts(found: DetectedBoxes) -> list[int]:
     """Of a sample's surest boxes, in the world: how many there are, have a twin, and do not stand."""
-    boxes = found.boxes.select(np.argsort(-found.scores, kind="stable")[:_SUREST])
+    boxes = found.boxes.select(columns_of(found.boxes, found.scores).surest_first[:_SUREST])
     return [len(boxes), int(np.count_nonzero(_has_twin(boxes))), int(np.count_nonzero(~_stands(boxes)))]
 
 

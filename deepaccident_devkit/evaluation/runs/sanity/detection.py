@@ -11,6 +11,7 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
 from deepaccident_devkit.evaluation.runs.sanity.pairs import NEAR, pair_suspicions, pair_tallies
 from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, SYMMETRIES, Group, Suspicion, scale_says, tally
 from deepaccident_devkit.geometry import SE3, Boxes
@@ -123,7 +124,7 @@ def detection_tallies(raw: DetectedBoxes, found: DetectedBoxes, moments: Detecti
         moments: the truth.
     """
     truth = moments.truth
-    surest = np.argsort(-found.scores, kind="stable")[: 2 * len(truth)]
+    surest = columns_of(found.boxes, found.scores).surest_first[: 2 * len(truth)]
     center, in_world = found.boxes.center[surest], raw.boxes.center[surest]
     right = truth.center
     level = _found(center, right, 2, NEAR)

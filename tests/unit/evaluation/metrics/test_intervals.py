@@ -152,6 +152,14 @@ def test_each_number_for_itself() -> None:
     assert_allclose(interval_ends(values * 100, left_out * 100, ranges * [1, 100], 0.95)[0][0], 100 * together[0][0])
 
 
+@pytest.mark.parametrize(("share", "end"), [(0.0, 0), (1.0, 1)])
+def test_a_share_of_none_or_all_ends_there_exactly(share: float, end: int) -> None:
+    for count in range(LEAST_CLUSTERS, 400):
+        ends = interval_ends(np.array([share]), np.full((count, 1), share), np.array([[0, 1]]), 0.95)
+        assert ends[end] == share
+        assert ends[1 - end] != share
+
+
 def test_at_the_least_number_of_clusters_it_is_that_they_are_alike() -> None:
     few, alike = _notes({"few": LEAST_CLUSTERS - 1, "alike": LEAST_CLUSTERS})
     assert few.startswith("no interval of few: fewer than")

@@ -17,7 +17,7 @@ import numpy as np
 import plain_results as plain
 import pytest
 
-from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.errors import MOST_SAID, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 
 FIRST, SECOND, THIRD = plain.TOKENS
@@ -523,7 +523,7 @@ def test_long_words_are_cut_in_messages(tmp_path: Path, change: dict[str, Any]) 
     path = plain.write_json(tmp_path / "long.json", plain.accidents() | change)
     with pytest.raises(ResultsError, match=r"long\.json: ") as raised:
         read_results(path)
-    assert len(str(raised.value)) < 1000
+    assert len(str(raised.value)) <= MOST_SAID
 
 
 def test_a_member_that_is_too_much(tmp_path: Path) -> None:
@@ -599,7 +599,7 @@ def test_what_is_no_results_file(tmp_path: Path) -> None:
     (tmp_path / "packed.json.gz").write_bytes(gzip.compress(b"{}"))
     refused(tmp_path / "packed.json.gz", "packed.json.gz: is compressed with gzip; unpack it")
     refused(tmp_path / ("long" * 100), "cannot be read (", "File name too long")
-    refused(tmp_path / "a\0b", "cannot be read (embedded null byte)")
+    refused(tmp_path / "a\0b", "expected a path, found ")
     folder = plain.write_motion(tmp_path / "motion")
     (folder / "results.json").rename(folder / "manifest.json")
     refused(folder / "manifest.json", "is the manifest of motion results; call it results.json")

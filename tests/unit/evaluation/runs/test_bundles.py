@@ -142,6 +142,14 @@ class TestPlaces:
         assert read_bundle(folder).summary["sanity"] == {"warnings": []}
         assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["bundle"]
 
+    def test_a_link_to_one_is_replaced_itself(self, run: EvaluationRun, tmp_path: Path) -> None:
+        folder = save_run(run, tmp_path / "bundle")
+        (tmp_path / "latest").symlink_to(folder)
+        before = {path.name: path.read_bytes() for path in folder.iterdir()}
+        save_run(replace(run, sanity={}), tmp_path / "latest", overwrite=True)
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+        assert read_bundle(tmp_path / "latest").summary["sanity"] == {}
+
     def test_the_earlier_one_stays_if_the_new_one_fails(
         self, run: EvaluationRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

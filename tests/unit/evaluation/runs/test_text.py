@@ -37,7 +37,7 @@ def test_what_it_tells(run: EvaluationRun) -> None:
     assert "number value" in lines
     assert "position_error 0.283 m" in lines
     assert "no intervals: of 1 cluster (an accident and its twin are one); at least 6 are needed" in lines
-    assert "samples 6, positives 3, negatives 3, unjudged 0, beyond 0, at_impact 0" in lines
+    assert "samples 6, positives 3, negatives 3, unjudged 0, beyond 0, at_impact 0, unplaced 0" in lines
     assert "within/5 tp 3, fp 0, fn 0" in lines
     assert lines[lines.index("by agent") + 1].startswith(
         "value samples scenarios apa precision recall false_alarm_rate"

@@ -97,7 +97,8 @@ def remove_scenario(root: Path, token: str) -> None:
 def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
     plans: list[tuple[Plan, int]] = []
     done = written(small, tmp_path / "deep" / "out", on_plan=lambda plan, free: plans.append((plan, free)))
-    files = {name for name, content in contents(done.folder).items() if content is not None}
+    there = {name for name, content in contents(done.folder).items() if content is not None}
+    files = {name for name in there if not name.startswith(".deepaccident-parts/tiny/")}
     assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 2
     assert {MANIFEST, ".deepaccident.lock", "counts.json"} < files
     assert plans == [(done.plan, plans[0][1])]
@@ -112,7 +113,9 @@ def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
     )
     hashes = scenario_hashes(small, [record["token"] for record in small.scenario])
     assert told["release"]["fingerprint"] == fingerprint(hashes)
-    assert told["release"]["scenarios"] == {token: each.as_dict() for token, each in hashes.items()}
+    states = told["release"]["scenarios"]
+    assert all(len(state.pop("sensors")) == 32 for state in states.values())
+    assert states == {token: each.as_dict() for token, each in hashes.items()}
     assert told["settings"] == {
         "split": None,
         "where": [],
@@ -236,7 +239,8 @@ def test_an_export_beside_another(small: DeepAccident, tmp_path: Path, monkeypat
     monkeypatch.setattr(Beside, "write", lambda *_: None)
     monkeypatch.setattr(Beside, "finish", lambda *_: None)
     written(small, out, Beside())
-    assert contents(out).keys() - before.keys() == {"beside.manifest.json"}
+    new = contents(out).keys() - before.keys()
+    assert {name for name in new if not name.startswith(".deepaccident-parts/beside")} == {"beside.manifest.json"}
     assert written(small, out).kept == SCENARIOS
     with pytest.raises(ExportError, match="is not empty"):
         written(small, written(small, tmp_path / "other", Beside()).folder)
@@ -269,6 +273,69 @@ class TestRelease:
         mine.write_text("\n".join(names[:2]))
         with pytest.raises(ExportError, match=rf"1 scenarios .*such as {names[1 if grows else 2].replace(' ', '/')}"):
             written(small, tmp_path / "out", form)
+
+    @pytest.mark.parametrize("units", [1, SCENARIOS])
+    @pytest.mark.parametrize("change", ["comes", "goes", "another size"])
+    def test_only_what_has_other_sensor_files_is_made_again(
+        self, changing: Path, tmp_path: Path, units: int, change: str
+    ) -> None:
+        """Of a complete export, and of one that was stopped; then the same as one that was made now."""
+        token = next(iter(DeepAccident(dataroot=changing, verbose=False).scenario))["token"]
+        path, *_ = changing.glob(f"{token.replace('/', '/ego_vehicle/Camera_Front/')}/*_002.jpg")
+        content = path.read_bytes()
+        if change == "comes":
+            path.unlink()
+        out = tmp_path / "out"
+        if units < SCENARIOS:
+            stopped(reopened(changing), out, units)
+        else:
+            written(reopened(changing), out)
+        before = states(out)
+        path.unlink(missing_ok=True)
+        if change != "goes":
+            path.write_bytes(content + (b"\0" if change == "another size" else b""))
+        done = written(reopened(changing), out)
+        assert (done.written, done.kept) == (SCENARIOS - units + 1, units - 1)
+        fresh = written(reopened(changing), tmp_path / "fresh")
+        assert (contents(out), done.tally) == (contents(fresh.folder), fresh.tally)
+        kept = {name for name, state in states(out).items() if before.get(name) == state and name.endswith(".txt")}
+        assert len(kept) >= (units - 1) * 4
+        assert written(reopened(changing), out).written == 0
+
+    def test_sensor_files_that_a_format_does_not_need_change_nothing(self, changing: Path, tmp_path: Path) -> None:
+        written(reopened(changing), tmp_path / "out", TinyFormat(agents=("other_vehicle",)))
+        for path in changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg"):
+            path.unlink()
+        assert written(reopened(changing), tmp_path / "out", TinyFormat(agents=("other_vehicle",))).written == 0
+
+    def test_an_export_of_an_earlier_version_is_kept_and_told(
+        self, changing: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        out = written(reopened(changing), tmp_path / "out").folder
+        told = json.loads((out / MANIFEST).read_bytes())
+        for state in told["release"]["scenarios"].values():
+            del state["sensors"]
+        (out / MANIFEST).write_text(json.dumps(told))
+        shutil.rmtree(out / ".deepaccident-parts")
+        before = states(out)
+        assert written(reopened(changing), out).kept == SCENARIOS
+        assert states(out) == before
+        assert "did not note the sensor files; whether some have come or gone since is unknown" in caplog.text
+
+    def test_parts_that_went_are_made_again_with_the_rest(self, changing: Path, tmp_path: Path) -> None:
+        out = written(reopened(changing), tmp_path / "out").folder
+        shutil.rmtree(out / ".deepaccident-parts")
+        assert written(reopened(changing), out).written == 0
+        next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
+        assert written(reopened(changing), out).written == SCENARIOS
+
+    def test_shards_of_a_changed_export(self, changing: Path, tmp_path: Path) -> None:
+        out = written(reopened(changing), tmp_path / "out").folder
+        next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
+        parts = [written(reopened(changing), out, part=f"{number}/2").written for number in (1, 2)]
+        assert sum(parts) == 1
+        assert written(reopened(changing), out, part="merge").kept == SCENARIOS
+        assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
 
     def test_an_unfinished_export_is_continued_with_the_new_state(self, changing: Path, tmp_path: Path) -> None:
         dataset = reopened(changing)

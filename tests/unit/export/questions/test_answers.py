@@ -147,26 +147,29 @@ GOOD: dict[str, Any] = {"accident": [False, 0.7, False], "who": None, "where": [
     ("change", "sentence"),
     [
         ("{", "is no JSON .*; mend that line"),
-        ("[1]", r"expected a JSON object, found \[1\]; mend that line; README.md"),
+        ("[1]", "expected `object`, got `array`; mend that line; README.md"),
         ({"id": "0000"}, "id: '0000' is no question of the truth file; give the truth of these"),
-        ({"id": None}, "id: None is no question"),
-        ({"wher": 1}, "wher: is no field of an answer; mend that line"),
+        ({"id": None}, r"expected `str`, got `null` - at `\$\.id`; mend that line"),
+        ({"wher": 1}, "object contains unknown field `wher`; mend that line"),
         ({"accident": [True]}, "accident: expected 3 times true, false or a probability from 0 to 1, found"),
-        ({"accident": [0, 0, 1.2]}, "accident: expected 3 times true"),
-        ({"accident": [0, 0, "yes"]}, "accident: expected 3 times true"),
-        ({"accident": True}, "accident: expected 3 times true"),
-        ({"who": ["ego"]}, "who: expected two names, or null, found"),
+        ({"accident": [0, 0, 1.2]}, r"expected `float` <= 1\.0 - at `\$\.accident\[2\]`"),
+        ({"accident": [0, 0, "yes"]}, r"expected `bool \| float`, got `str` - at `\$\.accident\[2\]`"),
+        ({"accident": True}, r"expected `array`, got `bool` - at `\$\.accident`"),
+        ({"who": ["ego"]}, r"expected `array` of length 2, got 1 - at `\$\.who`"),
         ({"who": ["ego", "a999"]}, "who: 'a999' is nobody in the question; write null for one"),
-        ({"who": ["ego", 4]}, "who: 4 is nobody in the question"),
+        ({"who": ["ego", 4]}, r"expected `str \| null`, got `int` - at `\$\.who\[1\]`"),
         ({"who": ["ego", "ego"]}, "who: 'ego' stands there twice"),
-        ({"where": [1]}, r"where: expected \[x, y\], or"),
-        ({"where": [[1, 2], [3]]}, r"where: expected \[x, y\], or"),
-        ({"where": [1, 1e9]}, r"where: expected \[x, y\], or"),
-        ({"where": [True, 1]}, r"where: expected \[x, y\], or"),
-        ({"where": "here"}, r"where: expected \[x, y\], or"),
+        ({"where": [1]}, r"expected `array` of length >= 2 - at `\$\.where`"),
+        ({"where": [[1, 2], [3]]}, r"expected `array` of length >= 2 - at `\$\.where\[1\]`"),
+        ({"where": [[1, 2], 3]}, r"where: expected \[x, y\], or"),
+        ({"where": [1, 1e9]}, r"expected `float` <= 1000000\.0 - at `\$\.where\[1\]`"),
+        ({"where": [True, 1]}, r"expected `float \| array`, got `bool` - at `\$\.where\[0\]`"),
+        ({"where": "here"}, r"expected `array \| null`, got `str` - at `\$\.where`"),
         ({"where": None}, "where: is null, but an accident needs a place"),
-        ({"when": -1}, "when: expected seconds from 0, or null, found -1"),
-        ({"when": "soon"}, "when: expected seconds from 0, or null"),
+        ({"when": -1}, r"expected `float` >= 0\.0 - at `\$\.when`"),
+        ({"when": 10**400}, r"number out of range - at `\$\.when`"),
+        ({"when": "soon"}, r"expected `float \| null`, got `str` - at `\$\.when`"),
+        ({"x" * 10**6: 1}, "object contains unknown field `x{10,60} … x{10,60}`; mend"),
     ],
 )
 def test_malformed_answers(asked: Asked, tmp_path: Path, change: Any, sentence: str) -> None:
@@ -184,7 +187,7 @@ def test_an_answer_that_lacks_something(asked: Asked, tmp_path: Path, name: str)
     line = {"id": next(iter(asked.truth.values()))["id"], **GOOD}
     del line[name]
     path = written(tmp_path / "answers.jsonl", [line])
-    with pytest.raises(ResultsError, match=f"^{path}:1: {name}: is missing; mend that line"):
+    with pytest.raises(ResultsError, match=f"^{path}:1: object missing required field `{name}`; mend that line"):
         read_answers(path, asked.done.folder / "truth.jsonl")
 
 
@@ -197,7 +200,9 @@ def test_two_answers_to_a_question(asked: Asked, tmp_path: Path) -> None:
 
 def test_files_that_are_something_else(asked: Asked, tmp_path: Path) -> None:
     path, truth = written(tmp_path / "answers.jsonl", perfect(asked)), asked.done.folder / "truth.jsonl"
-    with pytest.raises(ResultsError, match=rf"^{path}:1: is no line of a truth file; give truth\.jsonl of the export"):
+    with pytest.raises(
+        ResultsError, match=rf"^{path}:1: .*; this is no line of a truth file; give truth\.jsonl of the export"
+    ):
         read_answers(path, path)
     with pytest.raises(ResultsError, match=f"^{tmp_path}/none: cannot be read"):
         read_answers(tmp_path / "none", truth)
@@ -207,6 +212,30 @@ def test_files_that_are_something_else(asked: Asked, tmp_path: Path) -> None:
     assert read_answers(empty, truth).alarms == 0
     with pytest.raises(ConfigError, match=r"^threshold: expected a number from 0 to 1, found 1\.5"):
         read_answers(path, truth, threshold=1.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "place"),
+    [
+        ("id", 3, r"\$\.id"),
+        ("sample", "a/b", r"\$\.sample"),
+        ("sample", ["a/b/c/001"], r"\$\.sample"),
+        ("last_frame", "9", r"\$\.last_frame"),
+        ("last_frame", 10**30, r"\$\.last_frame"),
+        ("accident", [], r"\$\.accident"),
+        ("accident", None, r"\$\.accident"),
+        ("actors", [["ego", 1]], r"\$\.actors"),
+        ("actors", {"ego": 2**70}, r"\$\.actors\[\.\.\.\]"),
+        ("actors", {"ego": {}}, r"\$\.actors\[\.\.\.\]"),
+    ],
+)
+def test_a_truth_file_that_was_changed(asked: Asked, tmp_path: Path, name: str, value: Any, place: str) -> None:
+    """The record names line and field; no other exception comes of what is in a truth file."""
+    lines = [{**each} for each in asked.truth.values()]
+    lines[1][name] = value
+    truth, answers = written(tmp_path / "truth.jsonl", lines), written(tmp_path / "answers.jsonl", perfect(asked))
+    with pytest.raises(ResultsError, match=f"^{truth}:2: .* - at `{place}`; this is no line of a truth file; give "):
+        read_answers(answers, truth)
 
 
 def test_the_command(asked: Asked, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import fsspec
 import pytest
+import tiny
 from packing import packed
 
 from deepaccident_devkit import DeepAccident
@@ -154,6 +155,17 @@ def test_names_that_lead_out_of_an_archive_are_of_no_release(tmp_path: Path) -> 
     assert len(open_dataroot(path, tmp_path / "index", workers=1).store.members) == 0  # type: ignore[union-attr]
     with pytest.raises(DatarootError, match=r"odd\.zip: no scenario found"):
         DeepAccident(dataroot=path, workers=1, verbose=False)
+
+
+def test_archives_with_backslashes_in_their_names_are_read(tmp_path: Path) -> None:
+    root = tiny.write_tiny_release(tmp_path / "release")
+    path = packed(root, tmp_path / "windows.zip", written=lambda name: f"DeepAccident/{name}".replace("/", "\\"))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("type1_subtype1_accident\\", b"")
+        archive.writestr("..\\" + _NAME.replace("/", "\\"), b"x")
+    release = DeepAccident(dataroot=path, workers=1, verbose=False)
+    assert len(release.annotation) == len(DeepAccident(dataroot=root, workers=1, verbose=False).annotation)
+    assert [each["token"] for each in release.scenario] == [tiny.TOKEN]
 
 
 @pytest.mark.parametrize(

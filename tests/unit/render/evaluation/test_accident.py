@@ -13,7 +13,7 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.render.evaluation import render_accuracy, render_alarms, render_errors, render_outcomes
 from deepaccident_devkit.render.evaluation.accident import accuracy_by_distance, alarm_precision_recall
 
-LEFT_OUT = {"unjudged": 0, "beyond": 0, "at_impact": False}
+LEFT_OUT = {"unjudged": 0, "beyond": 0, "at_impact": False, "unplaced": False}
 
 
 def alarm(position: float | None, score: float, time: float | None = 0.0) -> dict[str, Any]:
@@ -106,6 +106,7 @@ def test_outcomes_and_errors_are_counted() -> None:
             "unjudged": 0,
             "beyond": 0,
             "at_impact": False,
+            "unplaced": False,
         },
     )
     ax = render_errors(far, "position", ax=new_axes())

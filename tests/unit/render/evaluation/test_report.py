@@ -15,7 +15,7 @@ from PIL import Image
 from report_page import page_of
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, OutputFolderError
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.render.colors import WARNING_COLOR
@@ -111,6 +111,10 @@ def test_the_same_run_makes_the_same_bytes(da_motion: DeepAccident, tokens: list
     assert before == {each: each.read_bytes() for each in (path, *(tmp_path / "figures").iterdir())}
     with pytest.raises(ConfigError, match="is a file; give a folder"):
         save_report(runs[0], path)
+    (tmp_path / "planted").mkdir()
+    (tmp_path / "planted" / "figures").symlink_to(tmp_path / "figures")
+    with pytest.raises(OutputFolderError, match="figures: a symbolic link, which no devkit makes; remove it"):
+        save_report(runs[0], tmp_path / "planted")
 
 
 def test_a_partial_run_says_so_everywhere(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from damaged_releases import damaged_release
 from report_page import Page, page_of
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, SensorFileError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, OutputFolderError, SensorFileError
 from deepaccident_devkit.render.markup import source_hash
 from deepaccident_devkit.render.replay import tried
 from deepaccident_devkit.render.safety import report as report_module
@@ -181,3 +181,17 @@ def test_a_second_report_replaces_the_first(report: SafetyReport, folder: Path, 
         save_safety_report(report, folder / "report.html")
     with pytest.raises(ChoiceError, match="replays: expected 0 or more, or None for all, found -1"):
         save_safety_report(report, tmp_path, replays=-1)
+
+
+@pytest.mark.parametrize("name", ["figures", "replays"])
+@pytest.mark.usefixtures("_without_figures")
+def test_nothing_is_written_through_a_link(
+    report: SafetyReport, da_motion: DeepAccident, tmp_path: Path, name: str
+) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).symlink_to(outside)
+    with pytest.raises(OutputFolderError, match=f"{name}: a symbolic link, which no devkit makes; remove it"):
+        save_safety_report(report, tmp_path / "out", dataset=da_motion, workers=1)
+    assert not list(outside.iterdir())

@@ -8,14 +8,14 @@ from accident_scenes import as_heads, as_maps, scene, standing
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.metrics.alarms.truth import UNPLACED_NOTE, AccidentContext
 from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.motion import OWN_BOX_ID
 from deepaccident_devkit.taxonomy import AGENTS
@@ -306,8 +306,12 @@ def test_a_pair_that_no_label_shows(da_motion: DeepAccident, monkeypatch: pytest
         return record
 
     monkeypatch.setattr(da_motion, "get", get)
-    with pytest.raises(NotAvailableError, match="no label shows actor 999999"):
-        box_truth(da_motion, token)
+    truth = box_truth(da_motion, token)
+    assert (truth.accident, truth.impact, truth.unplaced) == (None, None, pytest.approx(1.0))
+    made = result([alarm(time=1.0)], truth)
+    assert (made.unplaced, made.samples, made.precision) == (1, 0, None)
+    assert UNPLACED_NOTE.format(1) in made.notes
+    assert result([alarm(time=0.5)], replace(truth, horizon=0.5)).unplaced == 0  # it comes later: nothing is left out
 
 
 def test_an_alarm_for_later_than_the_horizon_is_none() -> None:

@@ -1,0 +1,137 @@
+"""An accident of which no label shows both actors ends no evaluation: its samples are left out, and told."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from memory_results import MemoryResults
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation import instances_of
+from deepaccident_devkit.evaluation.metrics.alarms.truth import UNPLACED_NOTE
+from deepaccident_devkit.evaluation.metrics.predictions import Accident
+from deepaccident_devkit.evaluation.results import ResultsWriter
+from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results
+from deepaccident_devkit.evaluation.runs.prevention import prevention_evaluator
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.render.outcomes.accident import difference_words
+from deepaccident_devkit.render.outcomes.verdicts import sample_verdict
+from deepaccident_devkit.safety import describe
+from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.v2x.collisions import default_scenario
+
+ALARM = Accident(positions=[[5.0, 0.0], [8.0, 0.0]], time=1.0, score=0.5)
+Change = Callable[[list[str], list[str]], None]
+
+
+def named(which: int, actor: int, agents: str | None = None) -> Change:
+    """Another actor, and what `colliding agents:` says, in place of what meta has."""
+
+    def change(first: list[str], others: list[str]) -> None:
+        first[(1, 3)[which]] = str(actor)
+        if agents is not None:
+            others[0] = f" colliding agents: {agents}"
+
+    return change
+
+
+def twice(first: list[str], _others: list[str]) -> None:
+    first[3] = first[1]
+
+
+def no_other_lines(first: list[str], others: list[str]) -> None:
+    first[3] = "0"
+    others.clear()
+
+
+CHANGES = {
+    "id 0": named(1, 0, "ego none"),
+    "id 0 first": named(0, 0, "none ego"),
+    "nobody named": named(1, 0, "none none"),
+    "in no label": named(1, 424_242),
+    "one actor twice": twice,
+    "a first line alone": no_other_lines,
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("unplaced") / "release"
+    make_release(root, SynthConfig(scenarios=4, frames=30, seed=5, sensors="none", unplanned=0), workers=1)
+    return root
+
+
+@pytest.fixture(scope="module", params=CHANGES)
+def unplaced(request: pytest.FixtureRequest, whole: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """The release with such a meta file, and the token of its scenario."""
+    root = Path(shutil.copytree(whole, tmp_path_factory.mktemp("unplaced") / "release"))
+    meta = min(root.glob("*_accident/meta/*.txt"))
+    line, *others = meta.read_text().split("\n")
+    first = line.split()
+    CHANGES[request.param](first, others)
+    meta.write_text("\n".join([" ".join(first), *others]))
+    lines = [f"{each.parents[1].name} {each.stem}\n" for each in sorted(root.glob("*/meta/*.txt"))]
+    (root / "mine.txt").write_text("".join(lines))
+    dataset = DeepAccident("v1", root, verbose=False)
+    return SimpleNamespace(dataset=dataset, token=f"{meta.parents[1].name}/{meta.stem}", split=str(root / "mine.txt"))
+
+
+def run_of(unplaced: SimpleNamespace, path: Path, task: Any, protocol: str) -> EvaluationRun:
+    setup = EvaluationSetup(task=task, protocol=protocol)
+    selection = default_selection(setup, unplaced.split, samples="all")
+    with ResultsWriter(path, "accident") as writer:
+        for token in selection.tokens(unplaced.dataset):
+            writer.add(token, [ALARM])
+    return evaluate_results(unplaced.dataset, path, setup, selection, workers=1)
+
+
+SAMPLES = 5 * 6
+"""Of a scenario: five agents, every half second of 3 s."""
+
+
+@pytest.mark.slow
+def test_it_ends_no_evaluation_of_accidents(unplaced: SimpleNamespace, tmp_path: Path) -> None:
+    boxes = run_of(unplaced, tmp_path / "boxes.json", "accident", "boxes").result
+    assert (boxes.unplaced, boxes.at_impact) == (5 * 5, 5)  # those from 2 s before the impact on
+    assert boxes.samples == 4 * SAMPLES - 5 * 5 - 5
+    assert UNPLACED_NOTE.format(boxes.unplaced) in boxes.notes
+    assert run_of(unplaced, tmp_path / "paper.json", "accident", "paper").result.samples == 4 * SAMPLES
+
+
+@pytest.mark.slow
+def test_it_ends_no_evaluation_of_warnings_and_is_no_normal_scenario(unplaced: SimpleNamespace, tmp_path: Path) -> None:
+    clean, *others = (
+        run_of(unplaced, tmp_path / f"{protocol}.json", "warning", protocol) for protocol in ("clean", "boxes", "field")
+    )
+    for run in (clean, *others):
+        assert UNPLACED_NOTE.format(SAMPLES) in run.result.notes
+    recordings = [each.recordings for each in clean.result.groups.values()]
+    assert [sum(each[kind] for each in recordings) for kind in ("accident", "twins", "others")] == [5, 10, 0]
+    prevented = prevention_evaluator(unplaced.dataset, clean.evaluator, workers=1).compute()
+    assert [each.scenario for each in prevented.skipped] == [unplaced.token]
+
+
+def test_maps_are_compared_with_maps_as_ever(unplaced: SimpleNamespace) -> None:
+    dataset, token = unplaced.dataset, f"{unplaced.token}/ego_vehicle/020"
+    label = dataset.motion_labels(token, MotionLabelConfig(protocol="released")).to_present("bilinear")
+    results = cast("Any", MemoryResults("motion", {token: instances_of(label.instance, label.config.grid)}))
+    for protocol in ("released", "paper"):
+        setup = EvaluationSetup(task="accident", protocol=protocol)
+        evaluator = setup.evaluator()
+        evaluator.update(token, *SampleLoader(dataset, results, setup)(token))
+        assert evaluator.compute().samples == 1
+
+
+def test_nothing_false_is_said(unplaced: SimpleNamespace) -> None:
+    story = describe(unplaced.dataset, unplaced.token)
+    assert story.facts["collision"] is True
+    assert "two collide in 2.9 s, but the labels do not show how" in story.text
+    assert default_scenario(unplaced.dataset) != unplaced.token  # the other accident can be shown
+    verdict: Any = sample_verdict(unplaced.dataset, f"{unplaced.token}/ego_vehicle/020", [ALARM], protocol="boxes")
+    assert difference_words(verdict.compared).startswith(
+        "an accident comes in 1.0 s that no label shows both actors of"
+    )

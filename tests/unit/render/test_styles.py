@@ -1,0 +1,156 @@
+"""Pictures depend on their style, and on no setting of the user's matplotlib."""
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.render import detached_figure, style
+from deepaccident_devkit.render.notebook import png_of
+from deepaccident_devkit.render.pictures import save_picture
+from deepaccident_devkit.render.safety import render_lead_times, render_twins
+from deepaccident_devkit.render.statistics import render_statistics
+from deepaccident_devkit.render.training import render_curve
+from deepaccident_devkit.render.video.views import Scene, views_of
+from deepaccident_devkit.safety import lead_time_ledger, twin_diff
+from deepaccident_devkit.statistics import dataset_statistics
+
+HOSTILE: dict[str, Any] = {
+    "axes.axisbelow": False,
+    "axes.facecolor": "black",
+    "axes.formatter.limits": (0, 0),
+    "axes.grid": True,
+    "axes.prop_cycle": mpl.cycler(color=["red", "black"]),
+    "axes.spines.left": False,
+    "axes.titlesize": 40,
+    "axes.unicode_minus": False,
+    "axes.xmargin": 0.4,
+    "figure.dpi": 47,
+    "figure.facecolor": "red",
+    "figure.titlesize": 40,
+    "font.family": "monospace",
+    "font.size": 22,
+    "image.aspect": "auto",
+    "image.cmap": "hot",
+    "image.interpolation": "bicubic",
+    "image.origin": "lower",
+    "legend.fontsize": 30,
+    "lines.linewidth": 9,
+    "patch.linewidth": 8,
+    "savefig.bbox": "tight",
+    "savefig.dpi": 33,
+    "savefig.facecolor": "blue",
+    "savefig.transparent": True,
+    "scatter.marker": "x",
+    "svg.fonttype": "none",
+    "text.usetex": True,
+    "xtick.labelsize": 30,
+}
+Draw = Callable[[DeepAccident, str], Any]
+
+
+def moment(da: DeepAccident, sample: str) -> str:
+    token: str = da.get("sample", sample)["frame_token"]
+    return token
+
+
+def scenario(sample: str) -> str:
+    return sample.rsplit("/", 2)[0]
+
+
+PICTURES: dict[str, Draw] = {
+    "bev": lambda da, sample: da.render_bev(sample),
+    "camera": lambda da, sample: da.render_sample_data(f"{sample}/Camera_Front"),
+    "sample": lambda da, sample: da.render_sample(sample),
+    "sample, detached": lambda da, sample: da.render_sample(sample, fig=detached_figure((16, 5.6))),
+    "frame": lambda da, sample: da.render_frame(moment(da, sample)),
+    "annotation": lambda da, _: da.render_annotation(da.annotation[0]),
+    "instance": lambda da, _: da.render_instance(da.instance[0]),
+    "visibility": lambda da, sample: da.render_visibility(moment(da, sample)),
+    "visibility matrix": lambda da, sample: da.render_visibility_matrix(moment(da, sample)),
+    "calibration": lambda da, sample: da.render_calibration(moment(da, sample)),
+    "accident": lambda da, sample: da.render_accident(scenario(sample), seconds=(1.0, 0.0)),
+    "motion labels": lambda da, sample: da.render_motion_labels(sample),
+    "town map": lambda da, sample: da.render_town_map(da.get("scenario", scenario(sample))["town"]),
+    "lead times": lambda da, _: render_lead_times(lead_time_ledger(da)),
+    "twins": lambda da, sample: render_twins(twin_diff(da, scenario(sample))),
+    "statistics": lambda da, _: render_statistics(dataset_statistics(da, workers=1), "scenarios"),
+    "curve": lambda *_: render_curve([1, 2, 3], [-1.0, 2.0, -3.0], "loss"),
+}
+
+
+def pixels(drawn: Any) -> Any:
+    canvas: Any = FigureCanvasAgg(drawn.figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba()).copy()
+
+
+@pytest.fixture(scope="module")
+def sample(da: DeepAccident) -> str:
+    """Of the ego, at the impact."""
+    accident = next(each for each in da.scenario if each["collision"])
+    return f"{accident['token']}/ego_vehicle/{accident['num_frames']:03d}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PICTURES)
+def test_no_setting_of_the_user_changes_a_picture(
+    da: DeepAccident, da_motion: DeepAccident, sample: str, name: str
+) -> None:
+    if name == "motion labels":  # a sample with a past and a future
+        da, accident = da_motion, next(each for each in da_motion.scenario if each["collision"])
+        sample = da.get_sample(accident, "ego_vehicle", accident["num_frames"] - 10)["token"]
+    usual = pixels(PICTURES[name](da, sample))
+    with mpl.rc_context(HOSTILE):
+        theirs = dict(mpl.rcParams)
+        np.testing.assert_array_equal(pixels(PICTURES[name](da, sample)), usual)
+        assert dict(mpl.rcParams) == theirs
+
+
+def test_no_setting_of_the_user_changes_a_file(tmp_path: Path) -> None:
+    """Nor if it is other when the figure is saved; and a figure that went through a pickle stays one of ours."""
+    for name, settings in (("usual", {}), ("hostile", HOSTILE)):
+        drawn = render_curve([1, 2, 3], [-1.0, 2.0, -3.0], "loss")
+        with mpl.rc_context(settings):
+            pickle.loads(pickle.dumps(drawn.figure)).savefig(tmp_path / f"{name}_own.png")
+            save_picture(drawn, tmp_path / f"{name}.png")
+    for name in (".png", "_own.png"):
+        assert (tmp_path / f"hostile{name}").read_bytes() == (tmp_path / f"usual{name}").read_bytes()
+
+
+def test_a_video_and_what_a_notebook_shows_know_no_setting(da_motion: DeepAccident) -> None:
+    sample = da_motion.sample[40]
+    [(view, layers)] = views_of("bev", None)
+
+    def made() -> tuple[Any, bytes]:
+        scene = Scene(dataset=da_motion, views=((view, layers),), agents=None, width=160, height=160)
+        return scene.picture(sample["frame_token"]), png_of(da_motion.boxes(sample))
+
+    usual = made()
+    with mpl.rc_context(HOSTILE):
+        again = made()
+    np.testing.assert_array_equal(again[0], usual[0])
+    assert again[1] == usual[1]
+
+
+def test_axes_of_the_user_stay_theirs_but_images_stand_upright(da: DeepAccident, sample: str) -> None:
+    with mpl.rc_context({"image.origin": "lower", "axes.facecolor": "black"}):
+        _, ax = plt.subplots()
+        da.render_sample_data(f"{sample}/Camera_Front", ax=ax)
+    assert ax.get_facecolor()[:3] == (0, 0, 0)
+    assert ax.images[0].origin == "upper"
+
+
+def test_a_figure_keeps_the_style_that_it_was_made_in() -> None:
+    with style("paper"):
+        paper = render_curve([1, 2, 3], [1.0, 2.0, 3.0], "loss")
+        inside = pixels(paper)
+    assert paper.xaxis.label.get_fontsize() == 9
+    np.testing.assert_array_equal(pixels(paper), inside)

@@ -1,0 +1,283 @@
+"""Folders of a stranger: no link in them leads what is written or removed out of them."""
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from tiny_format import TinyFormat
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.cli.demo import demo
+from deepaccident_devkit.errors import DeepAccidentError, OutputFolderError
+from deepaccident_devkit.explore.keeping import KeptFiles
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.files import held_lock, place_in, remove_in, temporary_path, write_bytes
+from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
+from deepaccident_devkit.parallel import Shard
+from deepaccident_devkit.release.store.cache import FileCache
+from deepaccident_devkit.statistics.shards import remove_shards, statistics_shard
+from deepaccident_devkit.synth import SynthConfig, generate, make_release
+from deepaccident_devkit.synth.recording import RecordingJob
+from deepaccident_devkit.testing import SmallRelease, write_small_release
+
+PRECIOUS = b"precious\0"
+EXPORT, PARTS = "out", "out/.deepaccident-parts/tiny"
+Writer = Callable[[DeepAccident, Path], object]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """Two scenarios with a camera."""
+    root = tmp_path_factory.mktemp("small") / "release"
+    wanted = SmallRelease(splits=("train",), agents=("ego_vehicle",), frames=8, channels=("Camera_Front",))
+    write_small_release(root, wanted)
+    return DeepAccident(dataroot=root, verbose=False)
+
+
+def an_export(dataset: DeepAccident, folder: Path) -> None:
+    export_release(dataset, folder / EXPORT, TinyFormat(link="symbolic"), workers=1)
+
+
+def half_an_export(dataset: DeepAccident, folder: Path) -> None:
+    """One that was stopped at its second scenario."""
+    whole, left = TinyFormat.write, iter(range(1))
+
+    def write(self: TinyFormat, *arguments: Any) -> None:
+        whole(self, *arguments)
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TinyFormat, "write", write)
+        with pytest.raises(KeyboardInterrupt):
+            an_export(dataset, folder)
+
+
+def labels(dataset: DeepAccident, folder: Path) -> None:
+    tokens = [f"{row['token']}/ego_vehicle/003" for row in dataset.scenario]
+    config = MotionLabelConfig(future_frames=1, agents="available")
+    write_label_files(dataset, folder / "out", tokens, config, workers=1)
+
+
+def half_a_statistic(dataset: DeepAccident, folder: Path) -> None:
+    statistics_shard(dataset, Shard(1, 2), folder / "out", workers=1)
+
+
+def statistics(dataset: DeepAccident, folder: Path) -> None:
+    statistics_shard(dataset, Shard(2, 2), folder / "out", workers=1)
+    remove_shards(dataset, folder / "out")
+
+
+def a_release(_: DeepAccident, folder: Path, part: str | None = None) -> None:
+    def record(job: RecordingJob) -> None:
+        for kind in ("label", "calib"):
+            write_bytes(
+                job.root / job.folder.scenario_type / "ego_vehicle" / kind / f"{job.plan.name}.txt", b"recorded"
+            )
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generate, "record_scenario", record)
+        make_release(folder / "out", SynthConfig(scenarios=2, frames=1, sensors=False, seed=7), workers=1, part=part)
+
+
+def half_a_release(dataset: DeepAccident, folder: Path) -> None:
+    a_release(dataset, folder, "1/2")
+
+
+def an_index(dataset: DeepAccident, folder: Path) -> None:
+    if not (folder / "release").exists():
+        shutil.copytree(dataset.dataroot, folder / "release", ignore=shutil.ignore_patterns(".deepaccident"))
+    opened = DeepAccident(dataroot=folder / "release", verbose=False)
+    for row in opened.scenario:
+        opened.interactions(row["token"])
+    KeptFiles(opened).get("one", "a.jpg", lambda: b"made")
+
+
+WRITERS: dict[str, tuple[Writer, Writer]] = {
+    "an export": (half_an_export, an_export),
+    "labels": (labels, labels),
+    "statistics": (half_a_statistic, statistics),
+    "a release": (half_a_release, a_release),
+    "an index": (an_index, an_index),
+}
+"""What is made → what an earlier call left, and what is called then."""
+USERS_OWN = ("out", "release", "release/.deepaccident", "release/.deepaccident/v1")
+"""Folders that the user named, or may have put elsewhere."""
+
+
+def spots(folder: Path) -> Iterator[str]:
+    """Each folder, and one file of each."""
+    for path, folders, files in os.walk(folder):
+        inside = Path(path).relative_to(folder)
+        yield from ((inside / name).as_posix() for name in [*folders, *sorted(files)[:1], *sorted(files)[-1:]])
+
+
+def states(folder: Path) -> dict[str, tuple[int, bytes | None]]:
+    return {
+        str(path): (path.lstat().st_mtime_ns, path.read_bytes() if path.is_file() else None)
+        for path in [folder, *folder.rglob("*")]
+    }
+
+
+@pytest.mark.parametrize("dangling", [False, True], ids=["to something", "dangling"])
+@pytest.mark.parametrize("what", WRITERS)
+def test_a_link_in_any_place_leads_nothing_out(small: DeepAccident, tmp_path: Path, what: str, dangling: bool) -> None:
+    begin, go = WRITERS[what]
+    begun, done, outside, folder = (tmp_path / name for name in ("begun", "done", "outside", "folder"))
+    for each in (begun, outside):
+        each.mkdir()
+    begin(small, begun)
+    shutil.copytree(begun, done, symlinks=True)
+    go(small, done)
+    places = {name: path / name for path in (done, begun) for name in spots(path)}
+    if what == "a release":
+        places |= {name.replace("out", ".out.unfinished/release", 1): path for name, path in places.items()}
+    refused = 0
+    for number, (name, real) in enumerate(sorted(places.items())):
+        if name in USERS_OWN or (what == "an index" and "/.deepaccident/" not in name):
+            continue
+        target = outside / str(number)
+        if not dangling:
+            shutil.copytree(real, target) if real.is_dir() else target.touch()
+            for path in (target, *target.rglob("*")):
+                if not path.is_dir():
+                    path.unlink()
+                    path.write_bytes(PRECIOUS)
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(begun, folder, symlinks=True)
+        remove_in(folder, name)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).symlink_to(target)
+        before = states(outside)
+        try:
+            go(small, folder)
+        except (DeepAccidentError, OSError, ValueError) as error:  # the last of a format that reads a stranger's part
+            refused += isinstance(error, OutputFolderError)
+        assert states(outside) == before, name
+    assert refused
+
+
+ATTACKS = {
+    "absolute": "{outside}/precious",
+    "above": "../outside/precious",
+    "above, later": "folders/../../outside/precious",
+    "a link to a folder": "linked/precious",
+    "a link": "linked",
+    "the lock": ".deepaccident.lock",
+    "what is kept": ".deepaccident-parts/tiny",
+    "the manifest": "tiny.manifest.json",
+    "the folder": ".",
+    "nothing": "",
+    "a folder's end": "linked/",
+    "a long name": "a" * 300,
+    "a deep one": "a/" * 300_000 + "a",
+    "below a file": "counts.json/below/it",
+    "no UTF-8": b"\xff\xfe",
+}
+
+
+@pytest.mark.parametrize("of_another", [False, True], ids=["of the unit", "of another unit"])
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_journal_removes_nothing_outside(small: DeepAccident, tmp_path: Path, attack: str, of_another: bool) -> None:
+    """Its lines are paths of which an unfinished export removes those that it does not write again."""
+    half_an_export(small, tmp_path)
+    out, outside = tmp_path / EXPORT, tmp_path / "outside"
+    outside.mkdir()
+    (outside / "precious").write_bytes(PRECIOUS)
+    (out / "linked").symlink_to(outside)
+    (journal,) = (tmp_path / PARTS).glob("*normal*.paths")
+    line = ATTACKS[attack]
+    content = line if isinstance(line, bytes) else line.format(outside=outside).encode()
+    (journal.with_name("another.paths") if of_another else journal).write_bytes(content + b"\0")
+    before = states(outside)
+    if attack == "a link to a folder":
+        with pytest.raises(OutputFolderError, match="linked: a symbolic link, which no devkit makes; remove"):
+            an_export(small, tmp_path)
+    else:
+        an_export(small, tmp_path)
+        assert {path.name for path in out.iterdir()} >= {"tiny.manifest.json", ".deepaccident.lock", "counts.json"}
+        assert (out / "linked").is_symlink() == (attack != "a link")
+    assert states(outside) == before
+
+
+def test_a_journal_is_a_new_file(small: DeepAccident, tmp_path: Path) -> None:
+    """An export's files may be those of the release, by hard links: nothing is added to one."""
+    half_an_export(small, tmp_path)
+    (journal,) = (tmp_path / PARTS).glob("*normal*.paths")
+    (tmp_path / "precious").write_bytes(PRECIOUS)
+    journal.unlink()
+    os.link(tmp_path / "precious", journal)
+    an_export(small, tmp_path)
+    assert (tmp_path / "precious").read_bytes() == PRECIOUS
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("there", [False, True])
+def test_a_lock_that_is_a_link_is_not_taken(tmp_path: Path, shared: bool, there: bool) -> None:
+    target, lock = tmp_path / "precious", tmp_path / "out" / ".lock"
+    if there:
+        target.write_bytes(PRECIOUS)
+    lock.parent.mkdir()
+    lock.symlink_to(target)
+    with pytest.raises(OutputFolderError, match=r"\.lock: a symbolic link, which no devkit makes; remove it"):
+        held_lock(lock, "writes", shared=shared)
+    assert target.exists() == there
+    assert not there or target.read_bytes() == PRECIOUS
+
+
+def test_no_link_can_wait_for_a_temporary_file(tmp_path: Path) -> None:
+    names = [temporary_path(tmp_path / "a").name for _ in range(100)]
+    numbers = [int(re.split(r"[-.]", name)[-2]) for name in names]
+    assert len(set(numbers)) > 90
+    assert not {after - before for before, after in pairwise(numbers)} & {1, -1}
+
+
+def test_a_demo_uses_no_folder_behind_a_link(tmp_path: Path) -> None:
+    out, outside = tmp_path / "demo", tmp_path / "outside"
+    for folder in (out, outside):
+        folder.mkdir()
+    (out / ".deepaccident_demo").write_text(f"{__version__}\n")
+    (out / "release").symlink_to(outside)
+    result = CliRunner().invoke(demo, [str(out)])
+    assert isinstance(result.exception, OutputFolderError)
+    assert not list(outside.iterdir())
+
+
+def test_a_cache_is_not_left(tmp_path: Path) -> None:
+    cache, outside = FileCache(tmp_path / "cache", 10), tmp_path / "outside"
+    path = cache.path_of("one", "a.jpg")
+    cache.put(path, b"made")
+    path.parents[1].rename(outside)
+    (tmp_path / "cache" / path.parents[1].name).symlink_to(outside)
+    before = states(outside)
+    with pytest.raises(OutputFolderError, match="a symbolic link"):
+        cache.path_of("one", "a.jpg")
+    cache.put(cache.path_of("two", "b.jpg"), b"too much")
+    assert states(outside) == before
+
+
+@pytest.mark.parametrize("path", ["/absolute", "..", "a/../b", "link/b", "a/link/b", "", "."])
+def test_what_leads_out_is_refused(tmp_path: Path, path: str) -> None:
+    root, outside = tmp_path / "root", tmp_path / "outside"
+    for folder in (root / "a", outside / "b"):
+        folder.mkdir(parents=True)
+    for link in (root / "link", root / "a" / "link", tmp_path / "named"):
+        link.symlink_to(root if link.name == "named" else outside)
+    for use in (place_in, remove_in):
+        with pytest.raises(OutputFolderError, match=r"a symbolic link|is no path below it"):
+            use(root, path)
+    assert place_in(tmp_path / "named", "a/b/c") == tmp_path / "named" / "a" / "b" / "c"
+    assert place_in(root, "link") == root / "link"
+    with pytest.raises(OutputFolderError, match=r"link: a symbolic link, .*; remove it, or give another folder than "):
+        place_in(root, "link", opened=True)
+    for name in ("link", "a", "not there", "a/not/there"):
+        remove_in(root, name)
+    assert not list(root.iterdir())
+    assert (outside / "b").is_dir()
