@@ -6,22 +6,28 @@ from pathlib import Path
 
 import click
 
+EACH = 150
 _TOP = Path(__file__).parents[2]
 sys.path.insert(0, str(_TOP / "tests"))  # the tests' packages are found by their own names
 
 
 @click.command()
-@click.option("--count", default=3000, show_default=True, help="How many changed files.")
+@click.option("--count", default=EACH, show_default=True, help="How many changed files of each kind.")
+@click.option("--kinds", metavar="NAME[,NAME…]", help="Only these kinds of files; the page is not written.")
 @click.option("--kills", default=100, show_default=True, help="How many killed processes; 0: no full disks either.")
 @click.option("--seed", default=0, show_default=True)
 @click.option(
     "--out", type=click.Path(path_type=Path), default=_TOP / "docs" / "reliability.md", help="The page to write."
 )
-def main(count: int, kills: int, seed: int, out: Path) -> None:
-    """Change files, kill processes and fill disks; exit status 1 if anything failed."""
+def main(count: int, kinds: str | None, kills: int, seed: int, out: Path) -> None:
+    """Change files, kill processes and fill disks; exit status 1 if anything failed.
+
+    With --kinds nothing is killed, and no page is written.
+    """
     from campaign.healthy import make_healthy
+    from campaign.kinds import KINDS
     from campaign.page import page
-    from campaign.pool import drawn, run
+    from campaign.pool import drawn, left_out, run
     from campaign.stops import Stopped, drawn_stops, run_stops
     from campaign.worker import Outcome
 
@@ -30,18 +36,25 @@ def main(count: int, kills: int, seed: int, out: Path) -> None:
         if each.failed:
             click.echo(f"\r{each}")
 
+    chosen = [each.strip() for each in kinds.split(",")] if kinds else list(KINDS)
+    if unknown := set(chosen) - KINDS.keys():
+        raise click.BadParameter(f"{min(unknown)}: no such kind; there are {', '.join(KINDS)}")
+    cases = drawn(count, seed, chosen)
+    for each, package in left_out(chosen).items():
+        click.echo(f"left out: {each}, as {package} is not installed")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         healthy = make_healthy(folder / "healthy")
-        with click.progressbar(length=count, label="changed files") as bar:
-            outcomes = run(drawn(count, seed), healthy, tell=tell)
-        stops = drawn_stops(kills, seed) if kills else []
+        with click.progressbar(length=len(cases), label="changed files") as bar:
+            outcomes = run(cases, healthy, tell=tell)
+        stops = drawn_stops(kills, seed) if kills and not kinds else []
         with click.progressbar(length=len(stops), label="kills and full disks") as bar:
             stopped = run_stops(stops, healthy, folder / "out", tell)
     failed = sum(each.failed for each in (*outcomes, *stopped))
     command = f"--count {count} --kills {kills} --seed {seed}"
-    out.write_text(page(outcomes, stopped, f"`{command}`"), encoding="utf-8")
-    click.echo(f"{failed} failed; written: {out}")
+    if not kinds:
+        out.write_text(page(outcomes, stopped, f"`{command}`"), encoding="utf-8")
+    click.echo(f"{failed} failed" if kinds else f"{failed} failed; written: {out}")
     sys.exit(1 if failed else 0)
 
 

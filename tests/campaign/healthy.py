@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from packing import packed
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, Resampling, accident_context, instances_of
@@ -24,12 +25,12 @@ from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
 from deepaccident_devkit.synth.spec import design_text
 from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.testing import SmallRelease, write_small_release
-from packing import packed
 
 AGENTS: tuple[AgentName, ...] = ("ego_vehicle", "infrastructure")
 CHANNELS = ("Camera_Front", "lidar01", "BEV_instance_camera")
 HORIZON = 0.5
 LABELS = MotionLabelConfig(future_frames=1)
+EXPORT = OpenCood(without_clouds=True)
 SCHEDULER = "tcp://127.0.0.1:9"
 """Where nobody listens."""
 SETUPS = {
@@ -39,13 +40,16 @@ SETUPS = {
 }
 
 
-def make_healthy(folder: Path) -> Path:
+HAS_TORCH = find_spec("torch") is not None
+
+
+def make_healthy(folder: Path, *, weights: bool = HAS_TORCH) -> Path:
     """Make one of everything in a new folder; a few seconds. Those in `kept` stay as they are."""
     for name, frames, agents, channels in (
         ("small", 2, AGENTS, ()),
         ("sensors", 1, AGENTS[:1], CHANNELS),
         ("release", 6, AGENTS, ()),
-        *((("cameras", 4, AGENTS, CAMERAS),) if find_spec("torch") else ()),
+        *((("cameras", 4, AGENTS, CAMERAS),) if weights else ()),
     ):
         wanted = SmallRelease(splits=("train",), frames=frames, agents=agents, channels=channels)
         write_small_release(folder / name, wanted)
@@ -64,9 +68,15 @@ def make_healthy(folder: Path) -> Path:
     for method in ("stored", "deflated"):
         packed(folder / "small", folder / "zips" / f"{method}.zip", method)
     (folder / "schedulers").mkdir()
-    told = {"type": "Scheduler", "id": "Scheduler-1", "address": SCHEDULER, "services": {"dashboard": 8787}, "workers": {}}
+    told = {
+        "type": "Scheduler",
+        "id": "Scheduler-1",
+        "address": SCHEDULER,
+        "services": {"dashboard": 8787},
+        "workers": {},
+    }
     (folder / "schedulers" / "scheduler.json").write_text(json.dumps(told), encoding="utf-8")
-    if find_spec("torch"):
+    if weights:
         from campaign.healthy_weights import write_run, write_weight_files
 
         write_weight_files(folder / "weights")
@@ -98,10 +108,10 @@ def tokens(dataset: DeepAccident) -> list[str]:
 
 def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -> None:
     """A complete export and one that was killed, questions with answers, and a cache of images."""
-    export_release(dataset, folder / "exports" / "whole", OpenCood(), workers=1)
+    export_release(dataset, folder / "exports" / "whole", EXPORT, workers=1)
     begun = folder / "exports" / "begun"
     for part in ("1/2", "2/2"):
-        export_release(dataset, begun, OpenCood(), workers=1, part=part)
+        export_release(dataset, begun, EXPORT, workers=1, part=part)
     unfinished = begun / ".deepaccident-parts" / "opencood"
     max(unfinished.glob("*/done.json")).unlink()  # a unit of which some was written
     (unfinished / "a_unit_of_before.paths").write_bytes(b"before/one.yaml\0before/two.yaml\0")
@@ -112,7 +122,12 @@ def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -
     export_release(dataset, folder / "questions", Questions(window=windows), workers=1)
     truth = [json.loads(line) for line in (folder / "questions" / "truth.jsonl").read_bytes().splitlines()]
     answers = [
-        {"id": each["id"], "accident": [0.9] * len(each["accident"]), "who": list(each["actors"])[:2], "where": [[1, 2], [3, 4]]}
+        {
+            "id": each["id"],
+            "accident": [0.9] * len(each["accident"]),
+            "who": list(each["actors"])[:2],
+            "where": [[1, 2], [3, 4]],
+        }
         for each in truth
     ]
     lines = "".join(f"{json.dumps(answer)}\n" for answer in answers)

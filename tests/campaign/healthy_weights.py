@@ -10,7 +10,9 @@ from deepaccident_devkit.model.checkpoint import write_weights
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.training.config import TrainConfig
 
-TRAINING = TrainConfig(steps=1, egos=1, samples="every", agents="available", validation=None, save_every=1, seed=RUN.seed)
+TRAINING = TrainConfig(
+    steps=1, egos=1, samples="every", agents="available", validation=None, save_every=1, seed=RUN.seed
+)
 
 
 def small_network() -> V2XFormer:

@@ -27,7 +27,6 @@ from deepaccident_devkit.synth.spec.choices import Items, Part
 from deepaccident_devkit.tables.manifest import MANIFEST_FILE, read_manifest
 from deepaccident_devkit.validation import validate_release
 
-
 # ---- a release's small files
 
 

@@ -346,7 +346,9 @@ def array_of_another_type(content: bytes, rng: Rng) -> bytes:
         fields = np.zeros(array.shape, [("a", "f8"), ("b", "O" if rng.integers(2) else "i4")])
         turned = np.asfortranarray(array.T if rng.integers(2) else array)
         buffer = io.BytesIO()
-        np.lib.format.write_array(buffer, any_of(rng, (odd, fields, turned, array[..., None], array[:0], array.ravel())))
+        np.lib.format.write_array(
+            buffer, any_of(rng, (odd, fields, turned, array[..., None], array[:0], array.ravel()))
+        )
         return buffer.getvalue()
 
     return _zipped(content, rng, change)

@@ -1,7 +1,6 @@
 """Kinds of files beside releases and results: of exports, questions and caches; a scheduler's address; zips."""
 
 import json
-import zipfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -11,15 +10,14 @@ from unittest.mock import patch
 import numpy as np
 
 from campaign import other_mutations, plain
-from campaign.healthy import AGENTS, CHANNELS, SCHEDULER, opened
+from campaign.healthy import AGENTS, CHANNELS, EXPORT, SCHEDULER, opened
 from campaign.kind import Action, Kind, Room, dataset_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import WorkerError
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.image_cache import ImageCache
-from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.questions import read_answers, results_of_answers
-from deepaccident_devkit.parallel import cluster_executor, executors
+from deepaccident_devkit.parallel import cluster_executor, scheduler_file
 from deepaccident_devkit.validation import validate_release
 
 assert other_mutations  # made for these
@@ -30,8 +28,9 @@ assert other_mutations  # made for these
 def _exported(room: Room) -> dict[str, bytes]:
     """Run the export again: a killed one goes on, a complete one is compared."""
     folder = _export(room)
-    export_release(dataset_of(room.home), folder, OpenCood(), workers=1)
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*.yaml") if path.is_file()}
+    export_release(dataset_of(room.home), folder, EXPORT, workers=1)
+    files = (path for path in folder.rglob("*.yaml") if path.is_file() and not path.is_symlink())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def _export(room: Room) -> Path:
@@ -39,14 +38,14 @@ def _export(room: Room) -> Path:
 
 
 def _judge_exported(room: Room, read: Mapping[str, bytes]) -> str | None:
-    """The manifest tells of the release, and all files of a whole export have its bytes if they are there.
+    """The manifest tells of the settings and the scenarios, and files of a whole export have its bytes.
 
     Which of them are there is not compared: records say that a unit is done, and are believed.
     """
     folder, whole = _export(room), room.home / "exports" / "whole"
     told, expected = (plain.json_file(each / "opencood.manifest.json") for each in (folder, whole))
-    if [told[name] for name in ("settings", "release")] != [expected[name] for name in ("settings", "release")]:
-        return "another manifest"
+    if told["settings"] != expected["settings"] or told["release"]["scenarios"] != expected["release"]["scenarios"]:
+        return "other settings or scenarios"
     files = {path.relative_to(whole).as_posix(): path.read_bytes() for path in whole.rglob("*.yaml")}
     wrong = [name for name in read.keys() & files.keys() if read[name] != files[name]]
     return f"{wrong[0]} differs from that of a whole export" if wrong else None
@@ -107,10 +106,11 @@ def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
 def _scheduled(room: Room) -> str:
     """Nobody listens at the healthy address, and it is right to say so."""
     try:
-        with patch.object(executors, "_FILE_SECONDS", 0.2), cluster_executor(scheduler_file=room.victim):
+        with patch.object(scheduler_file, "_SECONDS", 0.2), cluster_executor(scheduler_file=room.victim):
             return "a scheduler"
     except WorkerError:
-        if room.victim.is_file() and plain.json_file(room.victim) == plain.json_file(room.healthy):
+        same = room.victim.is_file() and room.victim.stat().st_size == room.healthy.stat().st_size
+        if same and room.victim.read_bytes() == room.healthy.read_bytes():
             return SCHEDULER
         raise
 
@@ -130,7 +130,7 @@ def _from_zip(room: Room) -> dict[str, Any]:
 
 
 def _judge_zip(room: Room, read: Mapping[str, Any]) -> str | None:
-    """Unpacked by Python, whose comparison of checksums is left out, the release says the same."""
+    """Unpacked without a look at checksums, the release says the same."""
     unpacked = plain.unpacked(room.victim, room.scratch / "unpacked")
     from campaign.kinds import judge_tables
 
@@ -145,9 +145,9 @@ def _judge_findings(room: Room, sentences: list[str]) -> str | None:
     """`validate` tells of a member whose checksum is another."""
     if long := next((each for each in sentences if len(each) > 2000), None):
         return f"a sentence of {len(long)} characters"
-    with zipfile.ZipFile(room.victim) as archive:
-        damaged = archive.testzip()
-    return None if damaged is None or sentences else f"nothing is found, though {damaged} is damaged"
+    damaged = [name for name, (_, right) in plain.members(room.victim).items() if not right]
+    untold = [name for name in damaged if not any(name.rpartition("/")[2] in each for each in sentences)]
+    return f"no word of {untold[0]}, which is damaged" if untold else None
 
 
 _EXPORTED = Action(_exported, _judge_exported)

@@ -36,6 +36,11 @@ def drawn(count: int, seed: int, kinds: Collection[str] = tuple(KINDS)) -> list[
     return [case for name in kinds if KINDS[name].can_be_read for case in _drawn_of(KINDS[name], count, seed)]
 
 
+def left_out(kinds: Collection[str] = tuple(KINDS)) -> dict[str, str]:
+    """The kinds that `drawn` leaves out, and what they need."""
+    return {name: KINDS[name].needs for name in kinds if not KINDS[name].can_be_read}
+
+
 def _drawn_of(kind: Kind, count: int, seed: int) -> Iterator[Case]:
     rng = seeded(kind.name, seed)
     groups = [names for group in GROUPS if (names := fitting(kind.form, group))]

@@ -54,16 +54,10 @@ def _same(read: Mapping[str, Any], said: Mapping[str, Any]) -> str | None:
         there = next((said[each] for each in names if each in said), None)
         if there is None:
             return f"{name[:100]} is not in the file"
-        found, expected = (each if isinstance(each, np.ndarray) else _array(each) for each in (tensor, there))
-        if not np.array_equal(found, expected.astype(found.dtype), equal_nan=found.dtype.kind == "f"):
-            return f"{name[:100]} has other numbers"
+        (shape, found), (same, expected) = tensor if isinstance(tensor, tuple) else plain.flat(tensor), there
+        if shape != same or not np.array_equal(found, expected.astype(found.dtype), equal_nan=found.dtype.kind == "f"):
+            return f"{name[:100]} has another shape or other numbers"
     return None
-
-
-def _array(tensor: Any) -> Any:
-    import torch
-
-    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).detach().numpy()
 
 
 def _resumed(room: Room) -> dict[str, Any]:
@@ -89,5 +83,13 @@ KINDS = (
     Kind("weights", "safetensors", "weights", "*.safetensors", _WEIGHTS, "torch"),
     Kind("weights of PyTorch", "pt", "weights", "*.pt", _WEIGHTS, "torch"),
     Kind("weights of old PyTorch", "pth", "weights", "*.pth", _WEIGHTS, "torch"),
-    Kind("training state", "safetensors", "run", "last.safetensors", (Action(_resumed, _judge_resumed),), "torch", writes=True),
+    Kind(
+        "training state",
+        "safetensors",
+        "run",
+        "last.safetensors",
+        (Action(_resumed, _judge_resumed),),
+        "torch",
+        writes=True,
+    ),
 )

@@ -76,7 +76,19 @@ def tensor_of_another_dtype(content: bytes, rng: Rng) -> bytes:
     header, data = _header_of(content)
     tensor = header[_tensor_of(header, rng)]
     size = tensor["data_offsets"][1] - tensor["data_offsets"][0]
-    kinds = {"F64": 8, "I64": 8, "U64": 8, "C64": 8, "I32": 4, "F16": 2, "BF16": 2, "BOOL": 1, "F8_E4M3": 1, "U8": 1, "F4": 1}
+    kinds = {
+        "F64": 8,
+        "I64": 8,
+        "U64": 8,
+        "C64": 8,
+        "I32": 4,
+        "F16": 2,
+        "BF16": 2,
+        "BOOL": 1,
+        "F8_E4M3": 1,
+        "U8": 1,
+        "F4": 1,
+    }
     name = any_of(rng, list(kinds))
     tensor["dtype"] = any_of(rng, (name, name, "F32", "X", "", 1, None, "f32"))
     if rng.integers(2):
@@ -118,7 +130,9 @@ def notes_of_other_values(content: bytes, rng: Rng) -> bytes:
     odd = (None, True, -1, 1 << 70, 1.5, "", "x", [], {}, [1], {"a": 1}, float("nan"), "tiny", "\ud800")
     notes[any_of(rng, (*notes, "step", "best", "preset", "another"))] = any_of(rng, odd)
     texts = (json.dumps(notes), json.dumps(notes), json.dumps(notes), "", "[]", "null", "x", "{" * 5000, "[" * 200_000)
-    header["__metadata__"] = any_of(rng, ({"deepaccident": any_of(rng, texts)}, {"deepaccident": any_of(rng, texts)}, {}, {"deepaccident": {}}, "x"))
+    header["__metadata__"] = any_of(
+        rng, ({"deepaccident": any_of(rng, texts)}, {"deepaccident": any_of(rng, texts)}, {}, {"deepaccident": {}}, "x")
+    )
     return _with_header(header, data)
 
 
@@ -150,7 +164,18 @@ def notes_of_5_mb(content: bytes, rng: Rng) -> bytes:
 @by_content("names", "safetensors")
 def tensor_with_another_name(content: bytes, rng: Rng) -> bytes:
     header, data = _header_of(content)
-    odd = ("", "0", "__metadata__ ", "module.", "optimizer.x", "\x1b[2J" * 1_000_000, "x" * _NAME, "\u202e" * 1000, "a\0b", "..")
+    odd = (
+        "",
+        "0",
+        "__metadata__ ",
+        "module.",
+        "optimizer.x",
+        "\x1b[2J" * 1_000_000,
+        "x" * _NAME,
+        "\u202e" * 1000,
+        "a\0b",
+        "..",
+    )
     header[any_of(rng, (*odd, *ODD_NAMES))] = header.pop(_tensor_of(header, rng))
     return _with_header(header, data)
 
@@ -184,13 +209,13 @@ def checkpoint_of_odd_tensors(path: Path, rng: Rng) -> None:
         odd: tuple[Callable[[], Any], ...] = (
             *(lambda dtype=dtype: here.to(dtype) for dtype in dtypes),
             lambda: here.to("meta"),
-            lambda: here.to_sparse(),
+            here.to_sparse,
             lambda: torch.quantize_per_tensor(here, 0.1, 0, torch.qint8),
             lambda: torch.nn.Parameter(here),
             lambda: here.transpose(0, -1),
             lambda: here[:0],
-            lambda: here.numpy(),
-            lambda: here.tolist(),
+            here.numpy,
+            here.tolist,
             lambda: np.float64(1),
             lambda: {"state_dict": here},
             lambda: torch.nn.Linear(2, 2),
@@ -286,8 +311,22 @@ def pickle_of_gigabytes(content: bytes, rng: Rng) -> bytes:
 
 @by_content("types", *_TORCH)
 def checkpoint_asks_for_a_name(content: bytes, rng: Rng) -> bytes:
-    names = (b"os\nsystem", b"builtins\neval", b"torch\nload", b"torch.hub\nload", b"numpy\nfromfile", b"posix\nfork", b"a.b\nc.d", b"\n")
-    more = (b"torch.serialization\nload", b"torch._utils\n_rebuild_parameter", b"torch.jit\nload", b"\x1b[31m\n\xe2\x80\xae")
+    names = (
+        b"os\nsystem",
+        b"builtins\neval",
+        b"torch\nload",
+        b"torch.hub\nload",
+        b"numpy\nfromfile",
+        b"posix\nfork",
+        b"a.b\nc.d",
+        b"\n",
+    )
+    more = (
+        b"torch.serialization\nload",
+        b"torch._utils\n_rebuild_parameter",
+        b"torch.jit\nload",
+        b"\x1b[31m\n\xe2\x80\xae",
+    )
     end = any_of(rng, (b"(X\2\0\0\0lstR.", b".", b"(tR.", b"}b.", b")\x81.", b"X\2\0\0\0lsQ.", b"0"))
     name = any_of(rng, (*names, *more))
     return _with_pickle(content, lambda before: b"\x80\2c" + name + b"\n" + (end if end != b"0" else b"0" + before[2:]))
@@ -300,7 +339,12 @@ def number_of_a_pickle(content: bytes, rng: Rng) -> bytes:
     def change(before: bytes) -> bytes:
         number = any_of(rng, (0, 1, 2, 255, 1 << 16, 1 << 31, 1 << 40, (1 << 63) - 1, 1 << 70, -1, -(1 << 40)))
         length = max((number.bit_length() + 8) // 8, 1)
-        return _edited(before, rng, ("BININT", "BININT1", "BININT2", "LONG1"), b"\x8a%c" % length + number.to_bytes(length, "little", signed=True))
+        return _edited(
+            before,
+            rng,
+            ("BININT", "BININT1", "BININT2", "LONG1"),
+            b"\x8a%c" % length + number.to_bytes(length, "little", signed=True),
+        )
 
     return _with_pickle(content, change)
 
@@ -308,7 +352,18 @@ def number_of_a_pickle(content: bytes, rng: Rng) -> bytes:
 @by_content("names", *_TORCH)
 def text_of_a_pickle(content: bytes, rng: Rng) -> bytes:
     """The name of a tensor, of a storage or of a device is another; of a tensor it may have 5 MB."""
-    odd = ("", "0", "cuda:0", "meta", "storage", "../data", "x" * _NAME, "\x1b[2J" * 1_000_000, "\u202e" * 1000, *ODD_NAMES)
+    odd = (
+        "",
+        "0",
+        "cuda:0",
+        "meta",
+        "storage",
+        "../data",
+        "x" * _NAME,
+        "\x1b[2J" * 1_000_000,
+        "\u202e" * 1000,
+        *ODD_NAMES,
+    )
     text = any_of(rng, odd).encode()
     other = b"X" + struct.pack("<I", len(text)) + text
     return _with_pickle(content, lambda before: _edited(before, rng, ("BINUNICODE", "SHORT_BINUNICODE"), other))
@@ -316,8 +371,20 @@ def text_of_a_pickle(content: bytes, rng: Rng) -> bytes:
 
 @by_content("types", *_TORCH)
 def global_of_a_pickle(content: bytes, rng: Rng) -> bytes:
-    names = (b"torch\nDoubleStorage", b"torch\nBoolStorage", b"torch\nQInt8Storage", b"torch\nComplexFloatStorage", b"torch\nfloat32")
-    more = (b"torch._utils\n_rebuild_sparse_tensor", b"collections\nCounter", b"builtins\ndict", b"builtins\nset", b"torch\nTensor")
+    names = (
+        b"torch\nDoubleStorage",
+        b"torch\nBoolStorage",
+        b"torch\nQInt8Storage",
+        b"torch\nComplexFloatStorage",
+        b"torch\nfloat32",
+    )
+    more = (
+        b"torch._utils\n_rebuild_sparse_tensor",
+        b"collections\nCounter",
+        b"builtins\ndict",
+        b"builtins\nset",
+        b"torch\nTensor",
+    )
     name = any_of(rng, (*names, *more))
     return _with_pickle(content, lambda before: _edited(before, rng, ("GLOBAL",), b"c" + name + b"\n"))
 
@@ -345,7 +412,9 @@ def storage_lost_or_cut(content: bytes, rng: Rng) -> bytes:
         members[name] += bytes(64)
     else:
         head = name.partition("/")[0]
-        members |= any_of(rng, ({f"{head}/byteorder": b"big"}, {f"{head}/version": b"99"}, {f"{head}/constants.pkl": b"\x80\2N."}))
+        members |= any_of(
+            rng, ({f"{head}/byteorder": b"big"}, {f"{head}/version": b"99"}, {f"{head}/constants.pkl": b"\x80\2N."})
+        )
     return packed(members, zipfile.ZIP_STORED)
 
 

@@ -293,8 +293,7 @@ def _made_outside(folder: Path) -> Path:
 def _tree(folder: Path) -> dict[str, bytes | None]:
     """Path → content of all below a folder; None for folders."""
     return {
-        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
-        for path in folder.rglob("*")
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")
     }
 
 
