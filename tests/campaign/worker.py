@@ -18,7 +18,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +27,14 @@ import scipy.optimize
 import shapely
 from fault_injection.mutations import seeded
 
-from campaign.healthy import copied
+from campaign.healthy import HAS_TORCH, copied
 from campaign.kind import Action, Kind, Room
 from campaign.mutations import MARKER, MUTATIONS
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.files import temporary_path
 
 assert all((pyarrow.csv, pyarrow.parquet, scipy.optimize, shapely))  # what the readers import when they need it
-if find_spec("torch"):
+if HAS_TORCH:
     importlib.import_module("campaign.healthy_weights")
 
 SECONDS = 20.0
@@ -198,8 +197,8 @@ class Bench:
         verdicts = [self._acted(action, room, usual) for action in self._kinds[case.kind].actions]
         if (room.victim.parent / MARKER).exists():
             return Outcome(case, "code", "a pickle ran its code")
-        if changed := sorted(_tree(room.outside).items() ^ _OUTSIDE.items()):
-            return Outcome(case, "outside", f"{changed[0][0]} was changed outside ({verdicts[0][:2]})")
+        if changed := {name for name, _ in _tree(room.outside).items() ^ _OUTSIDE.items()}:
+            return Outcome(case, "outside", f"{min(changed)} was changed outside ({verdicts[0][:2]})")
         most = max(megabytes for *_, megabytes in verdicts)
         failed = [each for each in verdicts if each[0] not in ("read", "refused")]
         verdict, detail, _ = (failed or [each for each in verdicts if each[0] == "refused"] or verdicts)[0]
