@@ -1,14 +1,15 @@
-"""The healthy files that cases change: small releases, an index, results, a bundle, labels, exports, weights."""
+"""The healthy files that cases change: small releases, an index, results, a bundle, labels, a scenario file, exports.
 
-import importlib.util
+With PyTorch also files of weights and a run of training.
+"""
+
 import json
 import shutil
-import zipfile
-from contextlib import suppress
-from dataclasses import fields
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from packing import packed
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, Resampling, accident_context, instances_of
@@ -22,20 +23,16 @@ from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
 from deepaccident_devkit.synth.spec import design_text
-from deepaccident_devkit.taxonomy import AgentName
+from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 AGENTS: tuple[AgentName, ...] = ("ego_vehicle", "infrastructure")
 CHANNELS = ("Camera_Front", "lidar01", "BEV_instance_camera")
-TORCH = importlib.util.find_spec("torch") is not None and importlib.util.find_spec("safetensors") is not None
-"""Whether files of weights can be read here."""
-OUTSIDE = "outside"
-"""The folder of healthy files that no writer may touch, whatever the folders say that it writes into."""
 HORIZON = 0.5
 LABELS = MotionLabelConfig(future_frames=1)
-QUESTIONS = Questions(agents=AGENTS[:1], window=WindowRules(observe=0, stride=0.5, ahead=1))
-OPENCOOD = OpenCood(agents=AGENTS, without_clouds=True)
-CACHE = CachedImages(split="train", agents=AGENTS[:1], images=ImageConfig(resize=(18, 32), cameras=CHANNELS[:1]))
+EXPORT = OpenCood(without_clouds=True)
+SCHEDULER = "tcp://127.0.0.1:9"
+"""Where nobody listens."""
 SETUPS = {
     "motion": EvaluationSetup(task="motion", horizon=HORIZON),
     "accident": EvaluationSetup(task="accident", protocol="boxes", horizon=HORIZON),
@@ -43,17 +40,21 @@ SETUPS = {
 }
 
 
-def make_healthy(folder: Path) -> Path:
+HAS_TORCH = find_spec("torch") is not None
+
+
+def make_healthy(folder: Path, *, weights: bool = HAS_TORCH) -> Path:
     """Make one of everything in a new folder; a few seconds. Those in `kept` stay as they are."""
     for name, frames, agents, channels in (
         ("small", 2, AGENTS, ()),
         ("sensors", 1, AGENTS[:1], CHANNELS),
         ("release", 6, AGENTS, ()),
+        *((("cameras", 4, AGENTS, CAMERAS),) if weights else ()),
     ):
         wanted = SmallRelease(splits=("train",), frames=frames, agents=agents, channels=channels)
         write_small_release(folder / name, wanted)
     dataset = opened(folder / "release", folder / "index")
-    opened(folder / "sensors", folder / "index_of_sensors")
+    sensors = opened(folder / "sensors", folder / "index_of_sensors")
     for task in SETUPS:
         _write_results(dataset, folder / "results" / task, task)
     for task, setup in SETUPS.items():
@@ -63,21 +64,23 @@ def make_healthy(folder: Path) -> Path:
     write_label_files(dataset, folder / "labels", tokens(dataset), LABELS, workers=1)
     (folder / "specs").mkdir()
     (folder / "specs" / "crossing.yaml").write_text(design_text(1), encoding="utf-8")
-    _write_exports(dataset, folder)
-    (folder / "archive").mkdir()
-    with zipfile.ZipFile(folder / "archive" / "release.zip", "w") as archive:
-        for path in sorted((folder / "small").rglob("*")):
-            archive.write(path, path.relative_to(folder / "small"))
-    (folder / "scheduler").mkdir()
-    facts = {"type": "Scheduler", "id": "Scheduler-1", "address": "tcp://127.0.0.1:1", "services": {}, "workers": {}}
-    (folder / "scheduler" / "scheduler.json").write_text(json.dumps(facts, indent=2), encoding="utf-8")
-    (folder / OUTSIDE / "folder").mkdir(parents=True)
-    for name in ("precious.txt", "folder/precious.txt"):
-        (folder / OUTSIDE / name).write_text("not ours\n", encoding="utf-8")
-    if TORCH:
-        from campaign.weights import write_weights_of_all_kinds
+    _write_exports(dataset, sensors, folder)
+    for method in ("stored", "deflated"):
+        packed(folder / "small", folder / "zips" / f"{method}.zip", method)
+    (folder / "schedulers").mkdir()
+    told = {
+        "type": "Scheduler",
+        "id": "Scheduler-1",
+        "address": SCHEDULER,
+        "services": {"dashboard": 8787},
+        "workers": {},
+    }
+    (folder / "schedulers" / "scheduler.json").write_text(json.dumps(told), encoding="utf-8")
+    if weights:
+        from campaign.healthy_weights import write_run, write_weight_files
 
-        write_weights_of_all_kinds(folder)
+        write_weight_files(folder / "weights")
+        write_run(opened(folder / "cameras", folder / "index_of_cameras"), folder / "run")
     for name in ("bundles", "index"):
         copied(folder / name, folder / "kept" / name)
     return folder
@@ -103,35 +106,35 @@ def tokens(dataset: DeepAccident) -> list[str]:
     return list(selection("motion").tokens(dataset))
 
 
-class StoppedBeforeTheEnd(Exception):  # noqa: N818 - no fault
-    """Ends an export when all its units are written."""
-
-
-class _Unfinished(OpenCood):
-    def finish(self, *_: object) -> None:
-        raise StoppedBeforeTheEnd
-
-
-def _write_exports(dataset: DeepAccident, folder: Path) -> None:
-    """A whole export and one that was stopped, answers to its questions, and an images cache."""
-    asked = export_release(dataset, folder / "answers" / "export", QUESTIONS, workers=1).folder
-    questions = (asked / "questions" / "questions.jsonl").read_text(encoding="utf-8").splitlines()
+def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -> None:
+    """A complete export and one that was killed, questions with answers, and a cache of images."""
+    export_release(dataset, folder / "exports" / "whole", EXPORT, workers=1)
+    begun = folder / "exports" / "begun"
+    for part in ("1/2", "2/2"):
+        export_release(dataset, begun, EXPORT, workers=1, part=part)
+    unfinished = begun / ".deepaccident-parts" / "opencood"
+    max(unfinished.glob("*/done.json")).unlink()  # a unit of which some was written
+    (unfinished / "a_unit_of_before.paths").write_bytes(b"before/one.yaml\0before/two.yaml\0")
+    (begun / "before").mkdir()
+    for name in ("one", "two"):
+        (begun / "before" / f"{name}.yaml").write_bytes(b"written by the killed one\n")
+    windows = WindowRules(observe=0, ahead=1, stride=0.5, partial_past=True)
+    export_release(dataset, folder / "questions", Questions(window=windows), workers=1)
+    truth = [json.loads(line) for line in (folder / "questions" / "truth.jsonl").read_bytes().splitlines()]
     answers = [
-        json.dumps({"id": json.loads(line)["id"], "accident": [False], "who": None, "where": None})
-        for line in questions
+        {
+            "id": each["id"],
+            "accident": [0.9] * len(each["accident"]),
+            "who": list(each["actors"])[:2],
+            "where": [[1, 2], [3, 4]],
+        }
+        for each in truth
     ]
-    (folder / "answers" / "answers.jsonl").write_text("\n".join(answers) + "\n", encoding="utf-8")
-    (folder / "answers" / "truth.jsonl").write_bytes((asked / "truth.jsonl").read_bytes())
-    shutil.rmtree(asked)
-    export_release(dataset, folder / "export", OPENCOOD, workers=1)
-    with suppress(StoppedBeforeTheEnd):
-        export_release(dataset, folder / "unfinished", _Unfinished(**vars_of(OPENCOOD)), workers=1)
-    export_release(opened(folder / "sensors", folder / "index_of_sensors"), folder / "cache", CACHE, workers=1)
-
-
-def vars_of(form: OpenCood) -> dict[str, object]:
-    """The settings of a format, to make another one with."""
-    return {each.name: getattr(form, each.name) for each in fields(form)}
+    lines = "".join(f"{json.dumps(answer)}\n" for answer in answers)
+    (folder / "questions" / "answers.jsonl").write_text(lines, encoding="utf-8")
+    images = ImageConfig(resize=(18, 30), cameras=CHANNELS[:1])
+    cached = CachedImages(images=images, agents=AGENTS[:1], where=("length>=1",))
+    export_release(sensors, folder / "cache", cached, workers=1)
 
 
 def _link(source: str, target: str) -> None:

@@ -1,26 +1,24 @@
-"""Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong."""
+"""Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong.
+
+`KINDS` has those of `other_kinds` and `weights_kinds` too.
+"""
 
 import json
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
-from campaign import plain
-from campaign.healthy import CACHE, CHANNELS, OPENCOOD, SETUPS, TORCH, opened, selection
+from campaign import other_kinds, plain, weights_kinds
+from campaign.healthy import SETUPS, opened, selection
+from campaign.kind import Action, Kind, Room, dataset_of
 from campaign.mutations import HTML
-from campaign.room import Action, Kind, Room
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, evaluate_results, verify_bundle
-from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.image_cache import ImageCache
-from deepaccident_devkit.export.questions import results_of_answers
 from deepaccident_devkit.motion import LabelFiles
-from deepaccident_devkit.parallel import cluster_executor
 from deepaccident_devkit.reading import file_checksum
 from deepaccident_devkit.release import find_release, read_calib
 from deepaccident_devkit.render.evaluation.report import report_html
@@ -36,7 +34,7 @@ def _opened(room: Room, on_error: Any) -> DeepAccident:
     return DeepAccident("v1", room.tree, index_dir=room.scratch / "index", workers=1, verbose=False, on_error=on_error)
 
 
-def _tables(dataset: DeepAccident) -> dict[str, Any]:
+def tables(dataset: DeepAccident) -> dict[str, Any]:
     """All that the tables say of small files, by the token of the sample or scenario."""
     read: dict[str, Any] = {
         each["token"]: (each["velocity"], dataset.boxes(each["token"], frame="lidar", velocity="label"), pose)
@@ -45,7 +43,7 @@ def _tables(dataset: DeepAccident) -> dict[str, Any]:
     return read | {each["token"]: each for each in dataset.scenario}
 
 
-def _judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
+def judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
     """Compare the scenarios that were read with their files."""
     for token, value in read.items():
         scenario_type, name, *sample = token.split("/")
@@ -107,8 +105,8 @@ def _judge_sentences(_room: Room, sentences: list[str]) -> str | None:
 
 
 _SMALL = (
-    Action(lambda room: _tables(_opened(room, "raise")), _judge_tables),
-    Action(lambda room: _tables(_opened(room, "skip")), _judge_tables),
+    Action(lambda room: tables(_opened(room, "raise")), judge_tables),
+    Action(lambda room: tables(_opened(room, "skip")), judge_tables),
     Action(_validate, _judge_sentences),
 )
 _DEEP = Action(lambda room: _validate(room, deep=True), _judge_sentences)
@@ -138,19 +136,13 @@ def _judge_splits(room: Room, read: Mapping[str, Any]) -> str | None:
 
 
 _SPLITS = (
-    Action(lambda room: _tables(_opened(room, "raise")), _judge_splits),
+    Action(lambda room: tables(_opened(room, "raise")), _judge_splits),
     Action(lambda room: sorted(_opened(room, "skip").split_scenarios("train"))),
     Action(_validate, _judge_sentences),
 )
 
 
 # ---- a release's sensors
-
-
-@cache
-def _dataset(home: Path) -> DeepAccident:
-    """What results are evaluated with; it is never changed."""
-    return opened(home / "release", home / "index")
 
 
 @cache
@@ -237,7 +229,7 @@ def _evaluation(task: str) -> Action:
     """The numbers, and the page that shows them."""
 
     def read(room: Room) -> Any:
-        dataset = _dataset(room.home)
+        dataset = dataset_of(room.home)
         run = evaluate_results(dataset, _top(room), SETUPS[task], selection(task), workers=1, allow_partial=True)
         return run.summary(), report_html(run, [])
 
@@ -261,7 +253,7 @@ def _json_fault(content: Any) -> str | None:
 
 
 def _verify(room: Room) -> Any:
-    verified = verify_bundle(room.tree, _dataset(room.home), workers=1)
+    verified = verify_bundle(room.tree, dataset_of(room.home), workers=1)
     return verified.is_same, verified.to_text()
 
 
@@ -342,120 +334,6 @@ def _part_fault(part: Part, said: Any, path: str) -> str | None:
     return None
 
 
-# ---- exports
-
-
-def _answers(room: Room) -> Any:
-    out = room.scratch / "results.json"
-    results_of_answers(room.tree / "answers.jsonl", room.tree / "truth.jsonl", out)
-    return sorted(plain.json_file(out)["results"])
-
-
-def _judge_answers(room: Room, read: Any) -> str | None:
-    if room.victim.name != "truth.jsonl":
-        return None
-    lines = [json.loads(line) for line in room.victim.read_bytes().splitlines() if line.strip()]
-    asked = {line["sample"] for line in lines}
-    ends = {f"{line['sample'].rpartition('/')[0]}/{line['last_frame']:03d}" for line in lines}
-    return None if asked <= set(read) <= asked | ends else "other samples"
-
-
-def _export(room: Room) -> Any:
-    """The same command again: a whole export is compared, another is continued."""
-    done = export_release(_dataset(room.home), room.tree, OPENCOOD, workers=1)
-    return done.written, done.kept
-
-
-def _judge_export(room: Room, _read: Any) -> str | None:
-    """What was continued equals the undisturbed one; a whole one is only compared."""
-    if room.tree.name != "unfinished":
-        return None
-    for path in sorted((room.home / "export").rglob("*.yaml")):
-        name = path.relative_to(room.home / "export")
-        if not (room.tree / name).is_file() or (room.tree / name).read_bytes() != path.read_bytes():
-            return f"another {name}"
-    return None
-
-
-_EXPORT = (Action(_export, _judge_export),)
-
-
-@cache
-def _cached_release(home: Path) -> DeepAccident:
-    return opened(home / "sensors", home / "index_of_sensors")
-
-
-def _cached(room: Room) -> Any:
-    """Every image, by its scenario."""
-    images, dataset = ImageCache(room.tree), _cached_release(room.home)
-    images.check_release(dataset, [each["token"] for each in dataset.agent])
-    return {
-        each["scenario_token"]: images.load(CACHE.images, dataset, f"{each['token']}/{CHANNELS[0]}")[0]
-        for each in dataset.sample
-    }
-
-
-def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
-    for token, image in read.items():
-        stored = plain.cached_image(room.tree / f"{token.replace('/', '__')}.images")
-        if image.transpose(2, 0, 1).tobytes() != stored:
-            return f"{token}: other pixels than in the file"
-    return None
-
-
-# ---- schedulers and archives
-
-
-class _Client:
-    """In the place of dask's client: nothing is connected."""
-
-    def __init__(self, address: str, **_options: object) -> None:
-        self.address = address
-
-    def __enter__(self) -> "_Client":
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def close(self, **_options: object) -> None: ...
-
-    def run(self, *_arguments: object, **_options: object) -> dict[str, Any]:
-        return {}
-
-    def get_executor(self, **_options: object) -> "_Client":
-        return self
-
-
-def _scheduler(room: Room) -> Any:
-    with patch("distributed.Client", _Client), cluster_executor(scheduler_file=room.victim) as executor:
-        return executor.address
-
-
-_SCHEDULER = (
-    Action(
-        _scheduler,
-        lambda room, read: None if plain.json_file(room.victim)["address"] == read else "another address",
-    ),
-)
-
-
-def _zip(room: Room) -> Any:
-    return _tables(DeepAccident("v1", room.victim, index_dir=room.scratch / "index", workers=1, verbose=False))
-
-
-def _judge_zip(room: Room, read: Any) -> str | None:
-    """What zipfile reads of the members, their checksums left aside: only `validate` compares those."""
-    plain.unpack(room.victim, room.scratch / "unpacked")
-    place = Room(room.home, room.scratch / "unpacked", room.victim, room.scratch, room.healthy)
-    return _judge_tables(place, read)
-
-
-_ZIP = (
-    Action(_zip, _judge_zip),
-    Action(lambda room: [str(each) for each in validate_release(room.victim, workers=1).findings], _judge_sentences),
-)
-
-
 # ---- the index
 
 
@@ -498,10 +376,6 @@ _INDEX = (
     ),
 )
 
-if TORCH:
-    from campaign.weights import WEIGHTS_KINDS
-else:
-    WEIGHTS_KINDS = ()
 KINDS = {
     kind.name: kind
     for kind in (
@@ -564,29 +438,8 @@ KINDS = {
         Kind("index's list", "json", "index", f"v1/{MANIFEST_FILE}", _INDEX),
         Kind("index's tables", "arrow", "index", "v1/tables-*/*.arrow", _INDEX),
         Kind("index's shards", "shard", "index", "v1/shards/*/*.arrow", _INDEX),
-        Kind(
-            "truth file",
-            "jsonl",
-            "answers",
-            "truth.jsonl",
-            (Action(_answers, _judge_answers),),
-            apart=True,
-        ),
-        Kind("manifest", "json", "export", "*.manifest.json", _EXPORT, apart=True),
-        Kind("journal", "journal", "unfinished", ".deepaccident-parts/*/[!.]*.paths", _EXPORT, apart=True),
-        Kind("record of a part", "json", "unfinished", ".deepaccident-parts/**/done.json", _EXPORT, apart=True),
-        Kind("images cache's list", "json", "cache", "*.manifest.json", (Action(_cached, _judge_cached),), apart=True),
-        Kind("images cache", "images", "cache", "*.images", (Action(_cached, _judge_cached),), apart=True),
-        Kind("scheduler file", "json", "scheduler", "*.json", _SCHEDULER, apart=True),
-        Kind(
-            "zip",
-            "zip",
-            "archive",
-            "*.zip",
-            _ZIP,
-            apart=True,
-        ),
-        *WEIGHTS_KINDS,
+        *other_kinds.KINDS,
+        *weights_kinds.KINDS,
     )
 }
-"""By name; those of weights are here where PyTorch is."""
+"""By name."""

@@ -17,25 +17,29 @@ tried, and what became of it. 5 minutes. [SECURITY.md](../SECURITY.md) says what
 ## Changed files
 
 {count:,} times, one file of a healthy tree was changed in one way and then read, as a user would read it: by opening
-the release, by `validate`, by evaluating the results, by verifying and comparing the bundle, and so on. A
-case is *read* if all that was read equals what a plain reader finds in the same bytes (Python's `json` and `split`,
-numpy, Pillow) or what a checksum says. It is *refused* if the devkit raises its own error, which names the file in at
-most 2,000 characters. Anything else *failed*: other values, another exception, more than {seconds:g} s, more than
-{megabytes} MB of memory above that of the healthy file, code that ran, a process that died, a file outside the case's
-own folder that was changed or removed.
-
-The kinds from the truth file on have a seed of their own each. An export is read by the command that made it: it
-compares a whole export, and continues an unfinished one.
+the release or its zip, by `validate`, by evaluating the results, by verifying and comparing the bundle,
+by going on with an export that was killed, by `results from questions`, by loading weights, by going on with a run of
+training, and so on. A case is *read* if all that was read equals what a plain reader finds in the same bytes (Python's
+`json`, `split` and `zipfile`, numpy, Pillow, PyTorch) or what a checksum says. It is *refused* if the devkit raises its
+own error, which names the file in at most 2,000 characters, none of which moves a terminal's cursor or turns the
+direction of letters. Anything else *failed*: other values, another exception, more than {seconds:g} s of the
+processor's time, more than {megabytes} MB of memory above that of the healthy file, code that ran, a process that died,
+and anything that was changed in a folder outside of what was read and written, to which links and paths lead.
 
 Each cell of the table has three numbers: read, refused, **failed**. The columns are the ways to change a file:
 
 - bytes: flipped bits, cut, inserted, removed, swapped and zeroed parts, other line ends and byte order marks
-- numbers: huge ones, NaN, sizes that are not so
-- types: other types, keys and formats; pickles that run code or ask for names; YAML tags
-- bombs: holes of 3 GB (of weights 5 GB), endless lines, deep nesting, archives and images that unpack to gigabytes
-- links: links to themselves, to devices and elsewhere; folders that lead out of an export; named pipes and folders in
-  the file's place; no file
-- names: HTML, control characters and commands as names and texts; odd files beside the healthy one
+- numbers: huge ones, NaN, sizes that are not so; ends of archives, tables and headers that lie
+- types: other types, keys and formats; pickles that run code or ask for names; YAML tags; tensors that are views,
+  sparse or without numbers; members of archives that are there twice, encrypted or lie on each other
+- bombs: holes of 5 GB, endless lines, deep nesting, values of 5 MB, addresses of 50 MB, archives and images that unpack
+  to gigabytes, pickles that ask for 6 GB in ten bytes, tensors of which one number stands for gigabytes
+- links: links to themselves, to devices and elsewhere; named pipes and folders in the file's place; no file; below an
+  export's folder links to what is outside, and paths in its journals that lead there
+- names: HTML, control characters, letters from right to left and commands as names and texts; members of archives whose
+  names lead elsewhere; odd files beside the healthy one
+
+Each kind of file has cases drawn by a seed of its own, so that a new kind changes nothing of the others.{left_out}
 
 {failed_text}
 """
@@ -52,19 +56,23 @@ limit on the size of files). Then the same command ran again.
 _END = """
 ## Run it again
 
-    pip install '.[torch,test]' && python -m tests.campaign
+    python -m tests.campaign
 
 at the top of a checkout repeats all of it and writes this page, which is of {command}. The same seed makes the
-same cases. `pytest tests/campaign` tries 300 others; a test compares the numbers of this page with each other and with
-the kinds of files. What fails is printed with its kind, mutation and seed.
+same cases; `--count` is how many a kind has, and `--kinds "weights,zip of a release"` runs these alone. Weights and
+training states need the extra `torch`, and are left out where it is not installed. `pytest tests/campaign` tries
+others, a few of each kind; a test compares the numbers of this page with each other and with the kinds of files. What
+fails is printed with its kind, mutation and seed.
 """
 
 
 def page(outcomes: Sequence[Outcome], stops: Sequence[Stopped], command: str) -> str:
-    """The whole page."""
+    """The whole page; kinds of which there is no outcome are named as left out."""
     failed = sum(outcome.failed for outcome in outcomes)
     text = "Nothing failed." if not failed else f"{failed} failed."
-    head = _HEAD.format(count=len(outcomes), seconds=SECONDS, megabytes=MEGABYTES, failed_text=text)
+    absent = [name for name in KINDS if name not in {outcome.case.kind for outcome in outcomes}]
+    left_out = f" Left out: {', '.join(absent)}." if absent else ""
+    head = _HEAD.format(count=len(outcomes), seconds=SECONDS, megabytes=MEGABYTES, left_out=left_out, failed_text=text)
     kills = [each for each in stops if each.stop.kind == "kill"]
     stopped = _STOPS.format(kills=len(kills), full=len(stops) - len(kills))
     tables = (_table(_rows(outcomes)), _table(_stop_rows(stops)))

@@ -3,8 +3,10 @@
 import io
 import json
 import pickle
+import re
+import struct
 import zipfile
-from contextlib import suppress
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,11 @@ import numpy as np
 import yaml
 
 LEFT_TO_RIGHT = np.diag([1.0, -1.0, 1.0, 1.0])
+_LARGE = 64 << 20
+_OF_RELEASE = re.compile(
+    r"(?<![^/])(type\d+_subtype\d+_(accident|normal)/(meta|[a-z_]+/(label|calib))/.*\.(txt|pkl)|[a-z_]+\.txt)$"
+)
+"""The part of a path that is of a release without sensors."""
 _ALLOWED = {
     *((f"numpy.{core}.multiarray", "_reconstruct") for core in ("core", "_core")),
     *((f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")),
@@ -85,22 +92,89 @@ def yaml_file(path: Path) -> Any:
     return yaml.safe_load(path.read_bytes().decode("utf-8"))
 
 
-def cached_image(path: Path) -> bytes:
-    """The first image of a scenario's file in an images cache."""
+def cached_image(path: Path, agent: int, camera: int, height: int, width: int) -> np.ndarray:
+    """The pixels (height, width, 3) of the first frame of an agent, of a file of uncompressed cached images."""
     content = path.read_bytes()
-    begin, size = np.frombuffer(content, "<i8", 2, offset=24)
-    return content[begin : begin + size]
+    assert content[:8] == b"DAimages"
+    rows, cameras = np.frombuffer(content, "<i8", 2, offset=8).tolist()
+    table = np.frombuffer(content, "<i8", rows * cameras * 2, offset=24).reshape(rows, cameras, 2)
+    begin, length = table[agent * rows if agent else 0, camera].tolist()
+    return np.frombuffer(content[begin : begin + length], np.uint8).reshape(3, height, width).transpose(1, 2, 0)
 
 
-def unpack(path: Path, folder: Path) -> None:
-    """Write the members of an archive that can be read below a folder, damaged or not; backslashes part folders."""
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.infolist():
-            place = folder / entry.filename.replace("\\", "/").lstrip("/")
-            if entry.is_dir() or ".." in place.parts:
-                continue
-            with suppress(zipfile.BadZipFile, OSError), archive.open(entry) as member:
-                member._expected_crc = None  # type: ignore[attr-defined]
-                content = member.read()
-                place.parent.mkdir(parents=True, exist_ok=True)
-                place.write_bytes(content)
+def members(archive: Path) -> dict[str, tuple[bytes, bool]]:
+    """Path in a release → the bytes of an archive's member, and whether its checksum is right; empty if none come out.
+
+    Which folders lead to the release does not matter, nor what the member's own head says.
+    """
+    content, found = archive.read_bytes(), {}
+    with zipfile.ZipFile(archive) as opened:
+        entries = opened.infolist()
+    for entry in entries:
+        inside = _OF_RELEASE.search(entry.filename.replace("\\", "/"))
+        if inside is None:
+            continue
+        begin = entry.header_offset + 30 + sum(struct.unpack_from("<HH", content, entry.header_offset + 26))
+        stored = content[begin : begin + entry.compress_size]
+        try:
+            if entry.compress_type != zipfile.ZIP_STORED:
+                stored = zlib.decompressobj(-zlib.MAX_WBITS).decompress(stored, min(entry.file_size, _LARGE) + 1)
+            member = stored if entry.file_size < _LARGE else b""
+        except zlib.error:
+            member = b""
+        found[inside[0]] = member, zlib.crc32(member) == entry.CRC and len(member) == entry.file_size
+    return found
+
+
+def unpacked(archive: Path, folder: Path) -> Path:
+    """The files of a release in an archive, also those whose checksum is another."""
+    for name, (member, _) in members(archive).items():
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(member)
+    return folder
+
+
+_NUMPY = {
+    "BF16": "<u2",
+    "BOOL": "?",
+    **{f"{kind}{8 * size}": f"<{kind.lower()}{size}" for kind in "IFU" for size in (1, 2, 4, 8)},
+}
+
+
+Flat = tuple[tuple[int, ...], np.ndarray]
+"""The shape of a tensor, and its numbers one after the other: numpy has no more than 64 dimensions."""
+
+
+def safetensors(path: Path) -> tuple[dict[str, Flat], dict[str, Any]]:
+    """The tensors of a safetensors file, and the notes of the devkit."""
+    content = path.read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    notes = header.pop("__metadata__", {}).get("deepaccident", "{}")
+    tensors = {}
+    for name, told in header.items():
+        begin, end = told["data_offsets"]
+        flat = np.frombuffer(content[8 + length + begin : 8 + length + end], _NUMPY[told["dtype"]])
+        wide = (flat.astype("<u4") << 16).view("<f4") if told["dtype"] == "BF16" else flat
+        tensors[name] = tuple(told["shape"]), wide
+    return tensors, json.loads(notes)
+
+
+def checkpoint(path: Path) -> dict[str, Flat]:
+    """The tensors of a checkpoint, by PyTorch itself, which runs no code of it; numpy's numbers may be beside them."""
+    import torch
+
+    numpy = np.float64(1).__reduce__()[0], np.zeros(1).__reduce__()[0], np.ndarray, np.dtype, type(np.dtype("f8"))
+    with torch.serialization.safe_globals([*numpy, type(np.dtype("f4"))]):
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    for name in ("state_dict", "model"):
+        if isinstance(found.get(name), dict):
+            found = found[name]
+    return {name: flat(each) for name, each in found.items() if isinstance(each, torch.Tensor)}
+
+
+def flat(tensor: Any) -> Flat:
+    """A tensor of PyTorch."""
+    wide = tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor
+    return tuple(tensor.shape), wide.detach().reshape(-1).numpy()

@@ -6,13 +6,19 @@ import time
 from pathlib import Path
 from typing import Any, NoReturn
 
+from campaign.kind import Action, Kind, Room
 from campaign.mutations import MARKER
-from campaign.room import Action, Kind, Room
-from deepaccident_devkit.errors import BrokenReleaseError, DeepAccidentError, ReleaseError
+from deepaccident_devkit.errors import DeepAccidentError, ReleaseError
 
 
 def _hangs(_room: Room) -> None:
-    time.sleep(60)
+    until = time.process_time() + 60
+    while time.process_time() < until:
+        pass
+
+
+def _writes_outside(room: Room) -> None:
+    (room.outside / "new.txt").write_bytes(b"")
 
 
 def _takes_memory(_room: Room) -> int:
@@ -42,6 +48,17 @@ def _runs_code(room: Room) -> None:
     (room.victim.parent / MARKER).mkdir()
 
 
+class _AsItIsError(ReleaseError):
+    """Says its whole message, and shortens and escapes nothing."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__()
+        self._message = message
+
+    def __str__(self) -> str:
+        return self._message
+
+
 def _unless_healthy(read: Any) -> Any:
     """Healthy files are read well: only the file's changed content is met by the fault."""
     return lambda room: "healthy" if room.victim.read_bytes() == room.healthy.read_bytes() else read(room)
@@ -52,9 +69,11 @@ _READERS = {
     "memory": Action(_unless_healthy(_takes_memory)),
     "memory, asked for": Action(_unless_healthy(_asks_for_memory)),
     "foreign": Action(_unless_healthy(_raises_another)),
-    "message": Action(_unless_healthy(lambda room: _raises(BrokenReleaseError(f"{room.victim}\n{'x' * 2000}")))),
+    "message": Action(_unless_healthy(lambda room: _raises(_AsItIsError(f"{room.victim}: {'x' * 2000}")))),
     "message, nameless": Action(_unless_healthy(lambda _: _raises(ReleaseError("something is wrong")))),
     "crash": Action(_unless_healthy(_dies)),
+    "message, of a terminal": Action(_unless_healthy(lambda room: _raises(_AsItIsError(f"{room.victim}: \x1b[2J")))),
+    "outside": Action(_unless_healthy(_writes_outside)),
     "code": Action(_unless_healthy(_runs_code)),
     "wrong": Action(
         lambda room: Path(room.victim).read_bytes(),

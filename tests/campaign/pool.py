@@ -5,50 +5,48 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import IO
 
-import numpy as np
+from fault_injection.mutations import seeded
 
 from campaign import worker
+from campaign.kind import Kind
 from campaign.kinds import KINDS
 from campaign.mutations import GROUPS, fitting
-from campaign.room import Kind
 from campaign.worker import SECONDS, Case, Outcome
 
 WORKERS = 2
 KINDS_MODULE = "campaign.kinds"
+_CONNECT = "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"
+"""How long dask tries to reach a scheduler."""
 _TESTS = Path(__file__).parents[1]
 
 
-def drawn(count: int, seed: int) -> list[Case]:
-    """So many cases: kinds and groups of mutations by turns, the mutation of a group by chance.
+def drawn(count: int, seed: int, kinds: Collection[str] = tuple(KINDS)) -> list[Case]:
+    """So many cases of each kind: groups of mutations by turns, the mutation of a group by chance.
 
-    Kinds that are `apart` have none of them.
+    A kind has a seed of its own, so that a new kind changes nothing of the others. Kinds that need a package which is
+    not there are left out.
     """
-    return _by_turns([kind for kind in KINDS.values() if not kind.apart], count, seed, np.random.default_rng(seed))
+    return [case for name in kinds if KINDS[name].can_be_read for case in _drawn_of(KINDS[name], count, seed)]
 
 
-def drawn_apart(count: int, seed: int) -> list[Case]:
-    """So many cases of each kind that is `apart`, by a seed of its own."""
-    return [
-        case
-        for kind in KINDS.values()
-        if kind.apart
-        for case in _by_turns([kind], count, seed, np.random.default_rng([seed, *kind.name.encode()]))
-    ]
+def left_out(kinds: Collection[str] = tuple(KINDS)) -> dict[str, str]:
+    """The kinds that `drawn` leaves out, and what they need."""
+    return {name: KINDS[name].needs for name in kinds if not KINDS[name].can_be_read}
 
 
-def _by_turns(kinds: Sequence[Kind], count: int, seed: int, rng: np.random.Generator) -> list[Case]:
-    groups = [(kind.name, names) for group in GROUPS for kind in kinds if (names := fitting(kind.form, group))]
-    return [
-        Case(kind, names[int(rng.integers(len(names)))], number // len(groups) + 1000 * seed)
-        for number, (kind, names) in zip(range(count), groups * (count // len(groups) + 1), strict=False)
-    ]
+def _drawn_of(kind: Kind, count: int, seed: int) -> Iterator[Case]:
+    rng = seeded(kind.name, seed)
+    groups = [names for group in GROUPS if (names := fitting(kind.form, group))]
+    for number in range(count):
+        names = groups[number % len(groups)]
+        yield Case(kind.name, names[int(rng.integers(len(names)))], number // len(groups) + 1000 * seed)
 
 
 def run(
@@ -65,7 +63,7 @@ def run(
     Args:
         cases: of kinds of files in the module `kinds`.
         healthy: the files that are changed; each worker makes a copy beside them.
-        seconds: that a case may take.
+        seconds: of the processor's time that a case may take.
         workers: how many processes.
         kinds: the module of the kinds of files.
         tell: is called with each outcome.
@@ -101,7 +99,7 @@ def _server(healthy: Path, number: int, kinds: str) -> Iterator[tuple[IO[str], I
     home = healthy.with_name(f"{healthy.name} of worker {number}")
     command = [sys.executable, "-W", "ignore", worker.__file__, str(healthy), str(home), kinds]
     paths = os.pathsep.join([str(_TESTS), str(_TESTS.parent), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", _CONNECT: "1s"}
     environment.pop("DEEPACCIDENT_LIMITS", None)
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as process:

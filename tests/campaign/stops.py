@@ -67,6 +67,24 @@ VERBS = (
         )
         for name, own in {"opencood": " --without-clouds", "nuscenes": "", "parquet": "", "webdataset": ""}.items()
     ),
+    Verb(
+        "export questions",
+        f"export questions {_RELEASE} --observe 0 --ahead 1 --stride 0.5 --partial-past --out {{out}}/questions",
+        progress="questions/questions.manifest.json",
+    ),
+    Verb(
+        "cache",
+        "cache {home}/sensors --index-dir {home}/index_of_sensors --workers 1 --out {out}/cache --resize 30x18 "
+        "--cameras Camera_Front --agents ego_vehicle --where length>=1",
+        progress="cache/cache.manifest.json",
+    ),
+    Verb(
+        "results from questions",
+        "results from questions {home}/questions/answers.jsonl --truth {home}/questions/truth.jsonl "
+        "--out {out}/answered.json",
+    ),
+    Verb("safety report", f"safety report {_RELEASE} --replays none --out {{out}}/safety"),
+    Verb("explore --export", f"explore {_RELEASE} --export {{out}}/pages"),
     Verb("replay", f"replay {_SENSORS} --out {{out}}/replay.html"),
 )
 

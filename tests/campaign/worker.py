@@ -1,13 +1,14 @@
 """A process that makes workers: `python worker.py` reads a case a line and answers with a line.
 
 Workers are forks of it, so that a new one has everything imported. One lasts until a case ends it: by a crash, by more
-than `seconds` of work, or by memory.
+than `seconds` of the processor's time, or by memory.
 """
 
 import importlib
 import json
 import logging
 import os
+import re
 import resource
 import select
 import shutil
@@ -26,16 +27,24 @@ import scipy.optimize
 import shapely
 from fault_injection.mutations import seeded
 
-from campaign.healthy import OUTSIDE, copied
+from campaign.healthy import HAS_TORCH, copied
+from campaign.kind import Action, Kind, Room
 from campaign.mutations import MARKER, MUTATIONS
-from campaign.room import Action, Kind, Room
 from deepaccident_devkit.errors import DeepAccidentError
+from deepaccident_devkit.files import temporary_path
 
 assert all((pyarrow.csv, pyarrow.parquet, scipy.optimize, shapely))  # what the readers import when they need it
+if HAS_TORCH:
+    importlib.import_module("campaign.healthy_weights")
 
 SECONDS = 20.0
+"""Of the processor's time: a busy machine makes nothing fail."""
+PATIENCE = 10
+"""A case that waits has so many times as much time."""
 MEGABYTES = 300
 LONGEST_MESSAGE = 2000
+_UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""What moves a terminal's cursor, or turns the direction of letters."""
 _ROOM_MEGABYTES = 3000
 """More address space than a worker has at its start: the hard limit."""
 
@@ -59,8 +68,8 @@ class Outcome:
     Attributes:
         case: it.
         verdict: `read`, `refused`, or how it failed: `foreign` exception, `wrong`, `message` (an error of ours that
-            does not name the file, or is too long), `memory`, `hang`, `crash`, `code` (a pickle's), `outside` (a file
-            outside the folder was changed or removed).
+            does not name the file, is too long, or has control characters), `memory`, `hang`, `crash`, `code` (a
+            pickle's), `outside` (something was changed there).
         detail: a sentence for those who look into it.
         megabytes: peak memory above the healthy run's.
     """
@@ -116,9 +125,11 @@ class _Worker:
         """The outcome's JSON; None if there is none in time, or the process ended."""
         self._seconds = seconds
         os.write(self._to_fork, line.encode())
-        until = time.monotonic() + seconds
+        until, worked = time.monotonic() + PATIENCE * seconds, _processor_seconds(self._process) + seconds
         while b"\n" not in self._buffer:
-            ready, _, _ = select.select([self._from_fork], [], [], max(0.0, until - time.monotonic()))
+            ready, _, _ = select.select([self._from_fork], [], [], 0.5)
+            if not ready and time.monotonic() < until and _processor_seconds(self._process) < worked:
+                continue
             more = os.read(self._from_fork, 1 << 16) if ready else b""
             if not more:
                 return None
@@ -134,7 +145,7 @@ class _Worker:
                 self._process = 0
                 return {"verdict": "crash", "detail": f"exit status {os.waitstatus_to_exitcode(status)}"}
             time.sleep(0.01)
-        return {"verdict": "hang", "detail": f"no answer in {self._seconds:g} s"}
+        return {"verdict": "hang", "detail": f"no answer in {self._seconds:g} s of work"}
 
     def stop(self) -> None:
         """End it."""
@@ -184,11 +195,10 @@ class Bench:
     def _outcome(self, case: Case, usual: float) -> Outcome:
         room = self.room(case)
         verdicts = [self._acted(action, room, usual) for action in self._kinds[case.kind].actions]
-        if (now := _seen(self._home / OUTSIDE)) != _seen(self._healthy / OUTSIDE):
-            return Outcome(case, "outside", f"files of nobody's concern are others now: {now}"[:LONGEST_MESSAGE])
-        code_ran = room.victim.parent / MARKER
-        if code_ran.exists():
+        if (room.victim.parent / MARKER).exists():
             return Outcome(case, "code", "a pickle ran its code")
+        if changed := {name for name, _ in _tree(room.outside).items() ^ _OUTSIDE.items()}:
+            return Outcome(case, "outside", f"{min(changed)} was changed outside ({verdicts[0][:2]})")
         most = max(megabytes for *_, megabytes in verdicts)
         failed = [each for each in verdicts if each[0] not in ("read", "refused")]
         verdict, detail, _ = (failed or [each for each in verdicts if each[0] == "refused"] or verdicts)[0]
@@ -200,13 +210,17 @@ class Bench:
         source, tree, scratch = self._healthy / kind.folder, self._home / "case" / kind.folder, self._home / "scratch"
         for folder in (self._home / "case", scratch):
             shutil.rmtree(folder, ignore_errors=True)
-        copied(source, tree)
+        if kind.writes:
+            shutil.copytree(source, tree)  # what is written into a hard link is written into the healthy file
+        else:
+            copied(source, tree)
         scratch.mkdir()
+        outside = _made_outside(self._home / "outside")
         files = kind.files(tree)
         victim = files[int(rng.integers(len(files)))]
         if case.mutation is not None:
             MUTATIONS[case.mutation].apply(victim, rng)
-        return Room(self._home, tree, victim, scratch, source / victim.relative_to(tree))
+        return Room(self._home, tree, victim, scratch, outside, source / victim.relative_to(tree))
 
     def _acted(self, action: Action, room: Room, usual: float) -> tuple[str, str, float]:
         """Verdict, detail and megabytes of one action."""
@@ -251,16 +265,55 @@ def _of_error(error: BaseException, room: Room) -> tuple[str, str]:
         return "foreign", short + where
     if len(str(error)) > LONGEST_MESSAGE:
         return "message", f"{len(str(error))} characters: {short}"
-    if not all(each.isprintable() or each == "\n" for each in detail):
-        return "message", f"has characters that change a terminal: {short!r}"
+    if unseen := _UNSEEN.search(str(error)):
+        return "message", f"has the character {unseen[0]!r}: {short}"
     if room.victim.name not in detail and str(room.tree) not in detail:
         return "message", f"names no file: {short}"
     return "refused", short
 
 
-def _seen(folder: Path) -> dict[str, bytes]:
-    """What lies below a folder, by its path from there."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+def _made_outside(folder: Path) -> Path:
+    """A new folder outside of what is read and written, with what a careless program would remove."""
+    for aside in (folder, folder.with_name("aside")):
+        if aside.is_dir() and not aside.is_symlink():
+            shutil.rmtree(aside)
+        else:
+            aside.unlink(missing_ok=True)
+    for name, content in _OUTSIDE.items():
+        place = folder / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if content is None:
+            place.mkdir(exist_ok=True)
+        else:
+            place.write_bytes(content)
+    return folder
+
+
+def _tree(folder: Path) -> dict[str, bytes | None]:
+    """Path → content of all below a folder; None for folders."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")
+    }
+
+
+_DEAD = temporary_path(Path("kept.txt")).name.replace(f"-{os.getpid()}-", "-999999999-")
+_OUTSIDE: Mapping[str, bytes | None] = {
+    "kept.txt": b"kept",
+    "folder": None,
+    "folder/empty": None,
+    "folder/inner.txt": b"inner",
+    f"folder/{_DEAD}": b"of a dead process",
+    _DEAD: b"of a dead process",
+}
+
+
+def _processor_seconds(process: int) -> float:
+    """How long a process has worked; 0 if it is gone."""
+    try:
+        facts = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(facts[11]) + int(facts[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _status(name: str) -> int:

@@ -60,7 +60,7 @@ def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> 
         ConfigError: the checkpoint cannot be read, or is of another model or run.
     """
     path = folder / LAST
-    if not path.is_file():
+    if not (path.is_file() or path.is_dir()):
         return Progress()
     weights = read_weights(path)
     try:

@@ -373,6 +373,12 @@ def test_a_checkpoint_of_another_run_is_refused(da: DeepAccident, whole: Path, t
         trained(da, tmp_path)
 
 
+def test_a_folder_in_the_place_of_a_checkpoint_is_refused(da: DeepAccident, tmp_path: Path) -> None:
+    (tmp_path / LAST).mkdir()
+    with pytest.raises(ConfigError, match=r"last\.safetensors.*: weights cannot be read"):
+        trained(da, tmp_path)
+
+
 def scaled(name: str, factor: float) -> Any:
     return lambda held, _: held.update({name: held[name] * factor})
 

@@ -1,9 +1,14 @@
-"""What a case is made of: the room where it happens, what is done there, and the kind of file that is changed."""
+"""What a kind of files is, and where a case of it happens."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+from campaign.healthy import opened
+from deepaccident_devkit import DeepAccident
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,6 +20,7 @@ class Room:
         tree: the case's folder in it.
         victim: the file that is changed.
         scratch: an empty folder.
+        outside: a folder that nothing may change, though links and paths lead there.
         healthy: the path of the unchanged file.
     """
 
@@ -22,6 +28,7 @@ class Room:
     tree: Path
     victim: Path
     scratch: Path
+    outside: Path
     healthy: Path
 
 
@@ -52,7 +59,8 @@ class Kind:
         folder: of the healthy tree; a case has a copy of it.
         pattern: of the files in it, of which a case changes one.
         actions: what is done with it, one after another; a refusal does not end them.
-        apart: whether it has a seed of its own, so that it changes no case of the others.
+        needs: a package without which this kind is left out; empty for none.
+        writes: whether the actions write into the folder.
     """
 
     name: str
@@ -60,8 +68,20 @@ class Kind:
     folder: str
     pattern: str
     actions: tuple[Action, ...] = field(repr=False)
-    apart: bool = False
+    needs: str = ""
+    writes: bool = False
+
+    @property
+    def can_be_read(self) -> bool:
+        """Whether the package that it needs is installed."""
+        return not self.needs or find_spec(self.needs) is not None
 
     def files(self, tree: Path) -> list[Path]:
         """The files of this kind."""
         return sorted(path for path in tree.glob(self.pattern) if path.is_file())
+
+
+@cache
+def dataset_of(home: Path) -> DeepAccident:
+    """What is evaluated and exported; it is never changed."""
+    return opened(home / "release", home / "index")
