@@ -7,7 +7,7 @@ import re
 import struct
 import zipfile
 import zlib
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -111,7 +111,7 @@ def members(archive: Path) -> dict[str, tuple[bytes, bool]]:
     with zipfile.ZipFile(archive) as opened:
         entries = opened.infolist()
     for entry in entries:
-        inside = _OF_RELEASE.search(entry.filename.replace("\\", "/"))
+        inside = _OF_RELEASE.search(str(PurePosixPath(entry.filename.replace("\\", "/"))))
         if inside is None:
             continue
         begin = entry.header_offset + 30 + sum(struct.unpack_from("<HH", content, entry.header_offset + 26))
