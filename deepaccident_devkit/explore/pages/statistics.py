@@ -16,7 +16,6 @@ from deepaccident_devkit.explore.choices import Choices, Found, found_by
 from deepaccident_devkit.explore.explorer import DPI, Explorer
 from deepaccident_devkit.explore.pages.answers import explorer_of, picture
 from deepaccident_devkit.explore.pages.release_tabs import release_page
-from deepaccident_devkit.explore.pages.scenarios import choices_of
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.statistics import STATISTICS_FIGURES, render_statistics
 from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
@@ -61,7 +60,7 @@ def _statistics(request: Request) -> Response:
 
 def _choices(request: Request) -> Choices:
     """What was chosen, without how the list showed it."""
-    given = choices_of(request)
+    given = Choices.of(request.query_params.multi_items())
     return Choices(facets=given.facets, query=given.query)
 
 

@@ -19,7 +19,7 @@ from deepaccident_devkit.motion.explaining.quirks import Remaker, actor_of, cell
 from deepaccident_devkit.motion.explaining.sources import cell_source, poses_at_present
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warps.warping import WarpMode
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, UNTRACKED_ID
 
 _MAPS = ("segmentation", "instance", "centerness", "offset", "flow")
 
@@ -158,6 +158,9 @@ def _disagreements(
 ) -> tuple[str, ...]:
     """The maps whose values the boxes do not give, and `painter` if the labels show another actor here."""
     maps = [name for name in _MAPS if getattr(values, name) != getattr(remade, name)]
+    untracked = painter is not None and painter.actor_id == UNTRACKED_ID
+    if untracked and "instance" in maps and not labels.config.rules.untracked_share_an_id:
+        maps.remove("instance")  # each has a number of its own, which no actor's id tells
     if labels.id_map:
         shown = actor_of(labels, values)
         same = shown == (None if painter is None else painter.actor_id)
