@@ -54,13 +54,6 @@ def test_an_option_that_changes_nothing_is_refused(words: str, sentence: str) ->
     assert (result.exit_code, sentence in result.stderr) == (2, True), result.output
 
 
-def test_rows_are_of_labels(da: DeepAccident) -> None:
-    meta = next(da.dataroot.rglob("meta/*.txt"))
-    assert run("explain", str(meta)).exit_code == 0
-    result = run("explain", str(meta), "--rows", "3")
-    assert (result.exit_code, "--rows changes nothing for a file of the kind meta" in result.stderr) == (2, True)
-
-
 def test_validate_offers_no_option_of_the_index(da: DeepAccident, tmp_path: Path) -> None:
     assert "--index-dir" not in run("validate", "--help").output
     words = ("validate", str(da.dataroot), "--scenario", da.scenario[0]["token"])
