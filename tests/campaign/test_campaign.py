@@ -66,6 +66,7 @@ def test_a_case_depends_on_its_seed_alone(healthy: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Duplicate name")  # it is what one of them makes
 def test_every_mutation_can_change_every_form(healthy: Path, tmp_path: Path) -> None:
     bench = Bench(healthy, tmp_path / "home", KINDS)
     one_of = {kind.form: kind.name for kind in KINDS.values()}
