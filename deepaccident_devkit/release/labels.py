@@ -129,25 +129,6 @@ def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
     return _labels({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, raw=raw)
 
 
-def read_label_to_fault(path: ReleasePath, *, raw: bool = False) -> tuple[Labels, LabelError | None]:
-    """One label file as far as its first wrong line, and the error that `read_label` raises for that; None if good.
-
-    Raises as `read_label` does, if not even the first line can be read.
-    """
-    try:
-        return read_label(path, raw=raw), None
-    except LabelError as error:
-        content = _content(path)
-        fault = _faulty_line(content)
-        if fault is None:
-            raise
-        before = b"".join(content.splitlines(keepends=True)[: fault[0] - 1])
-        columns = _parse_joined([_tidied(before)])
-        if columns is None:
-            raise
-        return _labels(columns, raw=raw), error
-
-
 def read_lone_words(path: ReleasePath) -> list[tuple[int, str, bool]]:
     """The lines of one label file that are skipped since they have one word, as its reference reader skips them.
 
