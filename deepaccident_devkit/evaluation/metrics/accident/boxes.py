@@ -206,7 +206,8 @@ class BoxAccidents:
             `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
             `false_samples`: how many raise an alarm without an accident to come; and of `_LEFT_OUT` each.
         """
-        given = [each if "tally" in each else self._tallied(each) for each in counts]
+        complete = [{"unplaced": 0, **each} for each in counts]  # runs kept by earlier versions refused such samples
+        given = [each if "tally" in each else self._tallied(each) for each in complete]
         return {
             "tally": united(each["tally"] for each in given),
             "alarms": [alarm for each in given for alarm in each["alarms"]],

@@ -314,6 +314,13 @@ def test_a_pair_that_no_label_shows(da_motion: DeepAccident, monkeypatch: pytest
     assert result([alarm(time=0.5)], replace(truth, horizon=0.5)).unplaced == 0  # it comes later: nothing is left out
 
 
+def test_counts_that_earlier_versions_kept_do_not_say_what_was_unplaced() -> None:
+    kept = [counted([alarm()], CRASH), counted([], PASSING)]
+    for now in (kept, BOXES.pooled(kept)):
+        before = [{name: value for name, value in each.items() if name != "unplaced"} for each in now]
+        assert BOXES.result(before) == BOXES.result(kept)
+
+
 def test_an_alarm_for_later_than_the_horizon_is_none() -> None:
     """900 s off it was as good as the truth once."""
     crash = replace(CRASH, horizon=2.0)
