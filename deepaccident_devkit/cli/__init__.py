@@ -25,27 +25,27 @@ _OF_DASK = ("distributed", "tornado", "asyncio")
 """Loggers of its parts."""
 
 
-_VERBS = (
-    "demo",
-    "synth",
-    "index",
-    "info",
-    "labels",
-    "cache",
-    "split",
-    "stats",
-    "safety",
-    "validate",
-    "evaluate",
-    "results",
-    "baseline",
-    "train",
-    "predict",
-    "render",
-    "replay",
-    "explore",
-    "export",
-)
+_VERBS = {
+    "baseline": "Predict without a trained model: actors keep their motion.",
+    "cache": "Write resized images for training.",
+    "demo": "Make a small synthetic release, and a page on it.",
+    "evaluate": "Evaluate results files; check and compare evaluations.",
+    "explore": "Show a release in the browser.",
+    "export": "Write data in the formats of other tools.",
+    "index": "Make or update the index of a release.",
+    "info": "Print what a release holds.",
+    "labels": "Write motion labels.",
+    "predict": "Predict with a trained model.",
+    "render": "Render pictures and videos.",
+    "replay": "Write a scenario as one HTML file that plays in the browser.",
+    "results": "Make results files of those of other tools.",
+    "safety": "Look into accidents: who saw it first, when it was too late.",
+    "split": "Make the official splits, or a split file of scenarios.",
+    "stats": "Print the paper's statistics of a release.",
+    "synth": "Make a synthetic release.",
+    "train": "Train the model.",
+    "validate": "Print what is wrong, unusual or missing in a release.",
+}
 
 
 @click.group(

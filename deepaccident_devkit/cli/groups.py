@@ -1,6 +1,6 @@
 """Groups of verbs: one imports a verb only when it is needed, the other is a verb with further verbs below it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
@@ -9,13 +9,16 @@ import click
 
 
 class ModuleVerbs(click.Group):
-    """Verbs that lie in modules of the same names: only the module of the verb that is run is imported."""
+    """Verbs that lie in modules of the same names: only the module of the verb that is run is imported.
 
-    def __init__(self, *arguments: Any, package: str, verbs: Sequence[str], **options: Any) -> None:
-        """Take what `click.Group` takes, a package, and names of modules in it; each holds a verb of the same name."""
+    The list of verbs imports none of them.
+    """
+
+    def __init__(self, *arguments: Any, package: str, verbs: Mapping[str, str], **options: Any) -> None:
+        """Take what `click.Group` takes, and verbs with a line on each; `package.verb` is the module that holds it."""
         super().__init__(*arguments, **options)
         self._package = package
-        self._verbs = tuple(verbs)
+        self._verbs = verbs
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """The verbs in alphabetical order, as click lists commands."""
@@ -25,8 +28,14 @@ class ModuleVerbs(click.Group):
         """The verb of a name; None if there is none."""
         if cmd_name not in self._verbs:
             return None
-        verb: click.Command = getattr(import_module(f"{self._package}.{cmd_name}"), cmd_name)
+        name = cmd_name.replace("-", "_")
+        verb: click.Command = getattr(import_module(f"{self._package}.{name}"), name)
         return verb
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's signature
+        """Write the list of verbs."""
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(self._verbs.items()))
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
