@@ -30,7 +30,7 @@ same text in the terminal.
 | `deepaccident index DATAROOT` | Makes the index before you need it. |
 | `deepaccident synth OUT` | Makes a synthetic release, so that you can work without the data. |
 | `deepaccident render VIEW DATAROOT --out FILE` | Renders a picture of the first accident, or of a row that you name. |
-| `deepaccident replay DATAROOT --out replay.html` | Writes one accident as a web page that plays it. |
+| `deepaccident render replay DATAROOT --out replay.html` | Writes one accident as a web page that plays it. |
 | `deepaccident labels DATAROOT --split train --out FOLDER` | Writes the motion labels of a split into files. |
 | `deepaccident baseline predict DATAROOT --out FOLDER` | Writes predictions that need no trained model. |
 | `deepaccident evaluate motion DATAROOT --results R --out DIR` | Evaluates predictions. `motion` can be `accident`, \
@@ -67,7 +67,7 @@ def _release(**_: object) -> None: ...
 
 _ALIKE = 3
 """Options that at least so many commands of a group have in common are described once, at the group."""
-_UNLIKE = ("video",)
+_UNLIKE = ("video", "replay")
 _SHARED = {parameter.name for parameter in _release.params}
 
 

@@ -42,13 +42,17 @@ def accident(da: DeepAccident) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("verb", sorted(set(_PICTURES) - {"evaluation"}))
+@pytest.mark.parametrize(
+    "verb", [*sorted(set(_PICTURES) - {"evaluation"}), "sample-data --color-by depth", "visibility --style table"]
+)
 def test_every_view_draws_the_first_accident_when_no_token_is_given(
     da: DeepAccident, accident: str, tmp_path: Path, verb: str
 ) -> None:
     out = tmp_path / "picture.png"
     in_short_recordings = ["--latency", 0] if verb == "link" else []
-    text = run(verb, da.dataroot, "--out", out, "--size", "{}x{}".format(*SIZE), "--dpi", 40, *in_short_recordings)
+    text = run(
+        *verb.split(), da.dataroot, "--out", out, "--size", "{}x{}".format(*SIZE), "--dpi", 40, *in_short_recordings
+    )
     assert re.fullmatch(rf"rendered: {re.escape(accident)}\S* in {re.escape(str(out))}\n", text)
     with Image.open(out) as image:
         assert image.size == SIZE
@@ -183,6 +187,8 @@ def test_video_takes_the_first_accident(da: DeepAccident, tmp_path: Path) -> Non
         (["frame", "a/b/003", "a/b/004"], "2 pictures need a folder, found the file"),
         (["frame", "--color-by", "depth"], "No such option"),
         (["frame", "--dpi", "0"], "0.0 is not in the range x>=1"),
+        (["visibility", "--style", "table", "--view-range", "9"], "--view-range changes nothing with --style table"),
+        (["sample-data", "--color-by", "agent", "--layers", "ids"], "--layers changes nothing with --color-by"),
     ],
 )
 def test_usage_errors(da: DeepAccident, tmp_path: Path, arguments: list[str], sentence: str) -> None:

@@ -35,6 +35,7 @@ from deepaccident_devkit.render.moments import render_frame, render_sample
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, figure_of_pixels, save_picture
+from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.styles import StyleName, style, style_dpi
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, render_scenario_video
 from deepaccident_devkit.render.video.writers import check_target
@@ -44,6 +45,7 @@ from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 _RELEASE = ("dataroot", "version", "index_dir", "workers", "executor", "on_error")
+_VISIBILITY_STYLES = ("map", "table")
 _logger = logging.getLogger(__name__)
 _OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
 
@@ -61,6 +63,22 @@ def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
 
 def _evaluated(dataset: Dataset, token: str, *, results: Path, **choices: Any) -> Any:
     return render_evaluation(dataset, token, read_results(results).prediction(token), **choices)
+
+
+def _sensor_file(dataset: Dataset, token: str, *, color_by: ColorBy | None = None, **choices: Any) -> Any:
+    """What a sensor recorded, or with `color_by` the LiDAR points on its image."""
+    if color_by is None:
+        return render_sample_data(dataset, token, **choices)
+    refuse_unused("with --color-by, which shows the image and all points", "layers")
+    return render_pointcloud_in_image(dataset, token, color_by=color_by, **choices)
+
+
+def _visibility(dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES[0], **choices: Any) -> Any:
+    """Who sees whom, from above or as a table."""
+    if style == _VISIBILITY_STYLES[0]:
+        return render_visibility(dataset, token, **choices)
+    refuse_unused(f"with --style {style}", "frame", "view_range", "layers")
+    return render_visibility_matrix(dataset, token, **choices)
 
 
 def _words(given: Sequence[str]) -> list[str] | None:
@@ -142,10 +160,19 @@ _PICTURES = {
         options=(_AGENTS, _LAYERS),
     ),
     "sample-data": _Picture(
-        draw=render_sample_data,
+        draw=_sensor_file,
         of="sample_data",
         help="Render what one sensor recorded: a camera image, or the LiDAR or the BEV camera from above.",
         canvas="ax",
+        options=(
+            click.option(
+                "--color-by",
+                type=WordChoice(get_args(ColorBy)),
+                help="Show all LiDAR points on a camera image, with colours of this, also points that are hidden "
+                "behind objects.",
+            ),
+            _LAYERS,
+        ),
     ),
     "annotation": _Picture(
         draw=render_annotation,
@@ -157,17 +184,6 @@ _PICTURES = {
         of="instance",
         help="Render one actor over time: its path, its camera images, its speed, and which agents see it.",
         options=(_AGENTS, _LAYERS),
-    ),
-    "pointcloud": _Picture(
-        draw=render_pointcloud_in_image,
-        of="sample_data",
-        help="Render the LiDAR points on a camera image, also those that are hidden behind objects.",
-        canvas="ax",
-        options=(
-            click.option(
-                "--color-by", type=WordChoice(get_args(ColorBy)), help="Colour of the points.  [default: depth]"
-            ),
-        ),
     ),
     "frame": _Picture(
         draw=render_frame,
@@ -198,18 +214,12 @@ _PICTURES = {
         styles=get_args(MotionStyle),
     ),
     "visibility": _Picture(
-        draw=render_visibility,
+        draw=_visibility,
         of="frame",
-        help="Render who sees whom, from above: an actor has one dot for each agent that sees it.",
+        help="Render who sees whom: from above, an actor with one dot for each agent that sees it, or as a table.",
         canvas="ax",
+        styles=_VISIBILITY_STYLES,
         options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _LAYERS),
-    ),
-    "visibility-matrix": _Picture(
-        draw=render_visibility_matrix,
-        of="frame",
-        help="Render who sees whom as a table: one row per actor, one column per agent.",
-        canvas="ax",
-        options=(_AGENTS,),
     ),
     "accident": _Picture(
         draw=render_accident,
@@ -263,7 +273,7 @@ _PICTURES = {
 
 @click.group()
 def render() -> None:
-    """Render pictures of a release, one command per view; `video` makes a video of them."""
+    """Render pictures of a release, one command per view; `video` and `replay` show a whole scenario."""
 
 
 def _verb(name: str, picture: _Picture) -> click.Command:
@@ -384,3 +394,21 @@ def video(
         **options,
     )
     click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB")
+
+
+@render.command(short_help="Write a scenario as one HTML file that plays.")
+@release_parameters
+@click.argument("scenario", required=False)
+@click.option("--out", required=True, type=click.Path(), metavar="FILE", help="File to write, such as replay.html.")
+@click.option("--results", type=click.Path(), help="Results file of motion or accidents, shown with its verdicts.")
+@cooperating_parameter("Agents to show", "available")
+def replay(scenario: str | None, out: str, results: str | None, agents: tuple[str, ...], **release: Any) -> None:
+    """Write one scenario of the release in DATAROOT as one HTML file that plays in any browser, without a network.
+
+    Without SCENARIO the command takes the first accident, or if there is none, the first scenario. The file has at most
+    15 MB.
+    """
+    prediction = None if results is None else read_results(results)  # before the release is indexed
+    dataset, chosen = DeepAccident(**release), names_or_configuration(agents)
+    path = render_replay(dataset, scenario, out, prediction=prediction, agents=chosen, progress=True)
+    click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")

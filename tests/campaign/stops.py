@@ -85,7 +85,7 @@ VERBS = (
     ),
     Verb("safety report", f"safety report {_RELEASE} --replays none --out {{out}}/safety"),
     Verb("explore --export", f"explore {_RELEASE} --export {{out}}/pages"),
-    Verb("replay", f"replay {_SENSORS} --out {{out}}/replay.html"),
+    Verb("replay", f"render replay {_SENSORS} --out {{out}}/replay.html"),
 )
 
 

@@ -280,17 +280,17 @@ def test_the_index_costs_at_most_one_percent(real: DeepAccident) -> None:
         ("sample-data", f"{sample_token('ego_vehicle', 51)}/lidar01"),
         ("annotation", f"{sample_token(INFRASTRUCTURE, 51)}/3"),
         ("instance", f"{TOKEN}/actor/7247"),
-        ("pointcloud", f"{sample_token(INFRASTRUCTURE, 51)}/Camera_Back"),
+        ("sample-data --color-by depth", f"{sample_token(INFRASTRUCTURE, 51)}/Camera_Back"),
         ("bev", sample_token("other_vehicle", 51)),
         ("labels", sample_token("ego_vehicle", 51)),
         ("visibility", sample_token(INFRASTRUCTURE, 51)),
-        ("visibility-matrix", f"{TOKEN}/051"),
+        ("visibility --style table", f"{TOKEN}/051"),
     ],
 )
 def test_it_can_be_drawn(real: DeepAccident, tmp_path: Path, view: str, token: str) -> None:
     out = tmp_path / "picture.png"
     index = real.tables_folder.parents[1]
-    arguments = ["render", view, str(real.dataroot), token, "--index-dir", str(index), "--out", str(out)]
+    arguments = ["render", *view.split(), str(real.dataroot), token, "--index-dir", str(index), "--out", str(out)]
     result = CliRunner().invoke(deepaccident, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     picture = cv2.imread(str(out))
