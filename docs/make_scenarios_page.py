@@ -86,7 +86,7 @@ Files are read with PyYAML's safe loader, without tags and aliases. Numbers are 
 `--check` prints who hits whom, when, how fast and with which sides, for the first pair that `synth` would make. Its
 exit status is 1 if the file gives no scenario. To see it:
 
-    deepaccident synth OUT --spec mine.yaml --scenarios 2 --no-sensors
+    deepaccident synth OUT --spec mine.yaml --scenarios 2 --sensors none
     deepaccident render accident OUT --layers boxes --out countdown.png
 
 The picture shows the boxes at four moments, in the agents' cameras and from above. Both commands together take about 20

@@ -25,7 +25,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 def test_synth_index_info_end_to_end(tmp_path: Path) -> None:
     out = tmp_path / "my release"
-    made = run("synth", out, "--scenarios", 2, "--frames", 3, "--image-size", "64x36", "--layout", "B", "--seed", 7)
+    made = run("synth", out, "--scenarios", 2, "--frames", 3, "--size", "64x36", "--layout", "B", "--seed", 7)
     assert made.returncode == 0, made.stderr
     assert f"deepaccident info {out}" in made.stdout or "deepaccident info" in made.stdout
     indexed = run("index", out)
@@ -142,22 +142,23 @@ def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     saved = run(
-        "split", own_release, "--where", "collision=true", "--where", "split=train", "--save", tmp_path / "a.txt"
+        "split", own_release, "--where", "collision=true", "--where", "split=train", "--out", tmp_path / "a.txt"
     )
     assert saved.returncode == 0, saved.stderr
     found = DeepAccident(dataroot=own_release).find(collision=True, split="train")
     assert read_split_file(tmp_path / "a.txt") == [scenario["token"] for scenario in found]
     assert f"scenarios {len(found)}" in " ".join(saved.stdout.split())
-    assert run("split", own_release, "--save", tmp_path / "b.txt").returncode == 0
+    assert run("split", own_release, "--out", tmp_path / "b.txt").returncode == 0
     everything = [scenario["token"] for scenario in DeepAccident(dataroot=own_release).scenario]
     assert read_split_file(tmp_path / "b.txt") == everything
-    assert run("split", own_release, "--save", tmp_path / "d.txt", "--out", tmp_path / "d").returncode == 2
-    assert run("split", own_release, "--save", tmp_path / "d.txt", "--seed", 1).returncode == 2
+    assert run("split", own_release, "--out", tmp_path / "d.txt", "--seed", 1).returncode == 2
     assert run("split", own_release, "--where", "split=train", "--out", tmp_path / "b").returncode == 2
     for options in (("--seed", 3), ("--seed", 17), ("--released-skip",)):
-        refused = run("split", own_release, "--where", "split=train", "--save", tmp_path / "c.txt", *options)
+        refused = run("split", own_release, "--where", "split=train", "--out", tmp_path / "c.txt", *options)
         assert (refused.returncode, (tmp_path / "c.txt").exists()) == (2, False)
-        assert f"{options[0]} changes nothing with --where or --save: it is for the official split" in refused.stderr
+        assert (
+            f"{options[0]} changes nothing with --where or a split file: it is for the official split" in refused.stderr
+        )
     wrong = run("split", own_release, "--where", "wether=Clear")
     assert (wrong.returncode, wrong.stderr.startswith("error: scenarios cannot be found by 'wether'")) == (2, True)
 

@@ -28,7 +28,7 @@ def deepaccident(*arguments: object, status: int = 0) -> str:
 @pytest.fixture(scope="module")
 def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("chain") / "release"
-    deepaccident("synth", root, "--scenarios", 2, "--frames", 25, "--no-sensors", "--seed", 12)
+    deepaccident("synth", root, "--scenarios", 2, "--frames", 25, "--sensors", "none", "--seed", 12)
     return root
 
 

@@ -68,7 +68,7 @@ def test_the_printed_address_opens_the_pages_until_ctrl_c(da: DeepAccident) -> N
 
 def test_pages_are_written_as_files(da: DeepAccident, tmp_path: Path) -> None:
     out = tmp_path / "pages"
-    words = ["explore", str(da.dataroot), "--export", str(out), "--where", "collision=true"]
+    words = ["explore", str(da.dataroot), "--out", str(out), "--where", "collision=true"]
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     assert result.exit_code == 0
     assert (out / "index.html").is_file()

@@ -94,7 +94,7 @@ WORDS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
     "stats": lambda root, out, _: ("stats", root, "--index-dir", out, "--out", out / "statistics"),
     "validate": lambda root, *_: ("validate", root, "--deep"),
     "labels": lambda root, out, _: ("labels", root, "--split", "train", "--samples", "all", "--out", out),
-    "synth": lambda _, out, __: ("synth", out / "made", "--scenarios", 2, "--frames", 8, "--image-size", "64x36"),
+    "synth": lambda _, out, __: ("synth", out / "made", "--scenarios", 2, "--frames", 8, "--size", "64x36"),
     "demo": lambda _, out, __: ("demo", out / "demo"),
     "baseline": lambda root, out, _: ("baseline", "predict", root, *IN_TRAIN, "--out", out),
     "evaluate": lambda root, out, results: (
@@ -113,7 +113,7 @@ def words(request: pytest.FixtureRequest, da_motion: DeepAccident, results: Path
 
 @pytest.mark.parametrize(("number", "status"), SIGNALS.items())
 def test_a_signal_ends_a_verb_with_one_line(number: signal.Signals, status: int, tmp_path: Path) -> None:
-    with started("synth", tmp_path / "out", "--no-sensors") as process:
+    with started("synth", tmp_path / "out", "--sensors", "none") as process:
         assert (stopped(process, number), process.returncode) == ([LINE], status)
     assert not leftovers(tmp_path)
 

@@ -84,7 +84,7 @@ WRITING: dict[str, Callable[[Any, Path, Path], tuple[object, ...]]] = {
         out,
     ),
     "stats": lambda root, _, out: ("stats", root, "--out", out, "--format", "png", "--workers", 1),
-    "split": lambda root, _, out: ("split", root, "--save", out / "mine.txt"),
+    "split": lambda root, _, out: ("split", root, "--out", out / "mine.txt"),
     "twins": lambda root, _, out: ("safety", "twins", root, "--out", out, "--workers", 1),
     "lead-time": lambda root, _, out: ("safety", "lead-time", root, "--out", out, "--workers", 1),
     "avoidability": lambda root, _, out: ("safety", "avoidability", root, "--out", out, "--workers", 1),

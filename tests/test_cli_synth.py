@@ -30,7 +30,7 @@ def made(monkeypatch) -> list[SynthConfig]:
 def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
     out = tmp_path / "a b"
     result = CliRunner().invoke(
-        synth, [str(out), "--scenarios", "1", "--frames", "1", "--layout", "B", "--seed", "3", "--no-sensors"]
+        synth, [str(out), "--scenarios", "1", "--frames", "1", "--layout", "B", "--seed", "3", "--sensors", "none"]
     )
     assert result.exit_code == 0, result.output
     assert f"deepaccident info {out}" in result.output
@@ -40,7 +40,7 @@ def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
 
 
 def test_verb_records_shards_and_merges_them(tmp_path):
-    words = [str(tmp_path / "out"), "--scenarios", "1", "--frames", "1", "--no-sensors"]
+    words = [str(tmp_path / "out"), "--scenarios", "1", "--frames", "1", "--sensors", "none"]
     for part, said in {
         "--shard 1/2": "part 1/2: 1 of 1 scenarios; next: the same with --merge\n",
         "--shard 2/2": "part 2/2: 0 of 1 scenarios; next: the same with --merge\n",
@@ -54,15 +54,13 @@ def test_verb_records_shards_and_merges_them(tmp_path):
 
 @pytest.mark.parametrize("size", ["480", "480x", "axb", "480x270x3"])
 def test_bad_image_size_is_a_usage_error(tmp_path, size):
-    result = CliRunner().invoke(synth, [str(tmp_path / "out"), "--image-size", size])
+    result = CliRunner().invoke(synth, [str(tmp_path / "out"), "--size", size])
     assert result.exit_code == 2
     assert "expected width x height such as 480x270" in result.output
 
 
 def test_every_option_reaches_the_configuration(tmp_path, made):
-    words = (
-        "--scenarios 6 --frames 12 --image-size 64x36 --layout B --seed 7 --no-sensors --unlabelled-test --view open"
-    )
+    words = "--scenarios 6 --frames 12 --size 64x36 --layout B --seed 7 --sensors none --unlabelled-test --view open"
     result = CliRunner().invoke(
         synth, [str(tmp_path), *words.split(), "--unplanned", "0.5", "--design", "3", "--design", "9"]
     )
@@ -83,18 +81,15 @@ def test_every_option_reaches_the_configuration(tmp_path, made):
     ]
 
 
-def test_sensors_are_chosen_by_a_word_and_left_out_by_an_option(tmp_path, made):
-    for words in ("--sensors all", "--sensors Cameras", "--sensors none", "--no-sensors"):
-        assert CliRunner().invoke(synth, [str(tmp_path), *words.split()]).exit_code == 0
-    assert [config.sensors for config in made] == ["all", "cameras", "none", "none"]
-    result = CliRunner().invoke(synth, [str(tmp_path), "--sensors", "cameras", "--no-sensors"])
-    assert (result.exit_code, len(made)) == (2, 4)
-    assert "--sensors changes nothing with --no-sensors; leave it out" in result.output
+def test_sensors_are_chosen_by_a_word(tmp_path, made):
+    for word in ("all", "Cameras", "none"):
+        assert CliRunner().invoke(synth, [str(tmp_path), "--sensors", word]).exit_code == 0
+    assert [config.sensors for config in made] == ["all", "cameras", "none"]
 
 
 def test_a_release_for_the_released_code_is_asked_for_by_one_word(tmp_path, made):
     CliRunner().invoke(synth, [str(tmp_path), "--for-released-code"])
-    CliRunner().invoke(synth, [str(tmp_path), "--for-released-code", "--image-size", "1600x900", "--layout", "A"])
+    CliRunner().invoke(synth, [str(tmp_path), "--for-released-code", "--size", "1600x900", "--layout", "A"])
     assert made == [
         SynthConfig(frames=None, for_released_code=True),
         SynthConfig(frames=None, for_released_code=True, image_size=(1600, 900)),
@@ -102,7 +97,7 @@ def test_a_release_for_the_released_code_is_asked_for_by_one_word(tmp_path, made
 
 
 @pytest.mark.parametrize(
-    "words", [("--image-size", "480x270"), ("--image-size", "1600x901"), ("--layout", "B"), ("--unlabelled-test",)]
+    "words", [("--size", "480x270"), ("--size", "1600x901"), ("--layout", "B"), ("--unlabelled-test",)]
 )
 def test_what_contradicts_the_released_code_is_refused(tmp_path, made, words):
     result = CliRunner().invoke(synth, [str(tmp_path), "--for-released-code", *words])
@@ -117,10 +112,9 @@ def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
     assert f"{tmp_path}: 4 scenarios with five agents, layout A" in result.output
 
 
-@pytest.mark.parametrize("words", ["--no-sensors", "--sensors none"])
-def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch, words):
+def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
     monkeypatch.setattr(sys.modules[synth.callback.__module__], "has_embree", lambda: False)
-    result = CliRunner().invoke(synth, [str(tmp_path), *words.split()])
+    result = CliRunner().invoke(synth, [str(tmp_path), "--sensors", "none"])
     assert "slow without the package embreex; in a checkout: pip install '.[synth]'" in result.stderr
     assert made == [SynthConfig(frames=None, sensors=False)]
 
@@ -211,7 +205,7 @@ def test_how_to_see_an_accident_is_the_last_line(mine, made):
 
     picture = "deepaccident render accident out{} --out countdown.png"
     assert last() == "or:   " + picture.format("")
-    assert last("--spec", "mine.yaml", "--no-sensors") == "or:   " + picture.format(" --layers boxes")
+    assert last("--spec", "mine.yaml", "--sensors", "none") == "or:   " + picture.format(" --layers boxes")
     assert last("--sensors", "cameras") == "or:   " + picture.format("")
     mine.write_text(MINE.replace("meet: {offset: 0}", ""), encoding="utf-8")
     assert last("--spec", "mine.yaml") == "next: deepaccident info out"
@@ -227,5 +221,5 @@ def test_a_design_is_shown_as_a_file_to_begin_with():
 def test_help_names_every_option():
     text = CliRunner().invoke(synth, ["--help"]).output
     named = {option for parameter in synth.params for option in parameter.opts if option.startswith("--")}
-    assert len(named) == 22
+    assert len(named) == 21
     assert all(option in text for option in named)

@@ -28,7 +28,12 @@ def _part(context: click.Context, parameter: click.Parameter, value: str | None)
 @click.command(short_help="Write resized images for training.")
 @bulk_parameters
 @click.option(
-    "--resize", required=True, callback=pixel_size, metavar="WxH", help="Size of a whole image, such as 704x396."
+    "--size",
+    "resize",
+    required=True,
+    callback=pixel_size,
+    metavar="WxH",
+    help="Size of a whole image, such as 704x396.",
 )
 @click.option(
     "--crop", callback=_part, metavar="LEFT,TOP,WIDTH,HEIGHT", help="Part of the resized image to keep.  [default: all]"

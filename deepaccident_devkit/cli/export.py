@@ -1,7 +1,7 @@
 """`deepaccident export`: the data in other tools' formats."""
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 
@@ -21,7 +21,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 from deepaccident_devkit.motion import PRESETS
-from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OnError
+from deepaccident_devkit.taxonomy import AGENTS, LIDAR
 from deepaccident_devkit.text import spelled
 from deepaccident_devkit.v2x.collisions import default_scenario
 
@@ -78,13 +78,6 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
     metavar="FILE",
     help="Also write the predictions of this results file.",
 )
-@click.option(
-    "--on-missing",
-    type=WordChoice(get_args(OnError)),
-    default="skip",
-    show_default=True,
-    help="skip: leave out missing sensor files. raise: stop at the first one.",
-)
 def mcap(
     scenario: str | None,
     out: Path,
@@ -100,7 +93,7 @@ def mcap(
     command takes the first scenario with a collision, or if there is none, the first scenario.
     """
     names = agent_names(agents)
-    choices = {name: options.pop(name) for name in ("frames", "points", "labels", "motion_labels", "on_missing")}
+    choices = {name: options.pop(name) for name in ("frames", "points", "labels", "motion_labels")}
     choices["frames"] = choices["frames"] or old_frames
     choices["agents"] = None if names == AGENTS else names
     choices["channels"] = [name for text in channels for name in text.split(",")] if channels else None

@@ -17,14 +17,10 @@ from deepaccident_devkit.splits import OFFICIAL_SEED, official_split, save_selec
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    help="Folder to write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into.",
+    help="Folder to write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into; or a file that ends in "
+    ".txt: a split file of the scenarios that match --where, or of all.",
 )
 @where_parameter
-@click.option(
-    "--save",
-    type=click.Path(path_type=Path),
-    help="Split file to write: of the scenarios that match --where, or of all.",
-)
 @click.option("--overwrite", is_flag=True, help="Replace files that already exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def split(
@@ -32,24 +28,21 @@ def split(
     released_skip: bool,
     out: Path | None,
     where: tuple[str, ...],
-    save: Path | None,
     overwrite: bool,
     as_json: bool,
     **release: Any,
 ) -> None:
     """Split the release in DATAROOT by the official procedure, and print how the scenarios are distributed.
 
-    With --where, report only the scenarios that match all filters. --save writes them into a split file; without
-    --where it writes all scenarios.
+    With --where, report only the scenarios that match all filters.
     """
-    if where and out:
-        raise click.UsageError("--out is for the official split; with --where give --save FILE")
-    if save and out:
-        raise click.UsageError("--out is for the official split, --save for a selection; give one of them")
+    save = out if out is not None and out.suffix == ".txt" else None
+    if where and out and not save:
+        raise click.UsageError(f"--where chooses scenarios for a split file; give --out FILE.txt, found {out}")
     if where or save:
-        refuse_unused("with --where or --save: it is for the official split", "seed", "released_skip")
-    if not (save or out):
-        refuse_unused("without --out or --save", "overwrite")
+        refuse_unused("with --where or a split file: it is for the official split", "seed", "released_skip")
+    if not out:
+        refuse_unused("without --out", "overwrite")
     dataset = DeepAccident(**release)
     if where or save:
         chosen = [scenario["token"] for scenario in dataset.find(*where)]

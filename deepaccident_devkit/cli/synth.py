@@ -25,7 +25,7 @@ from deepaccident_devkit.taxonomy import Layout
 
 _DEFAULTS = SynthConfig()
 _OF_FILES = (
-    *("scenarios", "image_size", "layout", "sensors", "no_sensors", "unlabelled_test", "exact", "for_released_code"),
+    *("scenarios", "image_size", "layout", "sensors", "unlabelled_test", "exact", "for_released_code"),
     *("unplanned", "workers", "scheduler", "scheduler_file", "shard", "merge"),
 )
 """Options of what is written."""
@@ -33,7 +33,7 @@ _FAULTY = 1
 """Exit status if a checked file gives no scenario."""
 _EXAMPLES = """\b
 Examples:
-  deepaccident synth OUT --scenarios 24 --no-sensors     only labels, all twelve designs
+  deepaccident synth OUT --scenarios 24 --sensors none     only labels, all twelve designs
   deepaccident synth --show-design 3 > mine.yaml         print a scenario file to edit
   deepaccident synth --spec mine.yaml --check            say what happens in your file, and write nothing
   deepaccident synth OUT --spec mine.yaml                make accidents from your file
@@ -64,7 +64,8 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     "--frames", type=int, help="Record only the last N frames of each scenario (10 Hz).  [default: all, 40 to 100]"
 )
 @click.option(
-    "--image-size",
+    "--size",
+    "image_size",
     callback=pixel_size,
     metavar="WxH",
     help="Size of the camera images in pixels. The real ones have 1600x900, and the released DeepAccident code assumes "
@@ -87,7 +88,6 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     help="What to write besides labels, calib and meta. all: images, point clouds, BEV arrays. cameras: images alone. "
     "none: nothing.",
 )
-@click.option("--no-sensors", is_flag=True, help="The same as --sensors none.")
 @click.option("--unlabelled-test", is_flag=True, help="Write no labels for the test split, as in the real release.")
 @click.option(
     "--exact", is_flag=True, help="Leave out the small errors of calib and point counts that the real release has."
@@ -146,7 +146,7 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     help="Print the scenario file of a design, as a start for your own, and stop.",
 )
 @click.pass_context
-def synth(context: click.Context, /, out: Path | None, *, no_sensors: bool, check: bool, **options: Any) -> None:
+def synth(context: click.Context, /, out: Path | None, *, check: bool, **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
     If a run is interrupted, the same command continues it.
@@ -159,9 +159,6 @@ def synth(context: click.Context, /, out: Path | None, *, no_sensors: bool, chec
         raise click.UsageError("Missing argument 'OUT': the folder to make.", context)
     if options["spec"] is not None or options["view"] == "hidden":
         refuse_unused("with --spec or --view hidden, which ask for one certain accident", "unplanned")
-    if no_sensors:
-        refuse_unused("with --no-sensors", "sensors")
-        options["sensors"] = "none"
     config = SynthConfig(**options)
     if config.sensors == "none" and not has_embree():
         click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)

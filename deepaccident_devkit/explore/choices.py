@@ -116,7 +116,7 @@ class Choices:
 
     def command(self, dataroot: str) -> str:
         """The command that writes the same scenarios into a split file."""
-        return shlex.join(["deepaccident", "split", dataroot, *where_words(self.filters), "--save", "selection.txt"])
+        return shlex.join(["deepaccident", "split", dataroot, *where_words(self.filters), "--out", "selection.txt"])
 
 
 def find_call(filters: Iterable[str]) -> str:

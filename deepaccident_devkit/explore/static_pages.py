@@ -198,7 +198,7 @@ class _Pages:
             slow=SLOW,
             release=self._dataset.version,
             python=find_call(filters),
-            command=shlex.join(["deepaccident", "explore", "DATAROOT", *where_words(filters), "--export", "DIR"]),
+            command=shlex.join(["deepaccident", "explore", "DATAROOT", *where_words(filters), "--out", "DIR"]),
         )
 
     def _write_scenario(self, place: int, told: Told) -> None:

@@ -231,7 +231,7 @@ class OpenTables:
 
     def _own_split_text(self) -> str:
         place = shlex.quote(str(self.dataroot))
-        return f"or make a split file of your own: deepaccident split {place} --save mine.txt, then --split mine.txt"
+        return f"or make a split file of your own: deepaccident split {place} --out mine.txt, then --split mine.txt"
 
     def _listed_scenarios(self, path: Path, missing: OnError) -> set[str]:
         listed = read_split_file(path, unique=True)

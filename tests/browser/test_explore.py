@@ -147,7 +147,7 @@ def test_a_query_tells_its_errors_in_place(pages: Browser, served: Served, datas
     text = "return [...document.querySelectorAll('.copy')].map((each) => each.dataset.text)"
     python, command = pages.script(text)
     assert python == "da.find('collision=true')"
-    assert "--where collision=true --save selection.txt" in command
+    assert "--where collision=true --out selection.txt" in command
     pages.driver.execute_cdp_cmd("Browser.grantPermissions", {"permissions": ["clipboardReadWrite"]})
     pages.script("document.querySelector('.copy').click()")
     said = pages.wait("document.getElementById('copied').textContent")

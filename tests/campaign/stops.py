@@ -41,9 +41,9 @@ _EVALUATE = f"{_RELEASE} --split train --samples all"
 VERBS = (
     Verb("index", "index {home}/release --index-dir {out} --workers 1"),
     Verb("labels", f"labels {_RELEASE} --split train --out {{out}}/labels", progress="labels/manifest.json"),
-    Verb("synth", "synth {out}/made --scenarios 2 --frames 3 --no-sensors --seed 1 --workers 1"),
+    Verb("synth", "synth {out}/made --scenarios 2 --frames 3 --sensors none --seed 1 --workers 1"),
     Verb("split", f"split {_RELEASE} --out {{out}} --overwrite"),
-    Verb("split --save", f"split {_RELEASE} --save {{out}}/mine.txt --overwrite"),
+    Verb("split", f"split {_RELEASE} --out {{out}}/mine.txt --overwrite"),
     Verb("stats", f"stats {_RELEASE} --out {{out}}/statistics --format png"),
     Verb(
         "evaluate",
@@ -74,7 +74,7 @@ VERBS = (
     ),
     Verb(
         "cache",
-        "cache {home}/sensors --index-dir {home}/index_of_sensors --workers 1 --out {out}/cache --resize 30x18 "
+        "cache {home}/sensors --index-dir {home}/index_of_sensors --workers 1 --out {out}/cache --size 30x18 "
         "--cameras Camera_Front --agents ego_vehicle --where length>=1",
         progress="cache/cache.manifest.json",
     ),
@@ -84,7 +84,7 @@ VERBS = (
         "--out {out}/answered.json",
     ),
     Verb("safety report", f"safety report {_RELEASE} --replays none --out {{out}}/safety"),
-    Verb("explore --export", f"explore {_RELEASE} --export {{out}}/pages"),
+    Verb("explore", f"explore {_RELEASE} --out {{out}}/pages"),
     Verb("replay", f"render replay {_SENSORS} --out {{out}}/replay.html"),
 )
 

@@ -16,7 +16,7 @@ COMMANDS = {
     "--out {out}/bundle",
     "predict": "baseline predict {release} --split train --task accident --out {out}/predictions",
     "stats": "stats {release} --format png --out {out}/stats",
-    "synth": "synth {out}/made --scenarios 3 --frames 3 --image-size 64x36 --seed 5",
+    "synth": "synth {out}/made --scenarios 3 --frames 3 --size 64x36 --seed 5",
 }
 """Name → command line."""
 OF_PARTS = {"validate": " --parts {out}/validate"}

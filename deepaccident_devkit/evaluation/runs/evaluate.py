@@ -267,7 +267,7 @@ def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:
             f"{len(silent)} of {len(scenarios)} scenarios have no meta file, which names the colliding pair, so that "
             f"accidents cannot be evaluated there: {', '.join(silent[:3])}{', …' if len(silent) > 3 else ''}; unpack "
             f"their meta folders, or leave them out with a split file of your own: deepaccident split "
-            f"{shlex.quote(str(dataset.dataroot))}{of_split} --where 'weather!=unknown' --save mine.txt, then "
+            f"{shlex.quote(str(dataset.dataroot))}{of_split} --where 'weather!=unknown' --out mine.txt, then "
             "--split mine.txt"
         )
 

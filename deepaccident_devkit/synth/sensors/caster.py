@@ -62,7 +62,7 @@ def require_embree() -> None:
     if not has_embree():
         raise MissingExtraError(
             "images and point clouds need the package embreex (in a checkout, pip install '.[synth]'), "
-            'or make a release without them (--no-sensors; SynthConfig(sensors="none"))'
+            'or make a release without them (--sensors none; SynthConfig(sensors="none"))'
         )
 
 

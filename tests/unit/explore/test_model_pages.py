@@ -603,7 +603,7 @@ def test_many_scenarios_are_read_only_for_who_asks(site: Site, monkeypatch: pyte
 def test_without_models_the_page_says_how_to_give_some(da_motion: DeepAccident) -> None:
     explorer = Explorer(da_motion, workers=1)
     page = Site(explorer, {}, Path()).page("/models/")
-    assert "--bundle FOLDER --results FILE" in page
+    assert "--results PATH" in page
     assert "deepaccident evaluate" in page
 
 

@@ -10,6 +10,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from http.client import HTTPConnection
 from importlib import import_module
 from ipaddress import ip_address
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -21,6 +22,7 @@ from click.testing import CliRunner
 import deepaccident_devkit.explore as package
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
+from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
 from deepaccident_devkit.explore import serving as module
 from deepaccident_devkit.explore.access import Access, Receive, Scope, Send
 from deepaccident_devkit.explore.addresses import RootPath
@@ -370,11 +372,11 @@ def test_a_missing_extra_is_an_error_with_the_remedy(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--export", "out", "--port", "9000"], "--port changes nothing with --export"),
-        (["--export", "out", "--no-open"], "--no-open changes nothing with --export"),
-        (["--export", "out", "--root-path", "/x"], "--root-path changes nothing with --export"),
-        (["--export", "out", "--host", "::1"], "--host changes nothing with --export"),
-        (["--where", "town=Town03"], "--where changes nothing without --export"),
+        (["--out", "out", "--port", "9000"], "--port changes nothing with --out"),
+        (["--out", "out", "--no-open"], "--no-open changes nothing with --out"),
+        (["--out", "out", "--root-path", "/x"], "--root-path changes nothing with --out"),
+        (["--out", "out", "--host", "::1"], "--host changes nothing with --out"),
+        (["--where", "town=Town03"], "--where changes nothing without --out"),
         (["--port", "0"], "0 is not in the range"),
     ],
 )
@@ -384,14 +386,14 @@ def test_the_verb_refuses_options_that_change_nothing(words: list[str], sentence
     assert sentence in result.output
 
 
-def test_the_verb_makes_one_call(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_verb_makes_one_call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
 
     def called(*arguments: Any, **options: Any) -> None:
         calls.append((arguments, options))
 
     def verb(*words: str) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        command = ["explore", "release", "--bundle", "a", "--bundle", "b", "--results", "c.json", *words]
+        command = ["explore", "release", *chain.from_iterable(("--results", str(path)) for path in given), *words]
         CliRunner().invoke(deepaccident, command, catch_exceptions=False)
         return calls.pop()
 
@@ -399,7 +401,11 @@ def test_the_verb_makes_one_call(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("explore", "export_pages"):
         monkeypatch.setitem(vars(package), name, called)
     monkeypatch.setitem(vars(package), "Explorer", lambda *given, **options: (*given, options))
-    shared = {"bundles": (Path("a"), Path("b")), "results": (Path("c.json"),)}
+    given = [tmp_path / "a", tmp_path / "b", tmp_path / "c.json"]
+    shared = {"bundles": given[:2], "results": given[2:]}
+    for folder in given[:2]:
+        folder.mkdir()
+        (folder / SUMMARY_FILE).touch()
     ((dataset, opened),), options = verb("--no-open", "--port", "9000", "--workers", "1")
     say: Callable[[str], object] = options.pop("say")
     say("")
@@ -409,6 +415,6 @@ def test_the_verb_makes_one_call(monkeypatch: pytest.MonkeyPatch) -> None:
     assert opened == {**shared, "workers": 1}
     assert options == {"host": "127.0.0.1", "port": 9000, "root_path": "", "open_browser": False}
     assert verb("--root-path", "/x")[1].items() >= {"port": None, "root_path": "/x", "open_browser": True}.items()
-    (_, target), options = verb("--export", "out", "--where", "town=Town03", "--where", "length=1..9")
+    (_, target), options = verb("--out", "out", "--where", "town=Town03", "--where", "length=1..9")
     wanted = {**shared, "where": ("town=Town03", "length=1..9"), "workers": None, "progress": True}
     assert (target, options) == (Path("out"), wanted)

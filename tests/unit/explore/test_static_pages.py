@@ -116,7 +116,7 @@ def test_the_list_has_the_scenarios_and_their_values(made: Made, da_motion: Deep
     told = shown(made.index)
     assert "2 scenarios of DeepAccident v1" in told.text
     assert "da.find()" in told.text
-    assert "deepaccident explore DATAROOT --export DIR" in told.text
+    assert "deepaccident explore DATAROOT --out DIR" in told.text
     explorer = Explorer(da_motion)
     explorer.scenarios.begin()
     assert explorer.jobs.wait(60)
@@ -243,7 +243,7 @@ def test_scenarios_are_chosen_by_filters_and_by_name(da_b: DeepAccident, tmp_pat
     index = export_pages(da_b, tmp_path / "a", where=["collision=true", "length>=1"], workers=1)
     assert listed(index) == wanted
     assert "da.find('collision=true', 'length>=1')" in shown(index).text
-    assert "--where collision=true --where 'length>=1' --export DIR" in shown(index).text
+    assert "--where collision=true --where 'length>=1' --out DIR" in shown(index).text
     chosen = [da_b.scenario[4], tokens[1], tokens[4]]
     index = export_pages(da_b, tmp_path / "b", scenarios=chosen, workers=1)
     assert listed(index) == [tokens[4], tokens[1]]

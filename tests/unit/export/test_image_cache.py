@@ -234,7 +234,7 @@ def command(*words: str | Path) -> Any:
 
 
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
-    words = [da.dataroot, "--out", tmp_path / "out", "--workers", "1", "--resize", "30x18", "--crop", "3,2,25,12"]
+    words = [da.dataroot, "--out", tmp_path / "out", "--workers", "1", "--size", "30x18", "--crop", "3,2,25,12"]
     words += ["--agents", "ego_vehicle", "--cameras", "Camera_Back,Camera_Front", "--decode", "scaled"]
     refused = command(*words)
     assert isinstance(refused.exception, ConfigError)
@@ -261,6 +261,6 @@ def test_a_disk_that_is_too_small_is_refused(da: DeepAccident, tmp_path: Path, m
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("words", [["--resize", "30"], ["--resize", "30x18", "--crop", "3,2,25"]])
+@pytest.mark.parametrize("words", [["--size", "30"], ["--size", "30x18", "--crop", "3,2,25"]])
 def test_sizes_that_cannot_be_read(da: DeepAccident, tmp_path: Path, words: list[str]) -> None:
     assert "expected " in command(da.dataroot, "--out", tmp_path / "out", *words).output

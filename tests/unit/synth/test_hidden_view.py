@@ -89,7 +89,7 @@ def test_another_view_is_refused():
 
 def test_the_verb_makes_it(tmp_path, digests):
     config = SynthConfig(scenarios=1, frames=1, sensors=False, view="hidden")
-    options = "--scenarios 1 --frames 1 --no-sensors --view hidden"
+    options = "--scenarios 1 --frames 1 --sensors none --view hidden"
     made = CliRunner().invoke(deepaccident, f"synth '{tmp_path / 'verb'}' {options}", catch_exceptions=False)
     assert made.exit_code == 0, made.output
     hidden, wide = (

@@ -168,7 +168,7 @@ def test_splits_come_from_files_else_folders_else_are_unknown(own_release: Path)
         shutil.copytree(own_release / split, flat, dirs_exist_ok=True)
     unknown = opened(flat)
     assert {scenario["split"] for scenario in unknown.scenario} == {None}
-    own = f"or make a split file of your own: deepaccident split {flat} --save mine.txt, then --split mine.txt"
+    own = f"or make a split file of your own: deepaccident split {flat} --out mine.txt, then --split mine.txt"
     with pytest.raises(NotAvailableError, match=f"the split of its scenarios is unknown: .*, {re.escape(own)}$"):
         unknown.split_scenarios("train")
     assert re.search(r"^unknown +6$", overview(unknown).to_text(), re.MULTILINE)

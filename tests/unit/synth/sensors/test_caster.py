@@ -81,7 +81,7 @@ def test_no_solids_and_no_rays_are_met_by_nothing(corners):
 
 def test_without_embree_the_error_names_the_remedy(monkeypatch):
     monkeypatch.setattr(caster, "has_embree", lambda: False)
-    with pytest.raises(MissingExtraError, match=r"pip install '\.\[synth\]'.*--no-sensors"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[synth\]'.*--sensors none"):
         caster.require_embree()
 
 
