@@ -102,7 +102,7 @@ def bundle(da_motion: DeepAccident, folder: Path, accidents: Path) -> Path:
     out = folder / "bundle"
     evaluate(
         *("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes", "--out", out),
-        *("--sanity", "--explain", "--include-results"),
+        *("--sanity", "--include-results"),
     )
     return out
 
@@ -145,7 +145,6 @@ def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: De
     }
     summary = read_bundle(bundle).summary
     assert summary["sanity"]["samples"] == 8
-    assert summary["explanation"]["protocol"].startswith("boxes")
     assert summary["release"]["dataroot"] == str(da_motion.dataroot)
     assert (bundle / "results" / accidents.name).read_bytes() == accidents.read_bytes()
     assert not bundle.with_name("bundle.unfinished").exists()
@@ -153,7 +152,7 @@ def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: De
 
 def test_parts_write_what_one_run_does(da_motion: DeepAccident, accidents: Path, bundle: Path, tmp_path: Path) -> None:
     words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
-    words = (*words, "--sanity", "--explain", "--include-results", "--out", tmp_path / "parts")
+    words = (*words, "--sanity", "--include-results", "--out", tmp_path / "parts")
     assert evaluate(*words, "--shard", "1/2").stdout == "part 1/2: 8 samples; next: the same with --merge\n"
     done = evaluate(*words, "--shard", "2/2", "--json")
     assert (done.stdout, done.stderr.splitlines()[-1]) == ("", "part 2/2: 0 samples; next: the same with --merge")

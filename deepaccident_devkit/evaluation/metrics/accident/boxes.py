@@ -7,7 +7,7 @@ Every alarm counts, the truth does not help to choose one, and an alarm that a r
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, get_args
 
@@ -34,7 +34,6 @@ from deepaccident_devkit.evaluation.metrics.alarms.raised import (
 )
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, UNPLACED_NOTE, AccidentContext, BoxTruth
-from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
@@ -119,20 +118,6 @@ class BoxAccidents:
     def settings(self) -> dict[str, Any]:
         """All choices, as JSON can hold them."""
         return asdict(self)
-
-    def variants(self) -> dict[str, BoxAccidents]:
-        """These metrics with one choice changed, by `name=value`; for explanations."""
-        own: Mapping[str, tuple[Any, ...]] = {
-            "min_score": (0.5,),
-            "match_distance": (2.0, 4.0, 8.0),
-            "naming": get_args(Naming),
-            "unjudged_are_false": (False, True),
-        }
-        return {
-            **with_parts(self, "reading", self.reading.variants()),
-            **with_others(self, own),
-            **with_parts(self, "scoring", self.scoring.variants()),
-        }
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.

@@ -32,7 +32,6 @@ from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     match_tracks,
 )
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.frames import (
     check_output,
@@ -110,23 +109,6 @@ class PaperAccidents:
     def settings(self) -> dict[str, Any]:
         """All choices, as JSON can hold them."""
         return asdict(self)
-
-    def variants(self) -> dict[str, PaperAccidents]:
-        """These metrics with one choice changed, by `name=value`; for explanations."""
-        own: Mapping[str, tuple[Any, ...]] = {
-            "predicted_by": get_args(PredictedBy),
-            "sample_choice": get_args(SampleChoice),
-            "position_time": get_args(PositionTime),
-            "alarm_choice": get_args(AlarmChoice),
-            "alarms_cut": (False, True),
-            "naming": get_args(Naming),
-            "match_distance": (2.0, 4.0, 8.0),
-        }
-        return {
-            **with_parts(self, "reading", self.reading.variants()),
-            **with_others(self, own),
-            **with_parts(self, "scoring", self.scoring.variants()),
-        }
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.

@@ -9,7 +9,7 @@ first frame's instances alone), `outlines.first_outline` (of an instance in seve
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
@@ -31,7 +31,6 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
 )
 from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.metrics.choices import with_others
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.frames import (
     check_output,
@@ -103,13 +102,6 @@ class ReleasedAccidents:
     def settings(self) -> dict[str, Any]:
         """All that decides the numbers, as JSON can hold it."""
         return asdict(self)
-
-    def variants(self) -> Mapping[str, ReleasedAccidents]:
-        """These rules with one choice changed, by `name=value`."""
-        switches = {name: (False, True) for name, value in asdict(self).items() if isinstance(value, bool)}
-        return with_others(
-            self, {"truth_gap": (2.0,), "prediction_gap": (2.0,), "level": (0.5,), "errors_at": (10.0,), **switches}
-        )
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.

@@ -14,7 +14,6 @@ from deepaccident_devkit.arrays import BoolArray, ShortRepr
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE, even
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.metrics.choices import with_others
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
@@ -210,18 +209,6 @@ class Scoring:
             raise ConfigError(f"errors_at: expected one of {', '.join(map(str, DISTANCES))}, found {self.errors_at!r}")
         if self.time_tolerance is not None and not self.time_tolerance >= 0:
             raise ConfigError(f"time_tolerance: expected seconds from 0, or None, found {self.time_tolerance!r}")
-
-    def variants(self) -> dict[str, Scoring]:
-        """This scoring with one choice changed, by `name=value`; for explanations."""
-        return with_others(
-            self,
-            {
-                "errors_at": DISTANCES,
-                "limit_counts": (False, True),
-                "far_is_missed": (False, True),
-                "time_tolerance": (None, 0.5),
-            },
-        )
 
     def hit(self, alarms: Sequence[Alarm], distance: float) -> Alarm | None:
         """The first alarm that foresees the true accident within a distance."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
-from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import VpqRules
 from deepaccident_devkit.evaluation.metrics.trajectories import GATE, TrajectoryRules
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, POST_PROCESSING, PostProcessing
@@ -53,42 +51,7 @@ class MotionProtocol:
         """As the released code prints them: `30x30`, `100x100`."""
         return tuple(f"{extent:g}x{extent:g}" for extent in self.ranges)
 
-    def variants(self) -> dict[str, MotionProtocol]:
-        """These metrics with one choice changed, by `name=value`; for explanations.
 
-        Those of a part have its name before theirs: `paths.link_distance=10.0`. Labels are no choice of the metrics:
-        where those of other protocols are the truth, the truth is another one.
-        """
-        reading = {
-            "foreground": ("argmax", "sigmoid"),
-            "center_threshold": (0.1, 0.3),
-            "max_centers": (20, 100),
-            "scan": ("released", "fiery"),
-            "link_distance": (3.0, 8.0, 10.0),
-        }
-        own: Mapping[str, tuple[Any, ...]] = {
-            "accelerating_paths": (False, True),
-            "gate": (2.0, GATE, math.inf),
-            "nothing_is_zero": (False, True),
-        }
-        return {
-            **self._part_variants("vpq", {"ids_must_stay": (False, True)}),
-            **self._part_variants("instances", reading),
-            **self._part_variants("paths", {**reading, "labels_bypass_sigmoid": (False, True)}),
-            **with_others(self, own),
-            **self._part_variants("trajectories", _TRAJECTORY_CHOICES),
-        }
-
-    def _part_variants(self, part: str, others: Mapping[str, Sequence[Any]]) -> dict[str, MotionProtocol]:
-        return with_parts(self, part, with_others(getattr(self, part), others))
-
-
-_TRAJECTORY_CHOICES: Final[Mapping[str, tuple[Any, ...]]] = {
-    "ade_limit": (8.0, math.inf),
-    "fde_limit": (10.0, math.inf),
-    "miss_distance": (2.0, 5.0),
-    "first_prediction_empty_ends": (False, True),
-}
 MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
     {"released": MotionProtocol(), "paper": MotionProtocol(nothing_is_zero=False)}
 )

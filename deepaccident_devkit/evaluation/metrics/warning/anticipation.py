@@ -135,9 +135,6 @@ class CleanWarnings(WarningRules):
         if self.threshold is not None and not math.isfinite(self.threshold):
             raise ConfigError(f"threshold: expected a number, or None, found {self.threshold!r}")
 
-    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
-        return {"scores_of": get_args(ScoresOf), "window": (1.0, 2.0, 3.0)}
-
     def result(self, counts: Collection[Counts], *, references: bool = False) -> AnticipationResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""
         parts = parts_of(counts)

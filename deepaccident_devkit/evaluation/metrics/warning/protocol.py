@@ -10,7 +10,6 @@ from typing import Any, Final, Literal, get_args
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.raised import Naming
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.text import settle_choices
 
 CorrectBy = Literal["either", "pair", "place"]
@@ -60,28 +59,6 @@ class WarningRules:
         """All choices, as JSON can hold them."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
-    def variants(self) -> Mapping[str, WarningRules]:
-        """These metrics with one choice changed, by `name=value`; for explanations."""
-        return {
-            **with_parts(self, "reading", self.reading.variants()),
-            **with_others(
-                self,
-                {
-                    "min_score": (0.5,),
-                    "match_distance": (2.0, 4.0, 8.0),
-                    "naming": get_args(Naming),
-                    "correct_by": get_args(CorrectBy),
-                    "distance": (5.0, 10.0, 15.0),
-                    "time_tolerance": (None, 0.5),
-                    **self._own_others(),
-                },
-            ),
-        }
-
-    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
-        """Other values of the further choices of a protocol."""
-        return {}
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WarningProtocol(WarningRules):
@@ -109,6 +86,3 @@ class WarningProtocol(WarningRules):
                 raise ConfigError(f"leads, curve_lead: expected seconds above 0, found {lead!r}")
         if type(self.curve_rows) is not int or self.curve_rows < 2:
             raise ConfigError(f"curve_rows: expected a whole number from 2, found {self.curve_rows!r}")
-
-    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
-        return {"unjudged_are_false": (False, True)}

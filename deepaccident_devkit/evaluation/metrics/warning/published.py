@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, get_args
+from dataclasses import dataclass, field
+from typing import ClassVar, get_args
 
-from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.drives import (
@@ -60,14 +59,6 @@ class FieldWarnings(WarningRules):
         """Check the values; raises ChoiceError or ConfigError."""
         WarningRules.__post_init__(self)
         settle_choices(self, {"scores_of": get_args(ScoresOf)})
-
-    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
-        return {"scores_of": get_args(ScoresOf)}
-
-    def variants(self) -> Mapping[str, WarningRules]:
-        """These metrics with one choice changed; each quirk among them."""
-        quirks = with_others(self.quirks, {each.name: (False, True) for each in fields(FieldQuirks)})
-        return {**WarningRules.variants(self), **with_parts(self, "quirks", quirks)}
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""

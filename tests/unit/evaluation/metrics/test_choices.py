@@ -1,6 +1,5 @@
 """The choices of a protocol by their names."""
 
-import functools
 import json
 from typing import Any
 
@@ -30,22 +29,6 @@ class TestSwitches:
                 for part in name.split("."):
                     value = getattr(value, part)
                 assert switched(rules, {name: json.loads(json.dumps(value)) if value != np.inf else value}) == rules
-
-    def test_no_variant_is_the_protocol_itself(self) -> None:
-        for task, protocol in ALL:
-            rules = TASK_PROTOCOLS[task][protocol]
-            assert [name for name, variant in rules.variants().items() if variant == rules] == []
-
-    def test_every_switch_that_is_on_or_off_has_the_other_as_a_variant(self) -> None:
-        for task, protocol in ALL:
-            if task not in {"accident", "warning"}:
-                continue  # of motion and detection some switches go together with others alone
-            rules = TASK_PROTOCOLS[task][protocol]
-            values = {name: functools.reduce(getattr, name.split("."), rules) for name in switch_names(rules)}
-            flags = {name: value for name, value in values.items() if isinstance(value, bool)}
-            variants = rules.variants()
-            missing = [name for name, value in flags.items() if f"{name}={not value}" not in variants]
-            assert missing == [], (task, protocol, sorted(variants))
 
     def test_a_choice_within_a_part(self) -> None:
         changed = switched(PaperAccidents(), {"scoring.far_is_missed": False, "match_distance": 2})

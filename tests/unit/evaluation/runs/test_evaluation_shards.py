@@ -22,7 +22,6 @@ from deepaccident_devkit.evaluation.runs import (
     scenario_hashes,
     verify_bundle,
 )
-from deepaccident_devkit.evaluation.runs.explanation import explain
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
@@ -279,7 +278,6 @@ CALLS: dict[str, Callable[..., Any]] = {
     "hashes": lambda job, **how: scenario_hashes(job.dataset, map(scenario_of, job.results.tokens), **how),
     "breakdowns": lambda job, **how: job.whole().broken_down(["agent", "all"], FEW, **how).summary(),
     "sanity": lambda job, **how: check_sanity(job.dataset, job.results, SETUP, job.results.tokens, samples=2, **how),
-    "explain": lambda job, **how: explain(job.dataset, job.results, SETUP, job.results.tokens[:1], **how),
 }
 
 

@@ -1,6 +1,6 @@
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading, accident_of
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.metrics.choices import switch_names
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
@@ -409,20 +408,20 @@ def test_orientations_of_prediction_and_label_may_differ() -> None:
         assert PAPER.counts(as_maps(lying), label, AccidentContext()) == expected
 
 
-def test_counts_are_json_and_each_choice_is_explained() -> None:
-    evaluator = AccidentEvaluator(protocol=PAPER, explain=True)
+def test_counts_are_json_and_choices_change_them() -> None:
     label = scene(HIT)
-    evaluator.update("one", as_heads(*[scene(moved(HIT, y=2.5))] * 2), label)
-    evaluator.update("two", as_maps(label), label)
+
+    def evaluated(**choices: object) -> AccidentEvaluator:
+        evaluator = AccidentEvaluator(protocol=replace(PAPER, **choices))
+        evaluator.update("one", as_heads(*[scene(moved(HIT, y=2.5))] * 2), label)
+        evaluator.update("two", as_maps(label), label)
+        return evaluator
+
+    evaluator = evaluated()
     assert json.loads(json.dumps(evaluator.counts["one"])) == evaluator.counts["one"]
     json.dumps(evaluator.settings)
     json.dumps(evaluator.compute().as_dict())
-    explained = evaluator.explained()
-    assert set(explained) == set(PAPER.variants())
     assert evaluator.compute().within[5.0].tp == 1
-    assert explained["scoring.limit_counts=True"].within[5.0].tp == 2
-    assert explained["scoring.far_is_missed=False"].within[5.0].fn == 0
-    assert explained["reading.danger_distance=0.5"].positives == 0
-    names = {name.split("=")[0] for name in explained}
-    assert {f"reading.{each.name}" for each in fields(AccidentReading)} | {"sample_choice"} <= names
-    assert names <= set(switch_names(PAPER))
+    assert evaluated(scoring=Scoring(limit_counts=True)).compute().within[5.0].tp == 2
+    assert evaluated(scoring=Scoring(far_is_missed=False)).compute().within[5.0].fn == 0
+    assert evaluated(reading=AccidentReading(danger_distance=0.5)).compute().positives == 0

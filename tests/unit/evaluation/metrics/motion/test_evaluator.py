@@ -262,26 +262,6 @@ def test_large_errors_are_cut_off() -> None:
     assert (result.min_ade, result.min_fde, result.miss_rate) == (2.0, 17.5, 0.0)
 
 
-def test_each_part_of_the_protocol_has_variants() -> None:
-    protocol = MotionEvaluator("released").protocol
-    variants = protocol.variants()
-    assert not variants["vpq.ids_must_stay=False"].vpq.ids_must_stay
-    assert variants["paths.link_distance=10.0"].paths.link_distance == 10
-    assert variants["instances.center_threshold=0.3"].instances.center_threshold == 0.3
-    assert variants["trajectories.miss_distance=2.0"].trajectories.miss_distance == 2
-    assert {name.split(".")[0].split("=")[0] for name in variants} >= {"instances", "gate", "nothing_is_zero"}
-    assert protocol not in variants.values()
-
-
-def test_limits_of_errors_are_explained_by_the_released_ones_and_by_none() -> None:
-    def limits(protocol: MotionProtocol) -> set[float]:
-        variants = protocol.variants()
-        return {each.trajectories.fde_limit for name, each in variants.items() if "fde_limit" in name}
-
-    assert limits(MotionProtocol()) == {math.inf}
-    assert limits(MotionProtocol(trajectories=TrajectoryRules(fde_limit=3.0))) == {10.0, math.inf}
-
-
 def test_paths_can_be_left_out() -> None:
     evaluator = MotionEvaluator(trajectories=False)
     assert evaluator.settings["trajectories"] is False
