@@ -121,7 +121,6 @@ def bundle(da_motion: DeepAccident, folder: Path, accidents: Path) -> Path:
         ("detection", "boxes", "paper", "mAP"),
         ("detection", "boxes", "opencood", "mAP"),
         ("warning", "accidents", "clean", "auc_ahead ego_involved"),
-        ("warning", "accidents", "boxes", "warned_share"),
         ("warning", "accidents", "field", "AP ustring ego_involved"),
     ],
 )
@@ -186,7 +185,7 @@ def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path:
         ("motion", "released", write_motion, "iou 100x100 100.00 %"),
         ("accident", "boxes", write_accidents, "apa 1.000"),
         ("detection", "released", write_boxes, "AP car 97.22 %"),
-        ("warning", "boxes", write_accidents, "warned_share 1.000"),
+        ("warning", "clean", write_accidents, "recall ego_involved 1.000"),
     ],
 )
 def test_a_partial_download_is_evaluated_and_its_report_has_pictures(
@@ -386,7 +385,7 @@ def test_tasks_have_the_grammar_of_all_verbs_on_a_release() -> None:
         text = evaluate(name, "--help").output
         for word in ("DATAROOT", "--version", "--index-dir", "--workers", "--on-error", "--results", "--protocol"):
             assert word in text
-    assert "[clean|boxes|field]" in evaluate("warning", "--help").output
+    assert "[clean|field]" in evaluate("warning", "--help").output
 
 
 def test_the_group_names_its_verbs() -> None:

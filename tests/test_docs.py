@@ -32,7 +32,6 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     CleanWarnings,
     FieldQuirks,
     FieldWarnings,
-    WarningProtocol,
 )
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
@@ -214,7 +213,6 @@ def test_the_commands_of_the_gallery_run(da_motion: DeepAccident, in_demo: Path)
         AccidentReading,
         Scoring,
         BoxAccidents,
-        WarningProtocol,
         CleanWarnings,
         FieldWarnings,
         FieldQuirks,

@@ -42,7 +42,6 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     FieldResult,
     FieldWarnings,
     WarningEvaluator,
-    WarningResult,
 )
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 
@@ -77,7 +76,6 @@ __all__ = [
     "ResultsWriter",
     "SampleAttributes",
     "WarningEvaluator",
-    "WarningResult",
     "accident_context",
     "accidents_of",
     "box_truth",

@@ -22,15 +22,11 @@ _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
         "mean_iou": "%",
         "iou/*": "%",
         "path_accuracy": "share",
-        "lasting_share": "share",
-        "mean_lasting": "s",
-        "mean_reach": "s",
         "area_under_curve": "share",
         "mean_time": "s",
         "recall": "share",
         "precision": "share",
         "time_in_alarm": "share",
-        "time_in_alarm/*": "share",
         "early_share": "share",
         "tta_hit": "s",
         "tta0": "s",
@@ -40,7 +36,6 @@ _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
         "precision_at_*": "share",
         "recall_at_half": "share",
         "alarm_seconds_per_minute": "1/min",
-        "alarm_seconds_per_minute/*": "1/min",
         "episodes_per_minute": "1/min",
         "shares/*": "share",
         "warned": "share",
@@ -52,11 +47,10 @@ _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
 _SIGNED: Final = ("lateness",)
 """Numbers with a unit that can be below 0."""
 _WITHOUT: Final = (
-    *("minutes", "minutes/*", "false_recordings"),
+    "false_recordings",
     *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
-    "median_*",
 )
-"""Totals, settings, and medians, which jump when a cluster is left out: the jackknife does not hold for them."""
+"""Totals and settings: the jackknife does not hold for them."""
 
 
 def numbers_of(result: object) -> dict[str, float]:
@@ -65,7 +59,7 @@ def numbers_of(result: object) -> dict[str, float]:
 
 
 def has_interval(path: str) -> bool:
-    """Whether a number is one that the jackknife holds for: neither a total, nor a setting, nor a median."""
+    """Whether a number is one that the jackknife holds for: neither a total nor a setting."""
     return not _is_one_of(path, _WITHOUT)
 
 

@@ -25,10 +25,6 @@ _PARTS: Final = {
     "within": "By the allowed distance (m)",
     "ranges": "By range",
     "classes": "By class",
-    "recordings": "Recordings",
-    "minutes": "Minutes",
-    "false_alarms": "False alarms",
-    "detection_recordings": "Recordings with so many seconds before the end",
     "beside": "With other choices, always reported as well",
 }
 """Field of a result → heading of its table."""

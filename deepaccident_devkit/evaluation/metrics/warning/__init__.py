@@ -16,9 +16,7 @@ from deepaccident_devkit.evaluation.metrics.warning.prevention import (
     PreventionCurve,
     PreventionFigures,
 )
-from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
 from deepaccident_devkit.evaluation.metrics.warning.published import FieldResult, FieldWarnings
-from deepaccident_devkit.evaluation.metrics.warning.result import WarningCurve, WarningResult
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 
 __all__ = [
@@ -40,10 +38,7 @@ __all__ = [
     "PreventionCurve",
     "PreventionFigures",
     "ScoreSeries",
-    "WarningCurve",
     "WarningEvaluator",
-    "WarningProtocol",
-    "WarningResult",
     "false_alarm_cost",
     "field_figures",
 ]

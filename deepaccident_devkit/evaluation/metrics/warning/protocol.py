@@ -1,4 +1,4 @@
-"""What counts as an alarm and as a right one: `WarningRules` of all warning protocols, and the protocol `boxes`."""
+"""`WarningRules`: what counts as an alarm and as a right one, for all warning protocols."""
 
 from __future__ import annotations
 
@@ -58,31 +58,3 @@ class WarningRules:
     def settings(self) -> dict[str, Any]:
         """All choices, as JSON can hold them."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WarningProtocol(WarningRules):
-    """Alarms one by one: how early the first right one is, how often and how long false ones are.
-
-    Attributes:
-        unjudged_are_false: where nobody collides, alarms for later than the recording goes on are false ones; else they
-            are left out and counted aside, since nothing refutes them.
-        leads: seconds before the impact at which detection rates are given.
-        curve_lead: seconds before the impact: of the curve's detection rate.
-        curve_rows: how many thresholds the curve has at most.
-    """
-
-    unjudged_are_false: bool = False
-    leads: tuple[float, ...] = (1.0, 2.0, 3.0)
-    curve_lead: float = 1.0
-    curve_rows: int = 101
-
-    def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError or ConfigError."""
-        WarningRules.__post_init__(self)
-        object.__setattr__(self, "leads", tuple(float(lead) for lead in self.leads))
-        for lead in (*self.leads, self.curve_lead):
-            if not 0 < lead < math.inf:
-                raise ConfigError(f"leads, curve_lead: expected seconds above 0, found {lead!r}")
-        if type(self.curve_rows) is not int or self.curve_rows < 2:
-            raise ConfigError(f"curve_rows: expected a whole number from 2, found {self.curve_rows!r}")

@@ -107,7 +107,7 @@ def test_any_workers_give_the_same_bits(da_motion: DeepAccident, crash: str) -> 
 
 
 def test_other_evaluators_have_no_scores_of_recordings(da_motion: DeepAccident) -> None:
-    for evaluator in (WarningEvaluator("boxes"), MotionEvaluator()):
+    for evaluator in (WarningEvaluator("field"), MotionEvaluator()):
         with pytest.raises(EvaluationError, match="need one of warnings, protocol clean, which scores whole recording"):
             prevented_accidents(da_motion, evaluator)
 

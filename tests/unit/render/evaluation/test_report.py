@@ -29,7 +29,7 @@ SETUPS = (
     EvaluationSetup(task="accident", protocol="boxes"),
     EvaluationSetup(task="accident", protocol="paper"),
     EvaluationSetup(task="detection"),
-    EvaluationSetup(task="warning", protocol="boxes"),
+    EvaluationSetup(task="warning", protocol="clean"),
     EvaluationSetup(task="warning", protocol="clean"),
 )
 

@@ -304,8 +304,8 @@ def test_no_alarm_at_the_impact_or_after_it_warns() -> None:
 
 
 def test_other_protocols_have_no_scores_of_recordings() -> None:
-    with pytest.raises(EvaluationError, match="counted by the protocol clean, found WarningProtocol"):
-        PreventedEvaluator(AccidentOutcomes(), "boxes")
+    with pytest.raises(EvaluationError, match="counted by the protocol clean, found FieldWarnings"):
+        PreventedEvaluator(AccidentOutcomes(), "field")
 
 
 @pytest.mark.parametrize(
