@@ -19,7 +19,6 @@ from deepaccident_devkit.baselines import outlook
 from deepaccident_devkit.baselines.collisions import accidents_ahead
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, WarningEvaluator
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, accident_context
-from deepaccident_devkit.evaluation.metrics.warning import FieldQuirks, FieldWarnings
 from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.synth import SynthConfig, make_release
@@ -40,8 +39,7 @@ def main() -> None:
 
 def measure(dataset: DeepAccident) -> None:
     """Of all samples of the split, two a second, each predictor through each protocol."""
-    protocols = {"clean": "clean", "field": FieldWarnings(quirks=FieldQuirks(nonsense_kept=True))}
-    warned = {name: {kind: WarningEvaluator(each) for kind, each in protocols.items()} for name in PREDICTORS}
+    warned = {name: {kind: WarningEvaluator(kind) for kind in ("clean", "field")} for name in PREDICTORS}
     accidents = {(name, when): AccidentEvaluator("boxes") for name in PREDICTORS for when in ("before", "after")}
     for token in dataset.samples(SPLIT, "all"):
         context = accident_context(dataset, token, HORIZON, references=True)
@@ -53,7 +51,7 @@ def measure(dataset: DeepAccident) -> None:
             accidents[name, "before"].update(token, alarms, None, as_before(context))
     results = {name: {kind: each.compute() for kind, each in those.items()} for name, those in warned.items()}
     put("warning-clean", beside({name: each["clean"].as_dict() for name, each in results.items()}, GROUP))
-    for code in ("ustring", "drive", "dad"):
+    for code in ("drive", "dad"):
         fields = {name: each["field"].as_dict() for name, each in results.items()}
         put(f"warning-{code}", beside(fields, f"{code} {GROUP}"))
     make_accident_tables.PAGE = HERE.parent / "CHANGELOG.md"

@@ -8,7 +8,7 @@ from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
 from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.metrics.warning.cost import AlarmCost, false_alarm_cost
 from deepaccident_devkit.evaluation.metrics.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
-from deepaccident_devkit.evaluation.metrics.warning.field import FieldFigures, FieldQuirks, field_figures
+from deepaccident_devkit.evaluation.metrics.warning.field import FieldFigures, field_figures, printed_figures
 from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import AccidentOutcomes, OutcomeTable
 from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
 from deepaccident_devkit.evaluation.metrics.warning.prevention import (
@@ -28,7 +28,6 @@ __all__ = [
     "CleanScores",
     "CleanWarnings",
     "FieldFigures",
-    "FieldQuirks",
     "FieldResult",
     "FieldWarnings",
     "OperatingPoint",
@@ -41,4 +40,5 @@ __all__ = [
     "WarningEvaluator",
     "false_alarm_cost",
     "field_figures",
+    "printed_figures",
 ]

@@ -23,8 +23,8 @@ Result = AnticipationResult | FieldResult
 WARNING_PROTOCOLS: Final[Mapping[str, Protocol]] = MappingProxyType(
     {"clean": CleanWarnings(), "field": FieldWarnings()}
 )
-"""`clean` ranks predictors, recording by recording; `field` is what published codes print. Both compare with the labels,
-as the accident protocol `boxes` does; the paper has no such metrics."""
+"""`clean` ranks predictors, recording by recording; `field` is what published codes print. Both compare with labels as
+the accident protocol `boxes` does; the paper has no such metrics."""
 
 
 class WarningEvaluator(Evaluator[Any]):

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar, get_args
+from dataclasses import dataclass
+from typing import ClassVar
 
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.drives import (
     GIVEN,
     PREDICTORS,
-    ScoresOf,
     by_group,
     drives_of,
     left_out_notes,
     parts_of,
     series_of,
 )
-from deepaccident_devkit.evaluation.metrics.warning.field import FIELD_CODES, FieldFigures, FieldQuirks, field_figures
+from deepaccident_devkit.evaluation.metrics.warning.field import FIELD_CODES, FieldFigures, field_figures
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
-from deepaccident_devkit.text import settle_choices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,20 +43,10 @@ class FieldResult(TaskResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldWarnings(WarningRules):
-    """Published anticipation metrics, for numbers beside published ones; a recording's score is as of `CleanWarnings`.
+    """Published anticipation metrics, for numbers beside published ones.
 
-    Attributes:
-        scores_of: as `CleanWarnings` has it; dash-cam sets know recordings alone.
-        quirks: which of the published codes' quirks are kept.
+    A recording's score is as of `CleanWarnings`, of all its alarms, since dash-cam sets know recordings alone.
     """
-
-    scores_of: ScoresOf = "recording"
-    quirks: FieldQuirks = field(default_factory=FieldQuirks)
-
-    def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError or ConfigError."""
-        WarningRules.__post_init__(self)
-        settle_choices(self, {"scores_of": get_args(ScoresOf)})
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""
@@ -66,7 +54,7 @@ class FieldWarnings(WarningRules):
         groups, samples = dict(by_group(drives_of(parts))), [sample for part in parts for sample in part]
         made = {
             predictor: {
-                f"{code} {group}": field_figures(series_of(those, predictor, self.scores_of), code, self.quirks)
+                f"{code} {group}": field_figures(series_of(those, predictor, "recording"), code)
                 for group, those in groups.items()
                 for code in FIELD_CODES
             }

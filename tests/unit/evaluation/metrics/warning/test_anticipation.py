@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,12 +21,11 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     AnticipationResult,
     CleanScores,
     CleanWarnings,
-    FieldQuirks,
-    FieldWarnings,
     ScoreSeries,
     WarningEvaluator,
     anticipation,
     field_figures,
+    printed_figures,
 )
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import mean_of
 from deepaccident_devkit.evaluation.metrics.warning.drives import REFERENCES, TRIVIAL
@@ -271,49 +270,17 @@ def test_recall_and_lead_never_stand_without_precision_and_time_in_alarm() -> No
         assert min(at for at, name in enumerate(names) if word in name) < min(leads)
 
 
-@pytest.mark.parametrize("quirk", [each.name for each in fields(FieldQuirks) if each.name != "five_seconds"])
-def test_each_published_quirk_can_be_left_out(quirk: str) -> None:
-    """On recordings that show them all: an exact zero, ties, a miss, an early impact, few frames."""
-    scores = np.array([[0.0, 0.2, 0.9, 0.1], [0.3, 0.3, 0.3, 0.3], [0.0, 0.1, 0.2, 0.9], [0.0, 0.9, 0.0, 0.0]] * 100)
-    series = ScoreSeries(
-        scores=scores, positive=np.array([True, True, False, False] * 100), toa=np.array([3.0, 2, 4, 4] * 100), fps=2.0
-    )
-    if quirk == "as_many_thresholds_as_frames":
-        series = ScoreSeries(scores=scores[:4], positive=series.positive[:4], toa=series.toa[:4], fps=2.0)
-    if quirk == "highest_recall_takes_first":  # perfect, but for alarms of all at the lowest threshold
-        series = ScoreSeries(
-            scores=np.tile([[0.1] * 40 + [0.9] * 40, [0.1] * 80], (20, 1)),
-            positive=np.array([True, False] * 20),
-            toa=np.full(40, 80.0),
-            fps=10.0,
-        )
-    kept = replace(FieldQuirks(), nonsense_kept=quirk != "nonsense_kept")
-    as_it_is, without = (field_figures(series, "ustring", each) for each in (kept, _other(kept, quirk)))
-    assert as_it_is != without
-
-
-def test_seconds_of_dad() -> None:
-    series = ScoreSeries(
-        scores=np.array([[0.1, 0.9, 0.9, 0.9], [0.1, 0.1, 0.1, 0.2]]),
-        positive=np.array([True, False]),
-        toa=np.array([4.0, 4.0]),
-        fps=2.0,
-    )
-    five, two = (field_figures(series, "dad", FieldQuirks(five_seconds=each)).mean_time for each in (True, False))
-    assert five == pytest.approx(2.5 * two)
-
-
-def _other(quirks: FieldQuirks, name: str) -> FieldQuirks:
-    return replace(quirks, **{name: not getattr(quirks, name)})
-
-
 def test_field_says_why_a_number_is_none() -> None:
     result = evaluated(never, "field", pairs=2).compute()
     figures = result.figures["ustring ego_involved"]
     assert math.isnan(figures.average_precision)
-    assert any("zero_alarms_negatives" in note for note in result.notes)
-    kept = FieldWarnings(quirks=FieldQuirks(nonsense_kept=True))
-    assert evaluated(never, kept, pairs=2).compute().figures["ustring ego_involved"].average_precision == 2.0
+    assert any("recordings without an accident count as true positives" in note for note in result.notes)
+
+
+def test_what_a_code_prints_may_be_above_1() -> None:
+    nothing = ScoreSeries(scores=np.zeros((4, 6)), positive=np.array([True, False] * 2), toa=np.full(4, 6.0), fps=2.0)
+    assert printed_figures(nothing, "ustring").average_precision == 2.0
+    assert math.isnan(field_figures(nothing, "ustring").average_precision)
 
 
 def test_without_recordings_there_is_nothing() -> None:
@@ -337,11 +304,6 @@ def test_without_recordings_there_is_nothing() -> None:
 def test_choices_are_checked(choices: dict, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         CleanWarnings(**choices)
-
-
-def test_field_knows_pairs_and_recordings_alone() -> None:
-    with pytest.raises(ChoiceError, match="scores_of: expected one of pair, recording, found 'scene'"):
-        FieldWarnings(scores_of="scene")
 
 
 def test_means_over_draws_leave_unknown_numbers_out_and_keep_counts_and_words() -> None:
