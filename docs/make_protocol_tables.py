@@ -88,8 +88,6 @@ def motion_variants() -> dict[str, MotionProtocol]:
     instances = {"link_distance": (3.0, 8.0), "foreground": ("sigmoid",), **reading}
     paths = {"link_distance": (3.0, 10.0), "foreground": ("argmax",), "labels_bypass_sigmoid": (False,), **reading}
     rules = {
-        "ade_limit": (np.inf,),
-        "fde_limit": (np.inf,),
         "miss_distance": (2.0,),
         "first_prediction_empty_ends": (False,),
     }

@@ -171,10 +171,10 @@ def test_parts_need_a_folder(da_motion: DeepAccident, accidents: Path, part: tup
 
 def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path: Path) -> None:
     words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
-    done = evaluate(*words, "--by", "town", "--switch", "scoring.limit_counts=true", "--json", "--out", tmp_path / "b")
+    done = evaluate(*words, "--by", "town", "--switch", "reading.present=false", "--json", "--out", tmp_path / "b")
     summary = json.loads(done.stdout)
     assert list(summary["breakdowns"]) == ["all", "town"]
-    assert summary["switches"] == {"scoring.limit_counts": True}
+    assert summary["switches"] == {"reading.present": False}
     assert summary == read_bundle(tmp_path / "b").summary
     assert f"written: {tmp_path / 'b'}" in done.stderr
 
@@ -348,9 +348,9 @@ class TestRefused:
         [
             (("--switch", "gap=3"), ChoiceError, r"BoxAccidents has no switch 'gap'"),
             (
-                ("--switch", "min_score=high"),
+                ("--switch", "reading.danger_distance=high"),
                 ChoiceError,
-                r"switch min_score: expected a number, such as 0.0, found 'hi",
+                r"switch danger_distance: expected a number, such as 1.0, found 'hi",
             ),
             (("--split", "nowhere"), ChoiceError, r"split: expected one of train, val"),
             (("--agents", "ego"), ChoiceError, r"--agents: expected one of ego_vehicle, .*did you mean 'ego_vehicle'"),
@@ -365,7 +365,7 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
-            (("--switch", "min_score"), "--switch: expected NAME=VALUE, found 'min_score'"),
+            (("--switch", "reading.present"), "--switch: expected NAME=VALUE, found 'reading.present'"),
             (("--by", "wether"), "Invalid value for '--by'"),
             (("--protocol", "boxy"), "Invalid value for '--protocol'"),
         ],

@@ -49,8 +49,9 @@ _SIGNED: Final = ("lateness",)
 _WITHOUT: Final = (
     "false_recordings",
     *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
+    "median_*",
 )
-"""Totals and settings: the jackknife does not hold for them."""
+"""Totals, settings, and medians, which jump when a cluster is left out: the jackknife does not hold for them."""
 
 
 def numbers_of(result: object) -> dict[str, float]:
@@ -59,7 +60,7 @@ def numbers_of(result: object) -> dict[str, float]:
 
 
 def has_interval(path: str) -> bool:
-    """Whether a number is one that the jackknife holds for: neither a total nor a setting."""
+    """Whether a number is one that the jackknife holds for: neither a total, nor a setting, nor a median."""
     return not _is_one_of(path, _WITHOUT)
 
 

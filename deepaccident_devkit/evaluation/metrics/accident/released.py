@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -54,7 +54,6 @@ class ReleasedAccidents:
     """The released rules; the defaults keep all quirks.
 
     Attributes:
-        labels: protocol of the labels that are the truth, others are refused; None for any.
         truth_gap: cells; the true instances that are nearer collide. With 0.001 they must overlap.
         prediction_gap: cells; the predicted instances that are nearer collide: 2.5 m. The paper has 1 m for both.
         level: where the outlines run, see `outlines.LEVEL`: 0.1 makes instances almost a cell larger all around.
@@ -63,30 +62,26 @@ class ReleasedAccidents:
         last_frame_only: only the last frame counts, as the lists of accidents begin empty at each. So accidents
             have no time, and its error is always 0. Else the frame with the smallest distance counts, and truth and
             prediction have each its own.
-        accelerating: paths that end early go on faster and faster; see `trajectories.padded`.
         far_is_missed: an accident foreseen elsewhere also leaves the true one missed. The released code counts it once.
         empty_first_ends: where the first prediction has no instance at all, the others do not count: a true accident
             is missed, and nothing is a false alarm.
         mean_alone_alarms: where there is no accident, only one foreseen by the last prediction (the mean) is a false
             positive; else one by any. (A true accident may be foreseen by any.)
-        errors_filled: where no accident at all is foreseen within a distance, its errors are 1, 20 m and 1 s, which
-            go into the means over the distances; else they do not count.
         errors_at: metres: the distance whose true positives the errors are means over; None for the mean of the errors
             at all three. The paper says 10.
     """
 
-    labels: str | None = "released"
+    labels: ClassVar[str] = "released"
+    """Protocol of the labels that are the truth; others are refused."""
     truth_gap: float = 0.001
     prediction_gap: float = 5.0
     level: float = 0.1
     truth_through_heads: bool = True
     redraw: bool = True
     last_frame_only: bool = True
-    accelerating: bool = True
     far_is_missed: bool = False
     empty_first_ends: bool = True
     mean_alone_alarms: bool = True
-    errors_filled: bool = True
     errors_at: float | None = None
 
     def __post_init__(self) -> None:
@@ -121,7 +116,7 @@ class ReleasedAccidents:
         truth, present = self.truth_paths(label, frames)
         points = longest(truth.paths) or len(truth.drawn)
         truth, *predictions = (
-            self.padded_paths(each, points) for each in (truth, *self.prediction_paths(prediction, frames))
+            padded_paths(each, points) for each in (truth, *self.prediction_paths(prediction, frames))
         )
         matches = [match_trajectories(each.paths, truth.paths).pairs for each in predictions]
         step = label.config.step * FRAME_PERIOD
@@ -161,17 +156,12 @@ class ReleasedAccidents:
         cut = [first_frames(heads, frames) for heads in output.heads or ()]
         return [paths_of_heads(heads, output.grid, self.post_processing)[0] for heads in cut]
 
-    def padded_paths(self, given: DrawnPaths, length: int) -> DrawnPaths:
-        """The same with paths of so many points."""
-        return replace(given, paths=padded(given.paths, length, accelerating=self.accelerating))
-
-    def _error(self, errors: Sequence[float | None], name: str) -> float | None:
-        """An error over all distances from those at each."""
+    def _error(self, errors: Sequence[float | None], name: str) -> float:
+        """An error over all distances from those at each; where none is foreseen it is that of `_NOTHING_FOUND`."""
         if self.errors_at is not None:
             errors = [errors[DISTANCES.index(self.errors_at)]]
-        filled = [_NOTHING_FOUND[name] if error is None and self.errors_filled else error for error in errors]
-        known = [error for error in filled if error is not None]
-        return math.fsum(known) / len(known) if known else None
+        filled = [_NOTHING_FOUND[name] if error is None else error for error in errors]
+        return math.fsum(filled) / len(filled)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,6 +170,11 @@ class Collision:
 
     pair: Pair
     frame: int
+
+
+def padded_paths(given: DrawnPaths, length: int) -> DrawnPaths:
+    """The same with paths of so many points; those that end early go on faster and faster (`trajectories.padded`)."""
+    return replace(given, paths=padded(given.paths, length))
 
 
 def accident_counts(

@@ -12,6 +12,9 @@ from deepaccident_devkit.evaluation.metrics.trajectories import GATE, Trajectory
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, POST_PROCESSING, PostProcessing
 from deepaccident_devkit.text import choice, settle_choices
 
+RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
+"""Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionProtocol:
@@ -21,19 +24,17 @@ class MotionProtocol:
 
     Attributes:
         labels: protocol of the labels that are the truth, by name; others are refused. None for any labels.
-        ranges: metres: sides of the squares around the ego in which IoU and VPQ are counted.
         instances: how instances are read off heads for VPQ.
         paths: how they are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has
             these errors from the accident evaluation, which links and cuts out instances by other rules.
         vpq: which matches count.
         accelerating_paths: the released quirk of `trajectories.padded`.
         gate: metres, as of `match_trajectories`.
-        trajectories: limits of the errors, and a quirk.
+        trajectories: what is a miss, and a quirk.
         nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
     """
 
     labels: str | None = "released"
-    ranges: tuple[float, ...] = (30.0, 100.0)
     instances: PostProcessing = POST_PROCESSING["motion"]
     paths: PostProcessing = field(default_factory=lambda: replace(POST_PROCESSING["accident"], redraw=False))
     vpq: VpqRules = field(default_factory=VpqRules)
@@ -45,11 +46,6 @@ class MotionProtocol:
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError."""
         settle_choices(self, {"labels": (None, *LABEL_PROTOCOLS)})
-
-    @property
-    def range_names(self) -> tuple[str, ...]:
-        """As the released code prints them: `30x30`, `100x100`."""
-        return tuple(f"{extent:g}x{extent:g}" for extent in self.ranges)
 
 
 MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(

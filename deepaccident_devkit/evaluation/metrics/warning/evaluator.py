@@ -86,7 +86,7 @@ class WarningEvaluator(Evaluator[Any]):
                 f"context: expected an AccidentContext, found {type(context).__name__}; make it with "
                 "accident_context(dataset, sample, horizon=2.0)"
             )
-        self.add(token, sample_counts(token, prediction, label, context, self.protocol))
+        self.add(token, sample_counts(token, prediction, label, context))
 
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""

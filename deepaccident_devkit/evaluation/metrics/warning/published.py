@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
@@ -18,7 +18,6 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
     series_of,
 )
 from deepaccident_devkit.evaluation.metrics.warning.field import FIELD_CODES, FieldFigures, field_figures
-from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,11 +41,15 @@ class FieldResult(TaskResult):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FieldWarnings(WarningRules):
+class FieldWarnings:
     """Published anticipation metrics, for numbers beside published ones.
 
     A recording's score is as of `CleanWarnings`, of all its alarms, since dash-cam sets know recordings alone.
     """
+
+    def settings(self) -> dict[str, Any]:
+        """No choices: it is as those codes are."""
+        return {}
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""

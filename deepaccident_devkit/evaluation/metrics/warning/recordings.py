@@ -7,21 +7,22 @@ from typing import Final, Literal, get_args
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.raised import (
-    NamedAlarm,
+    Pair,
     named_alarms,
     position_difference,
     within_horizon,
 )
-from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE
+from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE, AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, AccidentContext, BoxTruth
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.predictions import Prediction, checked_prediction
-from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Kind = Literal["accident", "twins", "others"]
 """Of a recording: somebody collides; nobody does, but in the scenario's twin; nobody does, and none there is known."""
+_NEAR: Final = 10.0
+"""Metres: an alarm is right whose positions differ by less in sum from where the pair meets, as errors of `paper`."""
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 UNPLACED: Final = "unplaced"
 """In place of the kind: somebody collides, but no label shows with whom (`BoxTruth.unplaced`); such samples are counted
@@ -33,9 +34,12 @@ def sample_counts(
     prediction: Prediction,
     label: MotionLabels | None,
     context: AccidentContext,
-    rules: WarningRules,
 ) -> Counts:
     """What one sample adds, the same for all warning protocols.
+
+    An alarm for later than the horizon does not count. Unlike an accident that counts for APA, the impact may be later
+    than the model looks ahead: an early alarm with the right pair or the right place is a warning. Cells of maps are
+    coarse, so that they raise more false alarms than explicit accidents.
 
     Returns:
         `recording`: scenario and agent; `frame`: its number there; `kind` (or `UNPLACED`) and `involvement` of the
@@ -55,7 +59,7 @@ def sample_counts(
         raise EvaluationError(
             "context: warnings need to know what happens, and when; give accident_context(dataset, sample, horizon=2.0)"
         )
-    raised = named_alarms(checked_prediction(prediction), label, truth, rules)
+    raised = named_alarms(checked_prediction(prediction), label, truth, AccidentReading())
     within = within_horizon(raised, truth)
     ahead, kind = context.time_to_impact, _kind(context) if truth.unplaced is None else UNPLACED
     judged = [each for each in within if ahead is not None or each[0].time <= to_end + SLACK]
@@ -67,11 +71,11 @@ def sample_counts(
         "involvement": context.involvement,
         "ahead": None if ahead is None else round(ahead / FRAME_PERIOD),
         "to_end": None if end is None else round(end / FRAME_PERIOD),
-        "alarms": [[each[0].score, int(_is_right(each, truth, context, rules))] for each in judged],
+        "alarms": [[each[0].score, int(_is_right(*each, truth, context))] for each in judged],
         "unjudged": [each[0].score for each in within if each not in judged] if len(judged) < len(within) else [],
         "beyond": len(raised) - len(within),
         "references": [
-            surest([[each.score, int(_is_right((each, each.ids), truth, context, rules))] for each in alarms], kind)
+            surest([[each.score, int(_is_right(each, each.ids, truth, context))] for each in alarms], kind)
             for alarms in context.references.values()
         ],
     }
@@ -102,16 +106,10 @@ def _kind(context: AccidentContext) -> Kind:
     return "twins" if context.twin else "others"
 
 
-def _is_right(alarm: NamedAlarm, truth: BoxTruth, context: AccidentContext, rules: WarningRules) -> bool:
-    accident, ids = alarm
-    ahead, impact = context.time_to_impact, truth.impact
-    if ahead is None or context.pair is None:
+def _is_right(accident: Accident, ids: Pair | None, truth: BoxTruth, context: AccidentContext) -> bool:
+    """Whether an alarm names the pair that collides, in either order, or the place where they meet."""
+    if context.time_to_impact is None or context.pair is None:
         return False
-    tolerance = rules.time_tolerance
-    if tolerance is not None and abs(accident.time - ahead) > tolerance + TIE:
-        return False
-    if rules.correct_by != "place" and ids is not None and set(ids) == set(context.pair):
+    if ids is not None and set(ids) == set(context.pair):
         return True
-    if rules.correct_by == "pair" or impact is None:
-        return False
-    return position_difference(accident.positions, impact.positions) < rules.distance - TIE
+    return truth.impact is not None and position_difference(accident.positions, truth.impact.positions) < _NEAR - TIE

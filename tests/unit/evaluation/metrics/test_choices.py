@@ -39,8 +39,8 @@ class TestSwitches:
         assert (
             switched(DETECTION_PROTOCOLS["released"], {"area": None, "error_threshold": None}).error_threshold is None
         )
-        with pytest.raises(ChoiceError, match=r"switch min_score: expected a number, such as 0.0, found None"):
-            switched(TASK_PROTOCOLS["accident"]["boxes"], {"min_score": None})
+        with pytest.raises(ChoiceError, match=r"switch match_distance: expected a number, such as 4.0, found None"):
+            switched(TASK_PROTOCOLS["accident"]["paper"], {"match_distance": None})
 
     def test_lists_are_tuples_and_choices_that_go_together_alone_are_made_together(self) -> None:
         rules = DETECTION_PROTOCOLS["paper"]

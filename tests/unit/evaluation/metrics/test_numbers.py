@@ -60,8 +60,8 @@ def test_a_number_of_others_is_what_its_clusters_are(alone: list[float], expecte
     assert range_of("theirs", np.array(alone)) == expected
 
 
-def test_totals_and_settings_have_no_interval() -> None:
-    for path in ("false_recordings", "within/5/distance", "beside/a=b/within/5/distance"):
+def test_totals_settings_and_medians_have_no_interval() -> None:
+    for path in ("false_recordings", "within/5/distance", "median_warning", "beside/a=b/within/5/distance"):
         assert not has_interval(path)
     assert all(has_interval(path.replace("*", "5")) for path in HEADLINE_UNITS)
 

@@ -255,7 +255,7 @@ class TestBrokenOff:
         loaded = broken_after(None)
         self.run_of(da_b, ten, out)
         assert loaded == []
-        self.run_of(da_b, ten, out, switches={"min_score": 0.5})
+        self.run_of(da_b, ten, out, switches={"reading.danger_distance": 0.5})
         assert len(loaded) == 10
         self.run_of(da_b, write_accidents(tmp_path / "more.json", ten.tokens, moved=3.0), out)
         assert len(loaded) == 20

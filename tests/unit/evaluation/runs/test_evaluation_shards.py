@@ -193,7 +193,7 @@ class TestStale:
         self, job: Job, counted: Path, tmp_path: Path, write_accidents: Write
     ) -> None:
         others = (
-            replace(job, setup=replace(SETUP, switches={"min_score": 0.5})),
+            replace(job, setup=replace(SETUP, switches={"reading.danger_distance": 0.5})),
             replace(job, results=write_accidents(tmp_path / "moved.json", job.results.tokens, moved=3.0)),
         )
         for other in others:

@@ -188,9 +188,9 @@ class TestNamed:
         assert found(verify(bundle, da_b))[0] == ("file", "files.json")
 
     def test_another_protocol_claimed(self, bundle: Path, da_b: DeepAccident) -> None:
-        changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"min_score": 2.0}))
+        changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.present": False}))
         wheres = [where for kind, where in found(verify(bundle, da_b)) if kind == "number"]
-        assert "settings/choices/min_score" in wheres
+        assert "settings/choices/reading/present" in wheres
         assert "metrics/apa" in wheres
 
     def test_many_of_a_kind_are_counted(self) -> None:
