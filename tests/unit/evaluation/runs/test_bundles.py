@@ -83,7 +83,7 @@ def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
     switched = replace(run, setup=replace(run.setup, switches={"reading.present": False}))
     summary = switched.summary()
     assert summary["switches"] == {"reading.present": False}
-    assert summary["settings"]["choices"]["scoring"]["limit_counts"] is True
+    assert summary["settings"]["choices"]["reading"]["present"] is False
     assert summary["counts"] == {"samples": 6, "scenarios": 2, "left_out": 0}
     assert summary["metrics"]["positives"] == 3
     assert {"python", "numpy"} <= summary["environment"].keys()

@@ -119,9 +119,9 @@ class TestRefused:
         with pytest.raises(EvaluationError, match=r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the"):
             evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection)
 
-    @pytest.mark.parametrize("task", ["accident", "warning"])
+    @pytest.mark.parametrize(("task", "protocol"), [("accident", "boxes"), ("warning", "clean")])
     def test_scenarios_without_meta_are_counted_before_the_start(
-        self, da_b: DeepAccident, own_release: Path, tmp_path: Path, task: TaskName
+        self, da_b: DeepAccident, own_release: Path, tmp_path: Path, task: TaskName, protocol: str
     ) -> None:
         every = SampleSelection(split="train", samples="all", scope="all")
         silent = [scenario["token"] for scenario in da_b.find(split="train")][:1]
@@ -132,7 +132,7 @@ class TestRefused:
             for sample in every.tokens(partial):
                 writer.add(sample, [])
         with pytest.raises(EvaluationError, match=r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'"):
-            evaluate_results(partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol="boxes"), every)
+            evaluate_results(partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every)
         save_selection(partial.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
         chosen = replace(every, split=str(tmp_path / "mine.txt"))
         check_metas(partial, chosen.tokens(partial), chosen.split)
