@@ -10,10 +10,14 @@ import numpy as np
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.metrics.accident.drawn_paths import DrawnPaths
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentProtocol
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents, surest_within
-from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents, collision, padded_paths
+from deepaccident_devkit.evaluation.metrics.accident.released import (
+    DrawnPaths,
+    ReleasedAccidents,
+    collision,
+    padded_paths,
+)
 from deepaccident_devkit.evaluation.metrics.alarms.raised import named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.reading import InstanceAccident, accident_of
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext

@@ -16,9 +16,10 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
-from deepaccident_devkit.evaluation.metrics.warning.drives import (
+from deepaccident_devkit.evaluation.metrics.warning.recordings import (
     GIVEN,
     GROUPS,
+    KINDS,
     PREDICTORS,
     Drive,
     ScoresOf,
@@ -29,7 +30,6 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
     series_of,
     twin_pairs,
 )
-from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS
 from deepaccident_devkit.text import settle_choices
 
 RANDOM_DRAWS: Final = 20

@@ -12,9 +12,8 @@ from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import AnticipationResult, CleanWarnings
-from deepaccident_devkit.evaluation.metrics.warning.drives import PART, parts_of
-from deepaccident_devkit.evaluation.metrics.warning.published import FieldResult, FieldWarnings
-from deepaccident_devkit.evaluation.metrics.warning.recordings import sample_counts
+from deepaccident_devkit.evaluation.metrics.warning.field import FieldResult, FieldWarnings
+from deepaccident_devkit.evaluation.metrics.warning.recordings import PART, parts_of, sample_counts
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.text import choice
 

@@ -1,4 +1,4 @@
-"""Anticipation metrics as four published evaluations compute them, with all of their quirks.
+"""`FieldWarnings`: the protocol `field`, what four published codes of anticipation compute, with all of their quirks.
 
 UString (Bao et al. 2020), DSTA (Karim et al. 2022), DRIVE (Bao et al. 2021) and DAD (Chan et al. 2016) print numbers of
 one name that are not comparable with each other; docs/protocols.md says what is odd in each. They are here so that a
@@ -8,13 +8,24 @@ number can be put beside a published one. To rank predictors take the protocol `
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts
+from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
+from deepaccident_devkit.evaluation.metrics.warning.recordings import (
+    GIVEN,
+    PREDICTORS,
+    by_group,
+    drives_of,
+    left_out_notes,
+    parts_of,
+    series_of,
+)
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 from deepaccident_devkit.text import choice
 
@@ -265,3 +276,57 @@ def _nothing(code: FieldCode, why: str) -> FieldFigures:
         "drive": dict.fromkeys(("precision_at_half", "recall_at_half", "time_at_half"), math.nan),
     }.get(code, {})
     return FieldFigures(average_precision=math.nan, mean_time=math.nan, time_at_r80=math.nan, note=why, **known)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldResult(TaskResult):
+    """The result of the protocol `field`: not comparable between codes, and predictors that know nothing can win.
+
+    Attributes:
+        samples: how many.
+        figures: code and involvement of the agent, such as `ustring ego_involved` → what that code prints.
+        references: predictor (of `PREDICTORS` but the given one) → the same.
+        beyond: alarms for later than the horizon, which do not count.
+        notes: sentences that a reader of the numbers should know: why numbers are NaN.
+    """
+
+    task: ClassVar[str] = "warning"
+    samples: int
+    figures: Mapping[str, FieldFigures]
+    references: Mapping[str, Mapping[str, FieldFigures]]
+    beyond: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldWarnings:
+    """Published anticipation metrics, for numbers beside published ones.
+
+    A recording's score is as of `CleanWarnings`, of all its alarms, since dash-cam sets know recordings alone.
+    """
+
+    def settings(self) -> dict[str, Any]:
+        """No choices: it is as those codes are."""
+        return {}
+
+    def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
+        """The metrics of some samples' counts, with those of the reference predictors or without."""
+        parts = parts_of(counts)
+        groups, samples = dict(by_group(drives_of(parts))), [sample for part in parts for sample in part]
+        made = {
+            predictor: {
+                f"{code} {group}": field_figures(series_of(those, predictor, "recording"), code)
+                for group, those in groups.items()
+                for code in FIELD_CODES
+            }
+            for predictor in (PREDICTORS if references else PREDICTORS[:1])
+        }
+        given = made.pop(GIVEN)
+        notes = [*left_out_notes(samples), *(f"{name}: {each.note}" for name, each in given.items() if each.note)]
+        return FieldResult(
+            samples=len(samples),
+            figures=given,
+            references=made,
+            beyond=sum(each["beyond"] for each in samples),
+            notes=(*notes, "times and precisions of different codes are not comparable; the protocol clean ranks"),
+        )

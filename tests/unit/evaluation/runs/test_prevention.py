@@ -21,8 +21,8 @@ from deepaccident_devkit.evaluation import (
     WarningEvaluator,
     accident_context,
 )
-from deepaccident_devkit.evaluation.metrics.warning.drives import REFERENCES
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.recordings import REFERENCES
 from deepaccident_devkit.evaluation.runs import prevented_accidents, with_prevented
 from deepaccident_devkit.evaluation.runs.prevention import accident_outcomes
 from deepaccident_devkit.evaluation.runs.prevention_text import prevention_tables, prevention_text

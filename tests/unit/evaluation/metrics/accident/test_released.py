@@ -11,12 +11,14 @@ from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS, AccidentContext, AccidentEvaluator
-from deepaccident_devkit.evaluation.metrics.accident.drawn_paths import DrawnPaths, paths_of_heads, paths_of_instances
 from deepaccident_devkit.evaluation.metrics.accident.released import (
+    DrawnPaths,
     ReleasedAccidents,
     accident_counts,
     collision,
     padded_paths,
+    paths_of_heads,
+    paths_of_instances,
 )
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid

@@ -14,7 +14,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context
 from deepaccident_devkit.evaluation.metrics.alarms import truth
-from deepaccident_devkit.evaluation.metrics.alarms.constant_velocity import constant_velocity_alarms
+from deepaccident_devkit.evaluation.metrics.alarms.truth import constant_velocity_alarms
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
 from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.evaluation.metrics.warning import (
@@ -28,8 +28,7 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     printed_figures,
 )
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import mean_of
-from deepaccident_devkit.evaluation.metrics.warning.drives import REFERENCES, TRIVIAL
-from deepaccident_devkit.evaluation.metrics.warning.recordings import surest
+from deepaccident_devkit.evaluation.metrics.warning.recordings import REFERENCES, TRIVIAL, surest
 
 PAIR = (11, 22)
 MEETING = np.array([[20.0, 10.0], [16.0, 10.0]])

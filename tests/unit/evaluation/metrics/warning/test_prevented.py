@@ -20,7 +20,7 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     PreventedResult,
     anticipation,
 )
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Skipped
 
 FRAMES = np.arange(1, 62, 5)
