@@ -43,11 +43,11 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
     """
     changes: dict[str, Any] = {}
     parts: dict[str, dict[str, Any]] = {}
+    names = switch_names(rules)
     for name, value in switches.items():
-        if name not in switch_names(rules):
-            raise ChoiceError(
-                f"{type(rules).__name__} has no switch {name!r}; there are {possible_text(name, switch_names(rules))}"
-            )
+        if name not in names:
+            there = f"there are {possible_text(name, names)}" if names else "it has none"
+            raise ChoiceError(f"{type(rules).__name__} has no switch {name!r}; {there}")
         head, _, rest = name.partition(".")
         if rest:
             parts.setdefault(head, {})[rest] = value

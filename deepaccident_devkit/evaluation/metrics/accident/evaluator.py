@@ -68,7 +68,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The protocol, its choices, and whether they are explained."""
+        """The protocol and its choices."""
         return {
             "protocol": type(self.protocol).__name__,
             "choices": self.protocol.settings(),

@@ -64,3 +64,7 @@ class TestSwitches:
     def test_refused(self, switches: dict[str, Any], sentence: str) -> None:
         with pytest.raises(ChoiceError, match=sentence):
             switched(PaperAccidents(), switches)
+
+    def test_a_protocol_without_any(self) -> None:
+        with pytest.raises(ChoiceError, match="FieldWarnings has no switch 'scores_of'; it has none"):
+            switched(TASK_PROTOCOLS["warning"]["field"], {"scores_of": "pair"})
