@@ -3,12 +3,19 @@
 import re
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.metrics.accident import AccidentEvaluator, AccidentResult, accident_context
+from deepaccident_devkit.evaluation.metrics.accident import (
+    PROTOCOLS,
+    AccidentEvaluator,
+    AccidentResult,
+    accident_context,
+)
+from deepaccident_devkit.evaluation.metrics.choices import switched
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionHeads
 from deepaccident_devkit.synth import SynthConfig, make_release
@@ -18,6 +25,27 @@ HERE = Path(__file__).parent
 PAGE, TESTS = HERE / "protocols.md", HERE.parent / "tests"
 RELEASE = SynthConfig(scenarios=24, frames=40, seed=12, sensors=False)
 HORIZON = 2.0
+PAPER_CHOICES: tuple[tuple[str, object], ...] = (
+    ("reading.foreground", "sigmoid"),
+    ("reading.link_distance", 3.0),
+    ("reading.link_distance", 8.0),
+    ("reading.redraw", True),
+    ("reading.outline", "cells"),
+    ("reading.danger_distance", 0.5),
+    ("reading.danger_distance", 1.5),
+    ("reading.danger_distance", 2.5),
+    ("reading.present", False),
+    ("reading.moment", "first"),
+    ("reading.moment", "last"),
+    ("predicted_by", "mean"),
+    ("sample_choice", "mean_first"),
+    ("position_time", "truth"),
+    ("match_distance", 2.0),
+    ("match_distance", 8.0),
+    ("scoring.errors_at", 5.0),
+    ("scoring.errors_at", 15.0),
+    ("scoring.far_is_missed", False),
+)
 
 
 def main() -> None:
@@ -33,16 +61,22 @@ def golden_table() -> str:
     from parity.test_accident import heads_of, label_of
 
     folder = TESTS / "data" / "golden"
-    released, paper = AccidentEvaluator("released"), AccidentEvaluator("paper", explain=True)
+    evaluators = {"`released`": AccidentEvaluator("released"), "**`paper`**": AccidentEvaluator("paper")}
+    evaluators |= changed("paper", PAPER_CHOICES)
     for index in range(len(GoldenCase(folder, "d_accident", "samples", None).whole["samples"])):
         case = GoldenCase(folder, "d_accident", "samples", index)
         label = label_of(case, "devkit")
         output = MotionOutput(grid=label.config.grid, heads=heads_of(case, "devkit"))
-        for evaluator in (released, paper):
+        for evaluator in evaluators.values():
             evaluator.update(f"sample {index}", output, label)
-    rows = {"`released`": released.compute(), "**`paper`**": paper.compute()}
-    rows |= {f"`{name}`": result for name, result in paper.explained().items()}
+    rows = {name: evaluator.compute() for name, evaluator in evaluators.items()}
     return table(rows, "protocol, or the choice of `paper` that is changed")
+
+
+def changed(protocol: str, choices: Iterable[tuple[str, object]]) -> dict[str, AccidentEvaluator]:
+    """An evaluator for each choice of a protocol that is changed."""
+    rules = PROTOCOLS[protocol]
+    return {f"`{name}={value}`": AccidentEvaluator(switched(rules, {name: value})) for name, value in choices}
 
 
 def perfect_table() -> str:

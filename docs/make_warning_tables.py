@@ -19,8 +19,7 @@ from deepaccident_devkit.baselines import outlook
 from deepaccident_devkit.baselines.collisions import accidents_ahead
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, WarningEvaluator
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, accident_context
-from deepaccident_devkit.evaluation.metrics.warning import FieldQuirks, FieldWarnings
-from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN
+from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.synth import SynthConfig, make_release
 
@@ -40,8 +39,7 @@ def main() -> None:
 
 def measure(dataset: DeepAccident) -> None:
     """Of all samples of the split, two a second, each predictor through each protocol."""
-    protocols = {"clean": "clean", "boxes": "boxes", "field": FieldWarnings(quirks=FieldQuirks(nonsense_kept=True))}
-    warned = {name: {kind: WarningEvaluator(each) for kind, each in protocols.items()} for name in PREDICTORS}
+    warned = {name: {kind: WarningEvaluator(kind) for kind in ("clean", "field")} for name in PREDICTORS}
     accidents = {(name, when): AccidentEvaluator("boxes") for name in PREDICTORS for when in ("before", "after")}
     for token in dataset.samples(SPLIT, "all"):
         context = accident_context(dataset, token, HORIZON, references=True)
@@ -53,10 +51,9 @@ def measure(dataset: DeepAccident) -> None:
             accidents[name, "before"].update(token, alarms, None, as_before(context))
     results = {name: {kind: each.compute() for kind, each in those.items()} for name, those in warned.items()}
     put("warning-clean", beside({name: each["clean"].as_dict() for name, each in results.items()}, GROUP))
-    for code in ("ustring", "drive", "dad"):
+    for code in ("drive", "dad"):
         fields = {name: each["field"].as_dict() for name, each in results.items()}
         put(f"warning-{code}", beside(fields, f"{code} {GROUP}"))
-    put("warning-boxes", boxes_table({name: each["boxes"] for name, each in results.items()}))
     make_accident_tables.PAGE = HERE.parent / "CHANGELOG.md"
     put("boxes-before-and-after", changes({key: each.compute() for key, each in accidents.items()}))
 
@@ -112,17 +109,6 @@ def beside(results: Mapping[str, dict], group: str) -> str:
         lines += [_line((name, *row[1:])) for row in rows if row[0] == GIVEN]
         references = [row for row in rows[1:] if row[0] != GIVEN]
     return "\n".join([*lines, *map(_line, references)])
-
-
-def boxes_table(results: Mapping[str, object]) -> str:
-    """The protocol `boxes`."""
-    head = ("predictor", "recording precision", "time in alarm, normal", "false alarms a minute", "warned", "tta0 (s)")
-    lines = [_line(head), "|---" * len(head) + "|"]
-    for name, each in results.items():
-        false = each.false_alarms_per_minute["normal"]
-        numbers = (each.recording_precision, each.time_in_alarm["normal"], false, each.warned_share, each.tta0)
-        lines.append(_line((name, *map(_number, numbers))))
-    return "\n".join(lines)
 
 
 def changes(results: Mapping[tuple[str, str], object]) -> str:

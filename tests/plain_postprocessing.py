@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
-from deepaccident_devkit.motion.postprocessing.predict import PostProcessing
+from deepaccident_devkit.motion.postprocessing.predict import FOREGROUND_THRESHOLD, PostProcessing
 
 F = np.float32
 
@@ -44,8 +44,8 @@ def is_actor(logits: np.ndarray, settings: PostProcessing, t: int, r: int, c: in
     if settings.foreground == "argmax":
         return actor > background
     if logits.max() == 10 and logits.min() == 0:
-        return actor > settings.foreground_threshold
-    return 1 / (1 + math.exp(-actor)) > settings.foreground_threshold
+        return actor > FOREGROUND_THRESHOLD
+    return 1 / (1 + math.exp(-actor)) > FOREGROUND_THRESHOLD
 
 
 def linked(raw: np.ndarray, flow: np.ndarray, distance: float) -> np.ndarray:

@@ -102,7 +102,7 @@ def bundle(da_motion: DeepAccident, folder: Path, accidents: Path) -> Path:
     out = folder / "bundle"
     evaluate(
         *("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes", "--out", out),
-        *("--sanity", "--explain", "--include-results"),
+        *("--sanity", "--include-results"),
     )
     return out
 
@@ -121,7 +121,6 @@ def bundle(da_motion: DeepAccident, folder: Path, accidents: Path) -> Path:
         ("detection", "boxes", "paper", "mAP"),
         ("detection", "boxes", "opencood", "mAP"),
         ("warning", "accidents", "clean", "auc_ahead ego_involved"),
-        ("warning", "accidents", "boxes", "warned_share"),
         ("warning", "accidents", "field", "AP ustring ego_involved"),
     ],
 )
@@ -145,7 +144,6 @@ def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: De
     }
     summary = read_bundle(bundle).summary
     assert summary["sanity"]["samples"] == 8
-    assert summary["explanation"]["protocol"].startswith("boxes")
     assert summary["release"]["dataroot"] == str(da_motion.dataroot)
     assert (bundle / "results" / accidents.name).read_bytes() == accidents.read_bytes()
     assert not bundle.with_name("bundle.unfinished").exists()
@@ -153,7 +151,7 @@ def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: De
 
 def test_parts_write_what_one_run_does(da_motion: DeepAccident, accidents: Path, bundle: Path, tmp_path: Path) -> None:
     words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
-    words = (*words, "--sanity", "--explain", "--include-results", "--out", tmp_path / "parts")
+    words = (*words, "--sanity", "--include-results", "--out", tmp_path / "parts")
     assert evaluate(*words, "--shard", "1/2").stdout == "part 1/2: 8 samples; next: the same with --merge\n"
     done = evaluate(*words, "--shard", "2/2", "--json")
     assert (done.stdout, done.stderr.splitlines()[-1]) == ("", "part 2/2: 0 samples; next: the same with --merge")
@@ -173,10 +171,10 @@ def test_parts_need_a_folder(da_motion: DeepAccident, accidents: Path, part: tup
 
 def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path: Path) -> None:
     words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
-    done = evaluate(*words, "--by", "town", "--switch", "scoring.limit_counts=true", "--json", "--out", tmp_path / "b")
+    done = evaluate(*words, "--by", "town", "--switch", "reading.present=false", "--json", "--out", tmp_path / "b")
     summary = json.loads(done.stdout)
     assert list(summary["breakdowns"]) == ["all", "town"]
-    assert summary["switches"] == {"scoring.limit_counts": True}
+    assert summary["switches"] == {"reading.present": False}
     assert summary == read_bundle(tmp_path / "b").summary
     assert f"written: {tmp_path / 'b'}" in done.stderr
 
@@ -187,7 +185,7 @@ def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path:
         ("motion", "released", write_motion, "iou 100x100 100.00 %"),
         ("accident", "boxes", write_accidents, "apa 1.000"),
         ("detection", "released", write_boxes, "AP car 97.22 %"),
-        ("warning", "boxes", write_accidents, "warned_share 1.000"),
+        ("warning", "clean", write_accidents, "recall ego_involved 1.000"),
     ],
 )
 def test_a_partial_download_is_evaluated_and_its_report_has_pictures(
@@ -350,9 +348,9 @@ class TestRefused:
         [
             (("--switch", "gap=3"), ChoiceError, r"BoxAccidents has no switch 'gap'"),
             (
-                ("--switch", "min_score=high"),
+                ("--switch", "reading.danger_distance=high"),
                 ChoiceError,
-                r"switch min_score: expected a number, such as 0.0, found 'hi",
+                r"switch danger_distance: expected a number, such as 1.0, found 'hi",
             ),
             (("--split", "nowhere"), ChoiceError, r"split: expected one of train, val"),
             (("--agents", "ego"), ChoiceError, r"--agents: expected one of ego_vehicle, .*did you mean 'ego_vehicle'"),
@@ -367,7 +365,7 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
-            (("--switch", "min_score"), "--switch: expected NAME=VALUE, found 'min_score'"),
+            (("--switch", "reading.present"), "--switch: expected NAME=VALUE, found 'reading.present'"),
             (("--by", "wether"), "Invalid value for '--by'"),
             (("--protocol", "boxy"), "Invalid value for '--protocol'"),
         ],
@@ -387,7 +385,7 @@ def test_tasks_have_the_grammar_of_all_verbs_on_a_release() -> None:
         text = evaluate(name, "--help").output
         for word in ("DATAROOT", "--version", "--index-dir", "--workers", "--on-error", "--results", "--protocol"):
             assert word in text
-    assert "[clean|boxes|field]" in evaluate("warning", "--help").output
+    assert "[clean|field]" in evaluate("warning", "--help").output
 
 
 def test_the_group_names_its_verbs() -> None:

@@ -30,9 +30,6 @@ from deepaccident_devkit.evaluation.metrics.trajectories import TrajectoryRules
 from deepaccident_devkit.evaluation.metrics.warning import (
     WARNING_PROTOCOLS,
     CleanWarnings,
-    FieldQuirks,
-    FieldWarnings,
-    WarningProtocol,
 )
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
@@ -214,10 +211,7 @@ def test_the_commands_of_the_gallery_run(da_motion: DeepAccident, in_demo: Path)
         AccidentReading,
         Scoring,
         BoxAccidents,
-        WarningProtocol,
         CleanWarnings,
-        FieldWarnings,
-        FieldQuirks,
     ],
 )
 def test_every_choice_of_the_metrics_is_explained(choices: type[Any]) -> None:

@@ -36,12 +36,10 @@ from deepaccident_devkit.evaluation.runs import (
     checked_target,
     evaluate_results,
     evaluate_shard,
-    explanation_checkpoint,
     save_run,
     summary_text,
     with_prevented,
 )
-from deepaccident_devkit.evaluation.runs.explanation import explain
 from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
@@ -147,9 +145,6 @@ def _task_verb(task: TaskName) -> click.Command:
         "--sanity", is_flag=True, help="Test whether the predictions are mirrored, rotated, shifted, scaled, …"
     )
     @click.option(
-        "--explain", "explained", is_flag=True, help="Show how much each field of the protocol changes the numbers."
-    )
-    @click.option(
         "--out", type=click.Path(path_type=Path), help="Folder to write all numbers, figures and a report into."
     )
     @click.option("--overwrite", is_flag=True, help="Replace an evaluation that is already in --out.")
@@ -190,14 +185,16 @@ def _evaluate(
     run = run.broken_down((EVERYTHING, *(by or breakdowns_of(setup.task))), resampling, **engine)
     if options.get("prevented"):
         run = with_prevented(run, dataset, resampling, progress=True, **engine)
-    run, texts = _examined(run, dataset, opened, options)
+    text = ""
+    if options["sanity"]:
+        run, text = _with_sanity(run, dataset, opened, options)
     if out is not None:
         report = partial(save_report, run, dataset=dataset, results=opened)
         kept = {name: options[name] for name in ("include_results", "overwrite")}
         out = save_run(run, out, **kept, extras=[report])
     summary = run.summary()
     shown = summary_text(summary, by or SHOWN_BREAKDOWNS)
-    click.echo(json.dumps(summary, indent=1) if as_json else "\n\n".join([shown, *texts]))
+    click.echo(json.dumps(summary, indent=1) if as_json else f"{shown}\n\n{text}".strip())
     if out is not None:
         click.echo(f"written: {out}", err=as_json)
 
@@ -223,23 +220,13 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any], part: Part) 
         refuse_unused("with --samples all: detections are of the present", "horizon")
 
 
-def _examined(
+def _with_sanity(
     run: EvaluationRun, dataset: DeepAccident, results: Results, options: dict[str, Any]
-) -> tuple[EvaluationRun, list[str]]:
-    """The run with the requested checks (sanity, explanation), and their texts."""
-    texts, tokens = [], sorted(run.evaluator.tokens)
-    engine = engine_of(options)
-    if options["sanity"]:
-        report = check_sanity(dataset, results, run.setup, tokens, **engine)
-        run = replace(run, sanity=report.as_dict())
-        texts.append(report.to_text())
-    if options["explained"]:
-        checkpoint = None if options["out"] is None else explanation_checkpoint(run, options["out"])
-        explanation = explain(dataset, results, run.setup, tokens, progress=True, checkpoint=checkpoint, **engine)
-        run = replace(run, explanation=explanation.as_dict())
-        texts.append(explanation.to_text())
+) -> tuple[EvaluationRun, str]:
+    """The run with its sanity check, and the check's text."""
+    report = check_sanity(dataset, results, run.setup, sorted(run.evaluator.tokens), **engine_of(options))
     mark = "" if run.partial is None else f"{run.partial.text()}\n"
-    return run, [f"{mark}{text}" for text in texts]
+    return replace(run, sanity=report.as_dict()), f"{mark}{report.to_text()}"
 
 
 for name in get_args(TaskName):

@@ -1,8 +1,8 @@
 """The official metrics, and those that the paper describes: motion, accidents, detection, segmentation from above.
 
 Three rooms: `metrics` counts arrays and sums the counts, a package a task; `results` are predictions in files; `runs`
-evaluates them into bundles that others can check, and tells why a number is what it is (`runs.sanity`,
-`runs.explanation`). `breakdown` sums by attribute; `metrics.warning` says how early accidents are warned of.
+evaluates them into bundles that others can check, and looks for mistakes in predictions (`runs.sanity`). `breakdown`
+sums by attribute; `metrics.warning` says how early accidents are warned of.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -42,7 +42,6 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     FieldResult,
     FieldWarnings,
     WarningEvaluator,
-    WarningResult,
 )
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 
@@ -77,7 +76,6 @@ __all__ = [
     "ResultsWriter",
     "SampleAttributes",
     "WarningEvaluator",
-    "WarningResult",
     "accident_context",
     "accidents_of",
     "box_truth",

@@ -18,7 +18,7 @@ SETUPS = (
     EvaluationSetup(task="motion"),
     EvaluationSetup(task="accident", protocol="paper"),
     EvaluationSetup(task="detection", protocol="released_iou"),
-    EvaluationSetup(task="warning", protocol="boxes"),
+    EvaluationSetup(task="warning", protocol="clean"),
 )
 
 

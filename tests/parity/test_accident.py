@@ -19,9 +19,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from parity.conftest import GoldenCase
 
 from deepaccident_devkit.evaluation.metrics.accident import AccidentEvaluator
-from deepaccident_devkit.evaluation.metrics.accident.drawn_paths import DrawnPaths, paths_of_heads
 from deepaccident_devkit.evaluation.metrics.accident.outlines import pair_gaps
-from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents, accident_counts
+from deepaccident_devkit.evaluation.metrics.accident.released import (
+    DrawnPaths,
+    ReleasedAccidents,
+    accident_counts,
+    paths_of_heads,
+)
 from deepaccident_devkit.evaluation.metrics.frames import first_frames
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabelConfig, MotionLabels, predict_instances

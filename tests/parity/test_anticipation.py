@@ -1,4 +1,4 @@
-"""The golden anticipation (tests/data/golden/safety): four published evaluations, and without their quirks.
+"""The golden anticipation (tests/data/golden/safety): four published evaluations, and `clean`.
 
 UString, DSTA, DRIVE and DAD were run with their sorts made stable, `clean` is plain code with scikit-learn's AP and AUC
 (tests/data/golden/safety/README.md). All numbers to 1e-9; where a published code raised an error the devkit says NaN.
@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepaccident_devkit.evaluation.metrics.warning import FieldQuirks, ScoreSeries, field_figures
+from deepaccident_devkit.evaluation.metrics.warning import ScoreSeries, printed_figures
 from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores
 
-AS_PUBLISHED = FieldQuirks(nonsense_kept=True)
 FIELD_NAMES = {
     "AP": "average_precision",
     "AP_frame": "average_precision",
@@ -87,7 +86,7 @@ def same(found: float | None, expected: float | None, what: str) -> None:
 def test_as_the_published_codes(golden, case: str, code: str) -> None:
     entry, arrays = golden
     expected = entry[code]
-    figures = field_figures(series_of(entry, arrays, cut=False), code.removesuffix("_stable"), AS_PUBLISHED)
+    figures = printed_figures(series_of(entry, arrays, cut=False), code.removesuffix("_stable"))
     if "error" in expected:
         assert math.isnan(figures.average_precision)
         assert math.isnan(figures.mean_time)

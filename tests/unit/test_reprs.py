@@ -105,7 +105,6 @@ OWN = {
     "MotionHeads": heads,
     "MotionLabels": labels,
     "MotionResult": lambda: MotionEvaluator().compute(),
-    "WarningResult": lambda: WarningEvaluator("boxes").compute(),
     "MotionOutput": lambda: MotionOutput(grid=GRID, heads=(heads(), heads())),
     "SE3": SE3.identity,
 }

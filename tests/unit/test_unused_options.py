@@ -22,8 +22,8 @@ CASES = [
         "--resamples changes nothing with --protocol field, which has no intervals",
     ),
     (
-        EVALUATE.format("warning") + " --protocol boxes --prevented",
-        "--prevented needs the scores of whole recordings, which --protocol boxes does not have; give --protocol clean",
+        EVALUATE.format("warning") + " --protocol field --prevented",
+        "--prevented needs the scores of whole recordings, which --protocol field does not have; give --protocol clean",
     ),
     (EVALUATE.format("detection") + " --samples all --horizon 3", "--horizon changes nothing with --samples all"),
     ("evaluate validate results --split val", "--split changes nothing without --dataroot"),

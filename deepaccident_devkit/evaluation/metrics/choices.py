@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -43,11 +43,11 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
     """
     changes: dict[str, Any] = {}
     parts: dict[str, dict[str, Any]] = {}
+    names = switch_names(rules)
     for name, value in switches.items():
-        if name not in switch_names(rules):
-            raise ChoiceError(
-                f"{type(rules).__name__} has no switch {name!r}; there are {possible_text(name, switch_names(rules))}"
-            )
+        if name not in names:
+            there = f"there are {possible_text(name, names)}" if names else "it has none"
+            raise ChoiceError(f"{type(rules).__name__} has no switch {name!r}; {there}")
         head, _, rest = name.partition(".")
         if rest:
             parts.setdefault(head, {})[rest] = value
@@ -71,26 +71,3 @@ def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any
 def as_tuples(value: Any) -> Any:
     """Lists as tuples, so that protocols can be compared and looked up by."""
     return tuple(as_tuples(each) for each in value) if isinstance(value, list | tuple) else value
-
-
-def with_others(rules: Rules, others: Mapping[str, Sequence[Any]]) -> dict[str, Rules]:
-    """A dataclass with one field changed at a time, by `name=value`.
-
-    Args:
-        rules: the dataclass.
-        others: values by field; the one that the rules have is left out.
-    """
-    return {
-        f"{name}={value}": replace(rules, **{name: value})
-        for name, values in others.items()
-        for value in values
-        if value != getattr(rules, name)
-    }
-
-
-def with_parts(rules: Rules, name: str, parts: Mapping[str, Any]) -> dict[str, Rules]:
-    """A dataclass with a part changed to each of some others, by the part's name and theirs: `reading.outline=cells`.
-
-    So `switched` calls these choices, too.
-    """
-    return {f"{name}.{key}": replace(rules, **{name: part}) for key, part in parts.items()}

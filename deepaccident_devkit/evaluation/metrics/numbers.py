@@ -22,15 +22,11 @@ _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
         "mean_iou": "%",
         "iou/*": "%",
         "path_accuracy": "share",
-        "lasting_share": "share",
-        "mean_lasting": "s",
-        "mean_reach": "s",
         "area_under_curve": "share",
         "mean_time": "s",
         "recall": "share",
         "precision": "share",
         "time_in_alarm": "share",
-        "time_in_alarm/*": "share",
         "early_share": "share",
         "tta_hit": "s",
         "tta0": "s",
@@ -40,7 +36,6 @@ _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
         "precision_at_*": "share",
         "recall_at_half": "share",
         "alarm_seconds_per_minute": "1/min",
-        "alarm_seconds_per_minute/*": "1/min",
         "episodes_per_minute": "1/min",
         "shares/*": "share",
         "warned": "share",
@@ -52,7 +47,7 @@ _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
 _SIGNED: Final = ("lateness",)
 """Numbers with a unit that can be below 0."""
 _WITHOUT: Final = (
-    *("minutes", "minutes/*", "false_recordings"),
+    "false_recordings",
     *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
     "median_*",
 )

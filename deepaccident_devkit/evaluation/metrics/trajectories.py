@@ -29,6 +29,8 @@ from deepaccident_devkit.motion.orientations import cells_in
 Paths = Mapping[int, FloatArray]
 GATE: Final = 4.0
 """Metres, the mean over the frames, within which two paths can be the same."""
+_ADE_LIMIT, _FDE_LIMIT = 8.0, 10.0
+"""Metres: a larger mean error, or final error, counts as this."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,15 +167,11 @@ class TrajectoryRules:
     """The choices of the errors; the defaults are the released ones.
 
     Attributes:
-        ade_limit: metres; a larger mean error counts as this.
-        fde_limit: metres; a larger final error counts as this.
         miss_distance: metres; a larger final error is a miss.
         first_prediction_empty_ends: the released quirk: where the first prediction has no path at all, the sample
             does not count, even if other predictions have paths.
     """
 
-    ade_limit: float = 8.0
-    fde_limit: float = 10.0
     miss_distance: float = 5.0
     first_prediction_empty_ends: bool = True
 
@@ -207,7 +205,7 @@ def trajectory_errors(
         predictions: K times id → (≥ T, 2) metres.
         truth: id → (T, 2) metres.
         matches: of each prediction with the truth.
-        rules: limits and quirks.
+        rules: what is a miss, and a quirk.
     """
     ade, fde, missed, count = 0.0, 0.0, 0, 0
     frames = longest(truth)
@@ -222,8 +220,8 @@ def trajectory_errors(
         ]
         if errors:
             best = min(errors, key=lambda each: each.item(-1))
-            ade += min(sum(best.tolist()) / frames, rules.ade_limit)
-            fde += min(best.item(-1), rules.fde_limit)
+            ade += min(sum(best.tolist()) / frames, _ADE_LIMIT)
+            fde += min(best.item(-1), _FDE_LIMIT)
             missed += best.item(-1) > rules.miss_distance
             count += 1
     return TrajectoryErrors(ade=ade, fde=fde, missed=missed, count=count)

@@ -5,7 +5,6 @@ says which differences of two are real.
 """
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
-from deepaccident_devkit.evaluation.runs.checkpoints import explanation_checkpoint
 from deepaccident_devkit.evaluation.runs.compare import compare_bundles
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
 from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
@@ -47,7 +46,6 @@ __all__ = [
     "default_selection",
     "evaluate_results",
     "evaluate_shard",
-    "explanation_checkpoint",
     "prevented_accidents",
     "read_bundle",
     "read_rows",

@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
@@ -16,9 +16,6 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Shard, ShardFiles, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
-
-if TYPE_CHECKING:
-    from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 
 _ENDING: Final = ".counts.json"
 _OF_SHARD: Final = re.compile(rf"[0-9a-f]+\.([1-9]\d{{0,8}})-of-([1-9]\d{{0,8}}){re.escape(_ENDING)}", re.ASCII)
@@ -29,7 +26,6 @@ def checkpoint_path(
     setup: EvaluationSetup,
     tokens: Collection[str],
     fingerprints: Mapping[str, str],
-    purpose: str = "evaluation",
     *,
     shard: Shard | None = None,
 ) -> Path:
@@ -43,7 +39,6 @@ def checkpoint_path(
         setup: task and rules.
         tokens: the samples.
         fingerprints: of the predictions and of the labels.
-        purpose: what is counted, where that is something else than the evaluation itself.
         shard: the part that the samples are of; None for all.
     """
     name = digest_of(
@@ -52,17 +47,10 @@ def checkpoint_path(
             "setup": setup.as_dict(),
             "tokens": sorted(tokens),
             "fingerprints": dict(fingerprints),
-            "purpose": purpose,
         }
     )
     files = ShardFiles(_absolute(out), name, _ENDING)
     return files.folder / f"{name}{_ENDING}" if shard is None else files.path(shard)
-
-
-def explanation_checkpoint(run: EvaluationRun, out: str | os.PathLike[str]) -> Path:
-    """The same file for the explanation of a run (`explain`), which takes longer than the run itself."""
-    fingerprints = {"results": run.results.fingerprint, "release": run.release.fingerprint}
-    return checkpoint_path(out, run.setup, run.evaluator.tokens, fingerprints, "explanation")
 
 
 def stored_shards(out: str | os.PathLike[str]) -> list[Shard]:

@@ -142,7 +142,6 @@ class EvaluationRun:
         release: whose labels are the truth.
         results: whose predictions they are.
         sanity: what the sanity check says, as JSON holds it; None without.
-        explanation: what each choice of the protocol changes, likewise.
         prevented: of warnings, the accidents that they would have prevented, as one group `all` with intervals; None
             without (`prevention.with_prevented`).
     """
@@ -158,7 +157,6 @@ class EvaluationRun:
     release: ReleaseInfo
     results: ResultsInfo
     sanity: Mapping[str, Any] | None = None
-    explanation: Mapping[str, Any] | None = None
     left_out: int = 0
     prevented: Breakdown[PreventedResult] | None = None
 
@@ -250,7 +248,6 @@ class EvaluationRun:
                 **{name: installed_version(name) for name in _LIBRARIES},
             },
             "sanity": self.sanity,
-            "explanation": self.explanation,
             **({} if self.prevented is None else {"prevented": _prevented(self.prevented)}),
         }
         plain_form: dict[str, Any] = json.loads(json.dumps(plain(made)))

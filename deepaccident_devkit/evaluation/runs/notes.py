@@ -28,7 +28,7 @@ def reading_notes(summary: Json) -> list[str]:
     elif summary["task"] == "detection" and released:
         notes.append(
             "released: hidden boxes are truth, a class without true boxes counts as 0, velocities are compared with "
-            "the label's raw ones; --explain shows the effect of each choice, --protocol paper leaves these out"
+            "the label's raw ones; --protocol paper leaves these out"
         )
     return notes
 

@@ -18,9 +18,8 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import LATENCIES
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import AccidentOutcomes, OutcomeTable
 from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
-from deepaccident_devkit.evaluation.metrics.warning.prevention import PreventedResult
+from deepaccident_devkit.evaluation.metrics.warning.prevention import AccidentOutcomes, OutcomeTable, PreventedResult
 from deepaccident_devkit.evaluation.metrics.warning.recordings import UNPLACED
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.parallel import Places, in_order, run_unordered

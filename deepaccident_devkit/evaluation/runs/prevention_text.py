@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN
 from deepaccident_devkit.evaluation.runs.predictors import PredictorTable, number_text
 from deepaccident_devkit.safety import OUTCOMES
 from deepaccident_devkit.text import columns_text

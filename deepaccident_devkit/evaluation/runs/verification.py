@@ -46,7 +46,6 @@ _NOT_COMPARED: Final = (
     "devkit_version",
     "environment",
     "sanity",
-    "explanation",
     "release/dataroot",
     "results/path",
     "results/fingerprint",
@@ -278,8 +277,8 @@ def _notes(bundle: Bundle, run: EvaluationRun | None, found: Sequence[Difference
             "numbers are made of the index, which does not see that a file was edited in place; bring it up to date "
             "with: deepaccident index DATAROOT --check"
         )
-    if any(bundle.summary.get(name) is not None for name in ("sanity", "explanation")):
-        yield "the sanity check and the explanation are not made again"
+    if bundle.summary.get("sanity") is not None:
+        yield "the sanity check is not made again"
     if run is None:
         return
     here = run.summary()["environment"]

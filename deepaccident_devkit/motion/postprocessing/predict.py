@@ -24,7 +24,8 @@ from deepaccident_devkit.motion.settings import count, flag, number
 from deepaccident_devkit.text import choice
 
 Foreground = Literal["argmax", "sigmoid"]
-_BETWEEN: Final = (math.ulp(0.0), math.nextafter(1.0, 0.0))
+FOREGROUND_THRESHOLD: Final = 0.4
+"""Sigmoid of an actor's logit that a cell of the foreground `sigmoid` must exceed."""
 _MOST_CENTERS: Final = 2**24
 
 
@@ -36,8 +37,7 @@ class PostProcessing:
 
     Attributes:
         foreground: which cells are actors: `argmax` of both logits (background where they are equal), or `sigmoid`:
-            those whose actor logit's sigmoid exceeds the threshold, whatever the background's is.
-        foreground_threshold: for `sigmoid`; a cell must exceed it.
+            those whose actor logit's sigmoid exceeds `FOREGROUND_THRESHOLD`, whatever the background's is.
         labels_bypass_sigmoid: with `sigmoid`, if the highest of all logits is 10 and the lowest 0, they are treated as
             labels (`MotionHeads.from_labels`), and the actor's logit itself is compared with the threshold: the sigmoid
             of its 0 would be above the released threshold.
@@ -52,7 +52,6 @@ class PostProcessing:
     """
 
     foreground: Foreground = "argmax"
-    foreground_threshold: float = 0.4
     labels_bypass_sigmoid: bool = True
     center_threshold: float = 0.1
     max_centers: int = 100
@@ -64,9 +63,6 @@ class PostProcessing:
         """Check the values; raises ChoiceError or ConfigError."""
         values = {
             "foreground": choice("foreground", self.foreground, get_args(Foreground)),
-            "foreground_threshold": number(
-                "foreground_threshold", self.foreground_threshold, "a probability between 0 and 1", *_BETWEEN
-            ),
             "labels_bypass_sigmoid": flag("labels_bypass_sigmoid", self.labels_bypass_sigmoid),
             "center_threshold": number("center_threshold", self.center_threshold, "a number from 0", 0.0),
             "max_centers": count("max_centers", self.max_centers, "centres of a frame", _MOST_CENTERS),
@@ -206,7 +202,7 @@ def foreground_cells(segmentation: AnyArray, rules: PostProcessing) -> BoolArray
     background, actor = segmentation[:, 0], segmentation[:, 1]
     if rules.foreground == "argmax":
         return np.asarray(actor > background)
-    threshold = np.float32(rules.foreground_threshold)
+    threshold = np.float32(FOREGROUND_THRESHOLD)
     if rules.labels_bypass_sigmoid and segmentation.max() == LABEL_LOGIT and segmentation.min() == 0:
         return np.asarray(actor > threshold)
     # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. That point's own logit is compared

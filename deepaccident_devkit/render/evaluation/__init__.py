@@ -13,13 +13,7 @@ from deepaccident_devkit.render.evaluation.motion import render_quality_by_time,
 from deepaccident_devkit.render.evaluation.prevention import render_prevention
 from deepaccident_devkit.render.evaluation.report import save_report
 from deepaccident_devkit.render.evaluation.samples import draw_motion_outcome
-from deepaccident_devkit.render.evaluation.warning import (
-    render_detection_rates,
-    render_false_alarms,
-    render_predictors,
-    render_warning_curve,
-    render_warning_times,
-)
+from deepaccident_devkit.render.evaluation.warning import render_predictors
 
 __all__ = [
     "draw_motion_outcome",
@@ -28,16 +22,12 @@ __all__ = [
     "render_average_precisions",
     "render_breakdown",
     "render_comparison",
-    "render_detection_rates",
     "render_errors",
-    "render_false_alarms",
     "render_outcomes",
     "render_precision_recall",
     "render_predictors",
     "render_prevention",
     "render_quality_by_time",
     "render_ranges",
-    "render_warning_curve",
-    "render_warning_times",
     "save_report",
 ]

@@ -18,7 +18,7 @@ from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
 from deepaccident_devkit.evaluation.metrics.motion.evaluator import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult, WarningResult
+from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.colors import MUTED_COLOR, WARNING_COLOR
@@ -44,7 +44,7 @@ MAIN_NUMBERS: Final = {
     "motion": ("ranges/100x100/pq", "ranges/100x100/iou"),
     "accident": ("apa", "position_error"),
     "detection": ("mean_average_precision",),
-    "warning": ("groups/ego_involved/auc_ahead", "recording_precision"),
+    "warning": ("groups/ego_involved/auc_ahead",),
 }
 """Task → paths of the headline numbers that figures show by attribute. The first one is shown by all attributes, and
 samples are ranked by it; the others are shown only by time to impact."""
@@ -220,33 +220,6 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
             draw=partial(warning.render_predictors, result),
         )
         yield from _prevention(run)
-    if not isinstance(result, WarningResult):
-        return
-    rates = _listed((f"{seconds:g} s before", rate) for seconds, rate in result.detection_rate.items())
-    yield RunFigure(
-        name="warning_times",
-        caption="Seconds of warning: from the first right alarm of a recording to the impact.",
-        alt=f"Histogram of seconds of warning; {_listed([('mean', result.mean_warning)])} s.",
-        draw=partial(warning.render_warning_times, result),
-    )
-    yield RunFigure(
-        name="detection_rates",
-        caption="Share of the accidents with a right alarm at this time before the impact, or earlier.",
-        alt=f"Share of accidents with a right alarm: {rates}.",
-        draw=partial(warning.render_detection_rates, result),
-    )
-    yield RunFigure(
-        name="false_alarms",
-        caption="False alarms a minute, by kind of recording; a twin is a normal scenario made like an accident.",
-        alt=f"False alarms a minute: {_listed(result.false_alarms_per_minute.items())}.",
-        draw=partial(warning.render_false_alarms, result),
-    )
-    yield RunFigure(
-        name="warning_curve",
-        caption="Detection rate over false alarms a minute; each point has another least score of alarms.",
-        alt="Detection rate over false alarms a minute.",
-        draw=partial(warning.render_warning_curve, result),
-    )
 
 
 def _prevention(run: EvaluationRun) -> Iterator[RunFigure]:

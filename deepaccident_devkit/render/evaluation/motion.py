@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import panoptic_quality
+from deepaccident_devkit.evaluation.metrics.motion.protocol import RANGES
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SERIES_COLORS
@@ -68,7 +69,7 @@ def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax:
     if not frames:
         return draw_nothing(ax)
     given = [each["vpq"] for each in counts]
-    for index, (name, color) in enumerate(zip(evaluator.protocol.range_names, cycle(SERIES_COLORS[1:]), strict=False)):
+    for index, (name, color) in enumerate(zip(RANGES, cycle(SERIES_COLORS[1:]), strict=False)):
         quality = [_quality([each[index] for each in given], frame) for frame in range(frames)]
         ax.plot([step * frame for frame in range(frames)], quality, marker="o", color=color, label=f"{name} m")
     ax.set(xlabel="seconds from the present", ylabel="PQ (%)", ylim=(0, 104))

@@ -9,9 +9,14 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.evaluation.metrics.warning import PreventedResult
-from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
-from deepaccident_devkit.evaluation.metrics.warning.prevention import BUDGET, OutcomeFigures, PreventionFigures
+from deepaccident_devkit.evaluation.metrics.warning.prevention import (
+    BUDGET,
+    NOMINAL,
+    SETTINGS,
+    OutcomeFigures,
+    PreventionFigures,
+)
+from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.chips import place_chips
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, MUTED_COLOR, TRUE_PLACE_COLOR

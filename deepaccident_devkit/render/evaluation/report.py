@@ -79,7 +79,6 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
         ),
         "Breakdowns": joined(sections.breakdowns(run)),
         **({"Sanity": sections.sanity(run.sanity)} if run.sanity is not None else {}),
-        **({"What each switch changes": sections.explanation(run.explanation)} if run.explanation is not None else {}),
         "Choices": sections.choices(run),
         "Check these numbers": sections.checking(),
     }

@@ -25,10 +25,6 @@ _PARTS: Final = {
     "within": "By the allowed distance (m)",
     "ranges": "By range",
     "classes": "By class",
-    "recordings": "Recordings",
-    "minutes": "Minutes",
-    "false_alarms": "False alarms",
-    "detection_recordings": "Recordings with so many seconds before the end",
     "beside": "With other choices, always reported as well",
 }
 """Field of a result → heading of its table."""
@@ -147,43 +143,6 @@ def sanity(report: Mapping[str, Any]) -> Markup:
     )
 
 
-def explanation(report: Mapping[str, Any]) -> Markup:
-    """The headline numbers by the other protocols, and their changes by each switch.
-
-    Args:
-        report: as `Explanation.as_dict` has it.
-    """
-    units, chosen = report["units"], report["chosen"]
-    others = {name: values for name, values in report["protocols"].items() if name != report["protocol"]}
-    protocols = {f"{report['protocol']} (chosen)": chosen, **others}
-    rows = [
-        [name, *(value_text(values.get(name), unit) for values in protocols.values())] for name, unit in units.items()
-    ]
-    changes: dict[str, dict[str, Markup]] = {}
-    for each in report["numbers"]:
-        numbers = changes.setdefault(each["choice"], {})
-        if each["changed"]:
-            numbers[each["headline"]] = _change(each, units[each["headline"]])
-    shown = [name for name in units if any(name in numbers for numbers in changes.values())]
-    same = [choice for choice, numbers in changes.items() if not numbers]
-    otherwise = [[choice, *(each.get(name, "") for name in shown)] for choice, each in changes.items() if each]
-    refused = [tag("li", tag("b", name), f": {why}") for name, why in report["refused"].items()]
-    return joined(
-        [
-            table(["number", *protocols], rows, f"by protocol, of {report['samples']:,} samples"),
-            table(["switch", *shown], otherwise, "one switch changed, all others as chosen") if otherwise else "",
-            tag("p", f"No number changes with: {', '.join(same)}.") if same else "",
-            tag(
-                "details",
-                tag("summary", "Protocols and switches that these results cannot be evaluated by"),
-                tag("ul", *refused),
-            )
-            if refused
-            else "",
-        ]
-    )
-
-
 def choices(run: EvaluationRun) -> Markup:
     """Every switch of the protocol, and all other settings; closed until the reader opens them."""
     given = run.setup.as_dict()
@@ -280,12 +239,6 @@ def _tables(tables: Sequence[PredictorTable]) -> Markup:
 
 def _samples(groups: Sequence[Group[Any]]) -> int:
     return sum(group.samples for group in groups)
-
-
-def _change(number: Mapping[str, Any], unit: Any) -> Markup:
-    change = number["change"]
-    below = [] if change is None else [tag("div", value_text(change, unit, signed=True), class_="interval")]
-    return joined([value_text(number["value"], unit), *below])
 
 
 def _share(value: float | None) -> str:

@@ -12,7 +12,7 @@ from deepaccident_devkit.arrays import AnyArray, IntArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.frames import cells_within, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.metrics.motion import MotionProtocol
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_matches
-from deepaccident_devkit.evaluation.metrics.motion.protocol import motion_protocol
+from deepaccident_devkit.evaluation.metrics.motion.protocol import RANGES, motion_protocol
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
@@ -89,7 +89,7 @@ def motion_outcome(
     true = _cut(maps_of_labels(labels_at_present(label)), frames)
     predicted = maps_of_output(prediction, step=true.step, post_processing=rules.instances)
     predicted = _cut(predicted, frames)
-    extent = max(rules.ranges)
+    extent = max(RANGES.values())
     within = (slice(None), *cells_within(true.grid, extent))
     matches = vpq_matches(predicted.instance[within], true.instance[within], rules.vpq)
     return MotionOutcome(true=true, predicted=predicted, matches=matches, extent=extent)

@@ -71,7 +71,7 @@ def _sample(recording: Recording, prediction: Foreseen, agent: str, frame: int, 
     world_from_ego = recording.dataset.world_from(token, "ego")
     alarms = [
         _alarm(recording, accident, ids, context, world_from_ego)
-        for accident, ids in named_alarms(given, label, truth, _RULES)
+        for accident, ids in named_alarms(given, label, truth, _RULES.reading)
     ]
     return {
         "frame": frame - 1,

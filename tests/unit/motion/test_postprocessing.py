@@ -190,8 +190,6 @@ def test_settings_that_cannot_be() -> None:
         PostProcessing(foreground="softmax")
     with pytest.raises(ChoiceError, match="scan: expected one of devkit, released, fiery, found 'left'"):
         PostProcessing(scan="left")
-    with pytest.raises(ConfigError, match=r"a probability between 0 and 1, found 40"):
-        PostProcessing(foreground_threshold=40)
     with pytest.raises(ConfigError, match="link_distance: expected a number of cells from 0, found nan"):
         PostProcessing(link_distance=float("nan"))
     with pytest.raises(ConfigError, match=r"max_centers: expected a whole number from 1 .*, found True"):

@@ -7,13 +7,13 @@ Every alarm counts, the truth does not help to choose one, and an alarm that a r
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, get_args
+from typing import Any, ClassVar
 
 import numpy as np
 
-from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     AccidentResult,
     Alarm,
@@ -26,7 +26,6 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     united,
 )
 from deepaccident_devkit.evaluation.metrics.alarms.raised import (
-    Naming,
     Pair,
     named_alarms,
     position_difference,
@@ -34,11 +33,9 @@ from deepaccident_devkit.evaluation.metrics.alarms.raised import (
 )
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, UNPLACED_NOTE, AccidentContext, BoxTruth
-from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.text import settle_choices
 
 _ASIDE = ("at_impact", "unplaced")
 """Why nothing else of a sample counts."""
@@ -87,52 +84,20 @@ class BoxAccidents:
     accident, the first sample that has one. They are not cut at the recording's end, which a model cannot know. An
     alarm for later than the horizon does not count, and at the impact itself there is nothing to foresee.
 
+    An alarm that the recording cannot refute is left out and counted aside. If nobody is near enough to an explicit
+    accident without `ids`, it names the wrong actors.
+
     Attributes:
         reading: how an accident is read off maps. By the paper's 1 m, the default, traffic side by side collides, since
             neighbouring cells are 0.5 m apart; at 0.5 m a square contact is missed.
-        min_score: alarms with a lower score do not count.
-        match_distance: metres: gate of the match of instances with actors, which decides whether a prediction in maps
-            names the right ones; also the largest distance of the `nearest` of `naming`.
-        naming: whom an explicit accident without `ids` (actor ids) names: the two actors whose boxes' centres are
-            `nearest` to its positions at its time (at the last moment of the truth, if it is for later), or, with
-            `given`, nobody. If nobody is near enough, the accident names the wrong actors.
-        unjudged_are_false: alarms that the recording cannot refute are false ones; else they are left out and counted
-            aside.
-        scoring: when an accident counts as foreseen.
     """
 
     reading: AccidentReading = field(default_factory=AccidentReading)
-    min_score: float = 0.0
-    match_distance: float = 4.0
-    naming: Naming = "nearest"
-    unjudged_are_false: bool = False
-    scoring: Scoring = field(default_factory=Scoring)
-
-    def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError or ConfigError."""
-        if not math.isfinite(self.min_score):
-            raise ConfigError(f"min_score: expected a number, found {self.min_score!r}")
-        if not 0 < self.match_distance < math.inf:
-            raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
-        settle_choices(self, {"naming": get_args(Naming)})
+    scoring: ClassVar[Scoring] = Scoring()
 
     def settings(self) -> dict[str, Any]:
         """All choices, as JSON can hold them."""
         return asdict(self)
-
-    def variants(self) -> dict[str, BoxAccidents]:
-        """These metrics with one choice changed, by `name=value`; for explanations."""
-        own: Mapping[str, tuple[Any, ...]] = {
-            "min_score": (0.5,),
-            "match_distance": (2.0, 4.0, 8.0),
-            "naming": get_args(Naming),
-            "unjudged_are_false": (False, True),
-        }
-        return {
-            **with_parts(self, "reading", self.reading.variants()),
-            **with_others(self, own),
-            **with_parts(self, "scoring", self.scoring.variants()),
-        }
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.
@@ -158,9 +123,9 @@ class BoxAccidents:
                 "label: the accident protocol 'boxes' compares with boxes; give box_truth(dataset, sample), or "
                 "accident_context(dataset, sample, horizon=2.0), as label or as context"
             )
-        raised = named_alarms(checked_prediction(prediction), label, truth, self)
+        raised = named_alarms(checked_prediction(prediction), label, truth, self.reading)
         within = within_horizon(raised, truth)
-        judged = [alarm for alarm in within if self._is_judged(alarm[0], truth)]
+        judged = [alarm for alarm in within if _is_judged(alarm[0], truth)]
         nearest = truth.nearest_pair(self.reading.danger_distance)
         return {
             "positive": truth.accident is not None,
@@ -233,19 +198,20 @@ class BoxAccidents:
             **dict.fromkeys(_ASIDE, 0),
         }
 
-    def _is_judged(self, accident: Accident, truth: BoxTruth) -> bool:
-        seen = truth.accident is not None or accident.time <= float(truth.time[-1]) + SLACK
-        return seen or self.unjudged_are_false
+
+def _is_judged(accident: Accident, truth: BoxTruth) -> bool:
+    """Whether the recording can refute an alarm."""
+    return truth.accident is not None or accident.time <= float(truth.time[-1]) + SLACK
 
 
-def _id_error(ids: Pair | None, truth: BoxTruth) -> int | None:
-    """1 if these are not the two that collide; None if nobody is named, or nobody collides."""
-    if ids is None or truth.accident is None or truth.accident.ids is None:
+def _id_error(ids: Pair, truth: BoxTruth) -> int | None:
+    """1 if these are not the two that collide; None if nobody collides."""
+    if truth.accident is None or truth.accident.ids is None:
         return None
     return int(set(ids) != set(truth.accident.ids))
 
 
-def _alarm(accident: Accident, ids: Pair | None, truth: BoxTruth) -> dict[str, Any]:
+def _alarm(accident: Accident, ids: Pair, truth: BoxTruth) -> dict[str, Any]:
     if truth.accident is None:
         return foreseen(score=accident.score)
     return foreseen(

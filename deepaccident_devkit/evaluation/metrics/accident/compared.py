@@ -10,10 +10,14 @@ import numpy as np
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.metrics.accident.drawn_paths import DrawnPaths
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentProtocol
-from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents, collision
+from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents, surest_within
+from deepaccident_devkit.evaluation.metrics.accident.released import (
+    DrawnPaths,
+    ReleasedAccidents,
+    collision,
+    padded_paths,
+)
 from deepaccident_devkit.evaluation.metrics.alarms.raised import named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.reading import InstanceAccident, accident_of
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
@@ -65,7 +69,7 @@ def compared_accidents(
         raise EvaluationError(
             "context: the protocol 'boxes' needs its truth; make it with accident_context(…, horizon)"
         )
-    alarms = named_alarms(given, label, context.truth, protocol)
+    alarms = named_alarms(given, label, context.truth, protocol.reading)
     unplaced = context.truth.unplaced if context.truth.is_unplaced else None
     return ComparedAccidents(true=true, predicted=tuple(alarm for alarm, _ in alarms), unplaced=unplaced)
 
@@ -83,7 +87,7 @@ def _released(
     step = label.config.step * FRAME_PERIOD
 
     def found(paths: DrawnPaths, gap: float) -> Accident | None:
-        padded = rules.padded_paths(paths, points)
+        padded = padded_paths(paths, points)
         one = collision(padded, moments, gap, rules.level)
         if one is None:
             return None
@@ -109,7 +113,7 @@ def _paper(
     if isinstance(given, MotionOutput):
         read = rules.read_predictions(given, frames, labels)
         return ComparedAccidents(true=true, predicted=_there(_accident(each, step) for each in read))
-    return ComparedAccidents(true=true, predicted=tuple(rules.raised(given, (frames - 0.5) * step)))
+    return ComparedAccidents(true=true, predicted=tuple(surest_within(given, (frames - 0.5) * step)))
 
 
 def _accident(found: InstanceAccident, step: float) -> Accident | None:

@@ -38,9 +38,6 @@ class AccidentProtocol(Protocol):
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Fewer counts with the same result, to the last bit."""
 
-    def variants(self) -> Mapping[str, AccidentProtocol]:
-        """The same protocol with one choice changed, by the choice's name: what `explain` compares with."""
-
 
 PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
     {"released": ReleasedAccidents(), "paper": PaperAccidents(), "boxes": BoxAccidents()}
@@ -57,28 +54,24 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
     0
     """
 
-    def __init__(self, protocol: str | AccidentProtocol = "released", *, explain: bool = False) -> None:
+    def __init__(self, protocol: str | AccidentProtocol = "released") -> None:
         """Start without samples.
 
         Args:
             protocol: of `PROTOCOLS` by name, or your own.
-            explain: count each sample also with each choice of the protocol changed, for `explained`; takes
-                that many times longer.
 
         Raises:
             ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
         self.protocol = _protocol(protocol)
-        self._variants = dict(self.protocol.variants()) if explain else {}
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The protocol, its choices, and whether they are explained."""
+        """The protocol and its choices."""
         return {
             "protocol": type(self.protocol).__name__,
             "choices": self.protocol.settings(),
-            "explain": bool(self._variants),
         }
 
     def update(
@@ -106,10 +99,6 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         labels, known = _known(label, context)
         given = checked_prediction(prediction)
         counts = dict(self.protocol.counts(given, labels, known))
-        if self._variants:
-            counts["variants"] = {
-                name: variant.counts(given, labels, known) for name, variant in self._variants.items()
-            }
         self.add(token, counts)
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
@@ -119,19 +108,6 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Fewer counts with the same result."""
         return self.protocol.pooled(counts)
-
-    def explained(self) -> dict[str, AccidentResult]:
-        """For each choice of the protocol the result if that choice alone is changed.
-
-        Raises:
-            EvaluationError: the evaluator was not made with `explain`.
-        """
-        if not self._variants:
-            raise EvaluationError("nothing to explain: make the evaluator with explain=True")
-        return {
-            name: variant.result([counts["variants"][name] for counts in self._counts.values()])
-            for name, variant in self._variants.items()
-        }
 
 
 def _known(label: Truth | None, context: AccidentContext | None) -> tuple[MotionLabels | None, AccidentContext]:

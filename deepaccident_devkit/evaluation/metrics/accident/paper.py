@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Final, Literal, get_args
+from typing import Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.metrics.alarms.raised import Naming, by_sureness, nearest_two, position_difference
+from deepaccident_devkit.evaluation.metrics.alarms.raised import by_sureness, nearest_two, position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     AccidentReading,
     InstanceAccident,
@@ -32,7 +32,6 @@ from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     match_tracks,
 )
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.frames import (
     check_output,
@@ -42,21 +41,17 @@ from deepaccident_devkit.evaluation.metrics.frames import (
     labels_at_present,
 )
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, Prediction, checked_prediction
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelProtocol, MotionHeads, MotionLabels
+from deepaccident_devkit.motion import LabelProtocol, MotionHeads, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import settle_choices
 
 SampleChoice = Literal["best", "mean_first"]
 PredictedBy = Literal["any", "mean"]
 PositionTime = Literal["own", "truth"]
-AlarmChoice = Literal["surest", "any"]
-_CHOICES: Final[Mapping[str, tuple[str | None, ...]]] = {
-    "labels": (None, *LABEL_PROTOCOLS),
+_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "predicted_by": get_args(PredictedBy),
     "sample_choice": get_args(SampleChoice),
     "position_time": get_args(PositionTime),
-    "alarm_choice": get_args(AlarmChoice),
-    "naming": get_args(Naming),
 }
 _FORMS: Final[Mapping[str, str]] = {"instance_maps": "instance maps", "explicit": "explicit accidents"}
 """Forms of a prediction that are not heads, as counts and as notes have them."""
@@ -67,7 +62,6 @@ class PaperAccidents:
     """The accident metrics of the paper's text.
 
     Attributes:
-        labels: label protocol of the truth; labels of others are refused. None for any labels.
         reading: how an accident is read off maps, the truth's and the prediction's alike.
         predicted_by: whose accident counts as predicted: that of `any` of the K predictions, or the `mean` sample's
             (the last of the K) alone.
@@ -77,27 +71,17 @@ class PaperAccidents:
             `beside`.
         position_time: the moment of the predicted positions: its `own` accident's, or that of the `truth`, where both
             predicted agents are there then. Explicit accidents have only their own.
-        alarm_choice: which of a sample's explicit accidents are predicted: the `surest` (the earliest of equally sure
-            ones), as a prediction in maps shows at most one; or `any`: each counts as one of K predictions, and the
-            surest as the mean.
-        alarms_cut: explicit accidents for later than the labels' last frame in the recording, by more than half a step,
-            are left out, as the frames of maps are.
-        naming: whom an explicit accident without `ids` names: the two true instances that are `nearest` to its
-            positions at its time, or, with `given`, nobody. (`ids` are actor ids, and are compared with those of the
-            true instances.)
         match_distance: metres: gate of the match of instances that decides whether a prediction names the right ones;
-            also how far off the `nearest` of `naming` may be.
+            also how far off the instances may be that an explicit accident without `ids` names.
         scoring: when an accident counts as foreseen.
     """
 
-    labels: str | None = "released"
+    labels: ClassVar[str] = "released"
+    """Label protocol of the truth; labels of others are refused."""
     reading: AccidentReading = field(default_factory=AccidentReading)
     predicted_by: PredictedBy = "any"
     sample_choice: SampleChoice = "best"
     position_time: PositionTime = "own"
-    alarm_choice: AlarmChoice = "surest"
-    alarms_cut: bool = True
-    naming: Naming = "nearest"
     match_distance: float = 4.0
     scoring: Scoring = field(default_factory=Scoring)
 
@@ -110,23 +94,6 @@ class PaperAccidents:
     def settings(self) -> dict[str, Any]:
         """All choices, as JSON can hold them."""
         return asdict(self)
-
-    def variants(self) -> dict[str, PaperAccidents]:
-        """These metrics with one choice changed, by `name=value`; for explanations."""
-        own: Mapping[str, tuple[Any, ...]] = {
-            "predicted_by": get_args(PredictedBy),
-            "sample_choice": get_args(SampleChoice),
-            "position_time": get_args(PositionTime),
-            "alarm_choice": get_args(AlarmChoice),
-            "alarms_cut": (False, True),
-            "naming": get_args(Naming),
-            "match_distance": (2.0, 4.0, 8.0),
-        }
-        return {
-            **with_parts(self, "reading", self.reading.variants()),
-            **with_others(self, own),
-            **with_parts(self, "scoring", self.scoring.variants()),
-        }
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.
@@ -160,10 +127,9 @@ class PaperAccidents:
             read = self.read_predictions(given, frames, rules)
             alarms = [self._alarm(found, truth, seconds) if found.contact else None for found in read]
         else:
-            gate, naming = self.match_distance, self.naming
             alarms = [
-                explicit_alarm(each, truth, actors, seconds=seconds, naming=naming, gate=gate)
-                for each in self.raised(given, (frames - 0.5) * seconds)
+                explicit_alarm(each, truth, actors, seconds=seconds, gate=self.match_distance)
+                for each in surest_within(given, (frames - 0.5) * seconds)
             ]
         if self.predicted_by == "mean":
             alarms = alarms[-1:]
@@ -225,11 +191,6 @@ class PaperAccidents:
             maps = [] if output.instances is None else [each[:frames] for each in output.instances]
         return [accident_of(each, output.grid, rules, self.reading) for each in maps]
 
-    def raised(self, accidents: list[Accident], last: float) -> list[Accident]:
-        """The explicit accidents that count as predicted, the surest last, as the mean sample is."""
-        raised = sorted((each for each in accidents if not self.alarms_cut or each.time <= last), key=by_sureness)
-        return raised[:1] if self.alarm_choice == "surest" else [*raised[1:], *raised[:1]]
-
     def _alarm(self, found: InstanceAccident, truth: InstanceAccident, seconds: float) -> Alarm:
         """A predicted accident against the true one, if there is one; `seconds` from frame to frame."""
         if found.contact is None or truth.contact is None:
@@ -263,13 +224,21 @@ def _notes(given: Mapping[str, Any], samples: int) -> tuple[str, ...]:
     )
 
 
+def surest_within(accidents: Sequence[Accident], last: float) -> list[Accident]:
+    """The surest explicit accident (the earliest of equally sure ones), as maps show one at most.
+
+    Those for later than `last`, the labels' last frame in the recording and half a step, are left out, as the frames of
+    maps are.
+    """
+    return sorted((each for each in accidents if each.time <= last), key=by_sureness)[:1]
+
+
 def explicit_alarm(
     predicted: Accident,
     truth: InstanceAccident,
     actors: Sequence[int | None] | None,
     *,
     seconds: float,
-    naming: Naming,
     gate: float,
 ) -> Alarm:
     """A predicted accident against the true one, if there is one.
@@ -279,15 +248,14 @@ def explicit_alarm(
         truth: read off the labels' maps.
         actors: actor ids of the two true instances, None for one that is not known; None without a true accident.
         seconds: from frame to frame of the maps.
-        naming: whom the predicted one names if it has no `ids`.
-        gate: metres: how far off the nearest instances may be.
+        gate: metres: how far off the instances may be that it names if it has no `ids`: those nearest to its positions.
     """
     if truth.contact is None:
         return foreseen()
     return foreseen(
         position=position_difference(predicted.positions, truth.positions),
         time=predicted.time - truth.contact.frame * seconds,
-        id_error=_id_error(predicted, truth, actors, seconds, naming, gate),
+        id_error=_id_error(predicted, truth, actors, seconds, gate),
     )
 
 
@@ -296,16 +264,13 @@ def _id_error(
     truth: InstanceAccident,
     actors: Sequence[int | None] | None,
     seconds: float,
-    naming: Naming,
     gate: float,
 ) -> int | None:
-    """1 if other actors than the two true ones are named; None if nobody is named, or their ids are not known."""
+    """1 if other actors than the two true ones are named; None if their ids are not known."""
     if truth.contact is None or actors is None:
         return None
     if predicted.ids is not None:
         return None if None in actors else int(set(predicted.ids) != set(actors))
-    if naming == "given":
-        return None
     frame = min(round(predicted.time / seconds), len(truth.tracks.center) - 1)
     nearest = nearest_two(predicted.positions, truth.tracks.identity, truth.tracks.center[frame], gate)
     return int(set(nearest) != set(truth.contact.ids))

@@ -9,15 +9,14 @@ first frame's instances alone), `outlines.first_outline` (of an instance in seve
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.metrics.accident.drawn_paths import DrawnPaths, paths_of_heads, paths_of_instances
 from deepaccident_devkit.evaluation.metrics.accident.outlines import pair_gaps
 from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     DISTANCES,
@@ -31,7 +30,6 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
 )
 from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.metrics.choices import with_others
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.frames import (
     check_output,
@@ -41,8 +39,24 @@ from deepaccident_devkit.evaluation.metrics.frames import (
     labels_at_present,
 )
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, Prediction
-from deepaccident_devkit.evaluation.metrics.trajectories import longest, match_trajectories, padded
-from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabels, PostProcessing
+from deepaccident_devkit.evaluation.metrics.trajectories import (
+    Paths,
+    instance_paths,
+    longest,
+    match_trajectories,
+    padded,
+)
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import (
+    POST_PROCESSING,
+    MotionHeads,
+    MotionLabels,
+    PostProcessing,
+    predict_instances,
+    trajectories,
+)
+from deepaccident_devkit.motion.orientations import to_orientation
+from deepaccident_devkit.motion.postprocessing.redrawing import first_hulls, redrawn_cells
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Pair = tuple[int, int]
@@ -55,7 +69,6 @@ class ReleasedAccidents:
     """The released rules; the defaults keep all quirks.
 
     Attributes:
-        labels: protocol of the labels that are the truth, others are refused; None for any.
         truth_gap: cells; the true instances that are nearer collide. With 0.001 they must overlap.
         prediction_gap: cells; the predicted instances that are nearer collide: 2.5 m. The paper has 1 m for both.
         level: where the outlines run, see `outlines.LEVEL`: 0.1 makes instances almost a cell larger all around.
@@ -64,30 +77,26 @@ class ReleasedAccidents:
         last_frame_only: only the last frame counts, as the lists of accidents begin empty at each. So accidents
             have no time, and its error is always 0. Else the frame with the smallest distance counts, and truth and
             prediction have each its own.
-        accelerating: paths that end early go on faster and faster; see `trajectories.padded`.
         far_is_missed: an accident foreseen elsewhere also leaves the true one missed. The released code counts it once.
         empty_first_ends: where the first prediction has no instance at all, the others do not count: a true accident
             is missed, and nothing is a false alarm.
         mean_alone_alarms: where there is no accident, only one foreseen by the last prediction (the mean) is a false
             positive; else one by any. (A true accident may be foreseen by any.)
-        errors_filled: where no accident at all is foreseen within a distance, its errors are 1, 20 m and 1 s, which
-            go into the means over the distances; else they do not count.
         errors_at: metres: the distance whose true positives the errors are means over; None for the mean of the errors
             at all three. The paper says 10.
     """
 
-    labels: str | None = "released"
+    labels: ClassVar[str] = "released"
+    """Protocol of the labels that are the truth; others are refused."""
     truth_gap: float = 0.001
     prediction_gap: float = 5.0
     level: float = 0.1
     truth_through_heads: bool = True
     redraw: bool = True
     last_frame_only: bool = True
-    accelerating: bool = True
     far_is_missed: bool = False
     empty_first_ends: bool = True
     mean_alone_alarms: bool = True
-    errors_filled: bool = True
     errors_at: float | None = None
 
     def __post_init__(self) -> None:
@@ -103,13 +112,6 @@ class ReleasedAccidents:
     def settings(self) -> dict[str, Any]:
         """All that decides the numbers, as JSON can hold it."""
         return asdict(self)
-
-    def variants(self) -> Mapping[str, ReleasedAccidents]:
-        """These rules with one choice changed, by `name=value`."""
-        switches = {name: (False, True) for name, value in asdict(self).items() if isinstance(value, bool)}
-        return with_others(
-            self, {"truth_gap": (2.0,), "prediction_gap": (2.0,), "level": (0.5,), "errors_at": (10.0,), **switches}
-        )
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.
@@ -129,7 +131,7 @@ class ReleasedAccidents:
         truth, present = self.truth_paths(label, frames)
         points = longest(truth.paths) or len(truth.drawn)
         truth, *predictions = (
-            self.padded_paths(each, points) for each in (truth, *self.prediction_paths(prediction, frames))
+            padded_paths(each, points) for each in (truth, *self.prediction_paths(prediction, frames))
         )
         matches = [match_trajectories(each.paths, truth.paths).pairs for each in predictions]
         step = label.config.step * FRAME_PERIOD
@@ -169,17 +171,12 @@ class ReleasedAccidents:
         cut = [first_frames(heads, frames) for heads in output.heads or ()]
         return [paths_of_heads(heads, output.grid, self.post_processing)[0] for heads in cut]
 
-    def padded_paths(self, given: DrawnPaths, length: int) -> DrawnPaths:
-        """The same with paths of so many points."""
-        return replace(given, paths=padded(given.paths, length, accelerating=self.accelerating))
-
-    def _error(self, errors: Sequence[float | None], name: str) -> float | None:
-        """An error over all distances from those at each."""
+    def _error(self, errors: Sequence[float | None], name: str) -> float:
+        """An error over all distances from those at each; where none is foreseen it is that of `_NOTHING_FOUND`."""
         if self.errors_at is not None:
             errors = [errors[DISTANCES.index(self.errors_at)]]
-        filled = [_NOTHING_FOUND[name] if error is None and self.errors_filled else error for error in errors]
-        known = [error for error in filled if error is not None]
-        return math.fsum(known) / len(known) if known else None
+        filled = [_NOTHING_FOUND[name] if error is None else error for error in errors]
+        return math.fsum(filled) / len(filled)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,6 +185,11 @@ class Collision:
 
     pair: Pair
     frame: int
+
+
+def padded_paths(given: DrawnPaths, length: int) -> DrawnPaths:
+    """The same with paths of so many points; those that end early go on faster and faster (`trajectories.padded`)."""
+    return replace(given, paths=padded(given.paths, length))
 
 
 def accident_counts(
@@ -280,3 +282,64 @@ def _by_distance(counts: Counts) -> list[dict[str, Any]]:
         {"tp": tp, "fp": fp, "fn": fn} | {name: [counts[name][index]] if tp else [] for name in ERRORS}
         for index, (tp, fp, fn) in enumerate(zip(counts["tp"], counts["fp"], counts["fn"], strict=True))
     ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnPaths:
+    """One prediction, or the truth, over T frames.
+
+    Attributes:
+        paths: by id, ascending, the first frame's instances: (n, 2) positions in metres, one for each frame that the
+            instance is in.
+        drawn: (T, H, W) the ids as they are rasterised, 0 elsewhere; in the orientation `released`, since outlines
+            depend on where they begin.
+    """
+
+    paths: Paths
+    drawn: AnyArray
+
+
+def paths_of_heads(heads: MotionHeads, grid: BevGrid, settings: PostProcessing) -> tuple[DrawnPaths, AnyArray]:
+    """Instances found by the accident post-processing, and (H, W) their ids at the present, as the heads lie."""
+    linked = predict_instances(heads, settings)
+    drawn = linked.instance if linked.redrawn is None else linked.redrawn
+    drawn = to_orientation(drawn, vectors=False, source=heads.orientation, target="released")
+    paths = trajectories(linked, grid, half_cell_shift=False)  # as instance maps' are: only differences count
+    return DrawnPaths(paths=paths, drawn=drawn), linked.instance[0]
+
+
+def paths_of_instances(instance: AnyArray, grid: BevGrid, *, redraw: bool) -> DrawnPaths:
+    """Instances given as maps.
+
+    Args:
+        instance: (T, H, W) ids from 1 that stay the same over the frames, 0 elsewhere.
+        grid: its cells and orientation.
+        redraw: rasterise boxes along the paths, as the released post-processing does; else keep the instances.
+    """
+    paths = instance_paths(instance, grid)
+    lying = to_orientation(instance, vectors=False, source=grid.orientation, target="released")
+    return DrawnPaths(paths=paths, drawn=_redrawn(lying, np.array([*paths], dtype=np.int64)) if redraw else lying)
+
+
+def _redrawn(instance: AnyArray, ids: IntArray) -> AnyArray:
+    """(T, H, W) the boxes of the first frame's instances `ids`, ascending."""
+    frames, *shape = instance.shape
+    frame, *position = np.nonzero(np.isin(instance, ids))
+    which = np.searchsorted(ids, instance[frame, position[0], position[1]])
+    first = frame == 0
+    hulls = first_hulls(np.stack(position)[:, first], which[first] + 1, len(ids))
+    centers, exists = _centers(which * frames + frame, np.stack(position), (len(ids), frames))
+    cells, drawn = redrawn_cells(hulls, centers, exists, (shape[0], shape[1]))
+    result = np.zeros_like(instance)
+    for image, (row, column), rank in zip(result, cells, drawn, strict=True):
+        image[row, column] = ids[rank - 1]
+    return result
+
+
+def _centers(key: IntArray, position: IntArray, shape: tuple[int, int]) -> tuple[FloatArray, BoolArray]:
+    """(I, T, 2) mean rows and columns of cells by key, 0 where there are none, and (I, T) where there are some."""
+    length = shape[0] * shape[1]
+    count = np.bincount(key, minlength=length)
+    sums = np.stack([np.bincount(key, along, length) for along in position], axis=-1)
+    centers = sums / np.maximum(count, 1)[:, None]
+    return centers.reshape(*shape, 2), count.reshape(shape) > 0

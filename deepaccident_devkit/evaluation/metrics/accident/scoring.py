@@ -14,7 +14,6 @@ from deepaccident_devkit.arrays import BoolArray, ShortRepr
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE, even
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.metrics.choices import with_others
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
@@ -182,8 +181,6 @@ Alarm = Mapping[str, Any]
 """An accident that is foreseen, as counts hold it: `position` (metres), `time` (seconds, later than the truth is
 positive) and `id` (0 the same two, 1 others) differences from the truth; None where there is none or it is not known.
 """
-_TIME_SLACK: Final = 1e-6
-"""Seconds: moments are decimal numbers, which binary numbers only approximate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,46 +189,22 @@ class Scoring:
 
     Attributes:
         errors_at: metres: the errors are means over the true positives within this distance.
-        limit_counts: a difference of exactly the distance allowed is within it, as in the released code.
         far_is_missed: an accident foreseen elsewhere is a false positive and leaves the true one missed; else it is
             only the former, as in the released code.
-        time_tolerance: seconds: the largest time error of an accident foreseen; None for any. The paper looks at
-            positions alone.
     """
 
     errors_at: float = 10.0
-    limit_counts: bool = False
     far_is_missed: bool = True
-    time_tolerance: float | None = None
 
     def __post_init__(self) -> None:
         """Check the values; raises ConfigError."""
         if self.errors_at not in DISTANCES:
             raise ConfigError(f"errors_at: expected one of {', '.join(map(str, DISTANCES))}, found {self.errors_at!r}")
-        if self.time_tolerance is not None and not self.time_tolerance >= 0:
-            raise ConfigError(f"time_tolerance: expected seconds from 0, or None, found {self.time_tolerance!r}")
-
-    def variants(self) -> dict[str, Scoring]:
-        """This scoring with one choice changed, by `name=value`; for explanations."""
-        return with_others(
-            self,
-            {
-                "errors_at": DISTANCES,
-                "limit_counts": (False, True),
-                "far_is_missed": (False, True),
-                "time_tolerance": (None, 0.5),
-            },
-        )
 
     def hit(self, alarms: Sequence[Alarm], distance: float) -> Alarm | None:
-        """The first alarm that foresees the true accident within a distance."""
-        return next((alarm for alarm in alarms if self._is_within(alarm, distance)), None)
-
-    def _is_within(self, alarm: Alarm, distance: float) -> bool:
-        position, time = alarm["position"], alarm["time"]
-        if position is None or position >= distance + (TIE if self.limit_counts else -TIE):
-            return False
-        return self.time_tolerance is None or abs(time) <= self.time_tolerance + _TIME_SLACK
+        """The first alarm that foresees the true accident nearer than a distance."""
+        near = (each for each in alarms if each["position"] is not None and each["position"] < distance - TIE)
+        return next(near, None)
 
 
 def foreseen(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,54 +27,38 @@ from deepaccident_devkit.text import choice
 
 LABEL_STEP: Final = 0.5
 """Seconds from one frame of the released labels to the next."""
-Naming = Literal["nearest", "given"]
-"""The actors that an explicit accident without `ids` names: those `nearest` to its positions then, or nobody."""
+MATCH_DISTANCE: Final = 4.0
+"""Metres: gate of the matches that decide which actors an alarm names."""
+LEAST_SCORE: Final = 0.0
+"""Alarms with a lower score do not count."""
 Pair = tuple[int | None, int | None]
 """Ids of the actors named; None for an unknown one."""
-NamedAlarm = tuple[Accident, Pair | None]
-"""An alarm and whom it names; None if it names nobody."""
+NamedAlarm = tuple[Accident, Pair]
+"""An alarm and whom it names."""
 _RELEASED_LABELS: Final = MotionLabelConfig()
 
 
-class AlarmRules(Protocol):
-    """The choices that decide which alarms there are, and whom they name; see `BoxAccidents`."""
-
-    @property
-    def reading(self) -> AccidentReading:
-        """How an accident is read off maps."""
-
-    @property
-    def min_score(self) -> float:
-        """Alarms with a lower score do not count."""
-
-    @property
-    def match_distance(self) -> float:
-        """Metres: gate of the matches with actors."""
-
-    @property
-    def naming(self) -> Naming:
-        """Whom an explicit accident without ids names."""
-
-
 def named_alarms(
-    prediction: MotionOutput | list[Accident], label: MotionLabels | None, truth: BoxTruth, rules: AlarmRules
+    prediction: MotionOutput | list[Accident], label: MotionLabels | None, truth: BoxTruth, reading: AccidentReading
 ) -> list[NamedAlarm]:
     """The alarms of one sample, the surest first, of equally sure ones the earliest.
 
     K motion predictions are at most one alarm, whose score is the share of them that have an accident. The mean sample
-    (the last) says where and when, or if it has no accident, the first that has one.
+    (the last) says where and when, or if it has no accident, the first that has one. An explicit accident without
+    `ids` (actor ids) names the two whose boxes' centres are nearest to its positions at its time (at the last moment of
+    the truth, if it is for later).
 
     Args:
         prediction: motion in maps, or explicit accidents.
         label: says how far apart in time maps are and how they lie in their cells; None for the released way.
         truth: the actors that can be named.
-        rules: the choices.
+        reading: how an accident is read off maps.
     """
     if isinstance(prediction, MotionOutput):
-        found = _alarms_of_maps(prediction, label.config if label else _RELEASED_LABELS, truth, rules)
+        found = _alarms_of_maps(prediction, label.config if label else _RELEASED_LABELS, truth, reading)
     else:
-        found = [(alarm, _named(alarm, truth, rules)) for alarm in prediction]
-    return sorted((each for each in found if each[0].score >= rules.min_score), key=lambda each: by_sureness(each[0]))
+        found = [(alarm, _named(alarm, truth)) for alarm in prediction]
+    return sorted((each for each in found if each[0].score >= LEAST_SCORE), key=lambda each: by_sureness(each[0]))
 
 
 def within_horizon(alarms: list[NamedAlarm], truth: BoxTruth) -> list[NamedAlarm]:
@@ -149,11 +133,11 @@ def accidents_of(
     ]
 
 
-def _named(alarm: Accident, truth: BoxTruth, rules: AlarmRules) -> Pair | None:
-    if alarm.ids is not None or rules.naming == "given":
+def _named(alarm: Accident, truth: BoxTruth) -> Pair:
+    if alarm.ids is not None:
         return alarm.ids
     frame = min(round(alarm.time / FRAME_PERIOD), len(truth.time) - 1)
-    return nearest_two(alarm.positions, truth.actor_id, truth.footprint[frame, :, :2], rules.match_distance)
+    return nearest_two(alarm.positions, truth.actor_id, truth.footprint[frame, :, :2], MATCH_DISTANCE)
 
 
 def foreseen_accident(
@@ -203,14 +187,14 @@ def _joint(there: list[tuple[InstanceAccident, Contact]], predictions: int, step
 
 
 def _alarms_of_maps(
-    output: MotionOutput, config: MotionLabelConfig, truth: BoxTruth, rules: AlarmRules
+    output: MotionOutput, config: MotionLabelConfig, truth: BoxTruth, reading: AccidentReading
 ) -> list[NamedAlarm]:
     """At most one alarm of K predictions."""
     seconds = config.step * FRAME_PERIOD
-    read = _read_off(output, config.rules, rules.reading)
+    read = _read_off(output, config.rules, reading)
     there = _surest_first(read)
     if not there:
         return []
     found, contact = there[0]
-    match = match_tracks(found.tracks, truth.tracks(seconds, len(found.tracks.center)), rules.match_distance)
+    match = match_tracks(found.tracks, truth.tracks(seconds, len(found.tracks.center)), MATCH_DISTANCE)
     return [(_joint(there, len(read), seconds), (match.get(contact.ids[0]), match.get(contact.ids[1])))]

@@ -14,7 +14,6 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.hulls import convex_hulls, hull_distances
-from deepaccident_devkit.evaluation.metrics.choices import with_others
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, PostProcessing, predict_instances
@@ -71,21 +70,6 @@ class AccidentReading:
         """(T, H, W) the instances of heads, in their orientation."""
         linked = predict_instances(heads, self.post_processing)
         return linked.instance if linked.redrawn is None else linked.redrawn
-
-    def variants(self) -> dict[str, AccidentReading]:
-        """This reading with one choice changed, by `name=value`; for explanations."""
-        return with_others(
-            self,
-            {
-                "foreground": ("argmax", "sigmoid"),
-                "link_distance": (3.0, 8.0, 10.0),
-                "redraw": (False, True),
-                "outline": get_args(Outline),
-                "danger_distance": (0.5, 1.0, 1.5, 2.5),
-                "present": (False, True),
-                "moment": get_args(Moment),
-            },
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

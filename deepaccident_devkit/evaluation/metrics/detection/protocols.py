@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
-from deepaccident_devkit.evaluation.metrics.choices import as_tuples, with_others
+from deepaccident_devkit.evaluation.metrics.choices import as_tuples
 from deepaccident_devkit.taxonomy import CATEGORIES, SMALL_CATEGORIES
 from deepaccident_devkit.text import choice, possible_text, settle_choices
 
@@ -152,76 +152,12 @@ class DetectionProtocol:
         result: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return result
 
-    def variants(self) -> dict[str, DetectionProtocol]:
-        """These metrics with one choice changed, by `name=value`; for explanations.
-
-        A choice that contradicts others is changed together with them: errors need thresholds in metres, a
-        single range and another curve than `voc`; a footprint in the area needs one; velocities of the label are those
-        of one agent in its LiDAR frame.
-        """
-        made = with_others(self, self._free_choices())
-        for name, value, more in self._bound_choices():
-            if getattr(self, name) != value:
-                made[f"{name}={value}"] = replace(self, **{name: value, **more})
-        return made
-
-    def _free_choices(self) -> dict[str, tuple[Any, ...]]:
-        """Choices that contradict no others."""
-        flags: dict[str, tuple[Any, ...]] = {
-            name: (False, True)
-            for name, value in asdict(self).items()
-            if isinstance(value, bool) and name not in ("global_sort", "label_velocity")
-        }
-        shares = {"min_precision": (0.0, 0.1)} if self.curve == "nuscenes" else {}
-        if self.curve == "voc":
-            return {**flags, "area": (None, _PAPER_AREA), "matching": get_args(Matching), "global_sort": (False, True)}
-        return {
-            **flags,
-            **shares,
-            "area": (None, _PAPER_AREA),
-            "matching": get_args(Matching),
-            "points": (40, 101),
-            "min_recall": (0.0, 0.1),
-        }
-
-    def _bound_choices(self) -> list[tuple[str, Any, dict[str, Any]]]:
-        """Choices with a value, and the choices that must change with it."""
-        in_metres = self.measure.startswith("distance")
-        one_agent = self.frame == "lidar" and self.truth != "cooperative"
-        kept = None if self.error_threshold not in _PAPER_THRESHOLDS else self.error_threshold
-        measures: tuple[Measure, ...] = ("distance_of_bottoms", "distance_bev") if in_metres else ("iou_3d", "iou_bev")
-        bound: list[tuple[str, Any, dict[str, Any]]] = [
-            *(("truth", value, {}) for value in ("label", "visible")),
-            ("truth", "cooperative", {"label_velocity": False}),
-            ("frame", "lidar", {}),
-            ("frame", "ego", {"label_velocity": False}),
-            *(("measure", value, {}) for value in measures),
-            *(("curve", value, _curve_needs(value)) for value in get_args(Curve)),
-            ("area_of", "footprint", {"area": self.area or _PAPER_AREA}),
-        ]
-        if one_agent:
-            bound += [("label_velocity", value, {}) for value in (False, True)]
-        if in_metres:
-            bound += [
-                ("thresholds", _PAPER_THRESHOLDS, {"error_threshold": kept, "small_thresholds": None}),
-                ("thresholds", (0.5, *_PAPER_THRESHOLDS), {"small_thresholds": None}),
-                ("ranges", ((0.0, math.inf),), {}),
-            ]
-        return bound
-
     def _check_errors(self, threshold: float) -> None:
         if threshold not in self.thresholds or len(self.ranges) > 1 or self.curve == "voc":
             raise ConfigError(
                 f"error_threshold: {threshold} needs to be one of the thresholds {self.thresholds}, a single range, "
                 "and another curve than voc; choose None for no errors"
             )
-
-
-def _curve_needs(curve: Curve) -> dict[str, Any]:
-    """What a curve excludes: only `nuscenes` has a least precision; `voc` has neither errors nor a least recall."""
-    if curve == "voc":
-        return {"min_precision": 0.0, "min_recall": 0.0, "error_threshold": None}
-    return {"global_sort": True} if curve == "nuscenes" else {"global_sort": True, "min_precision": 0.0}
 
 
 _PAPER_AREA: Final = (-51.2, 51.2, -51.2, 51.2)

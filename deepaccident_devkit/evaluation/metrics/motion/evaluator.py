@@ -26,7 +26,7 @@ from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     panoptic_quality,
     vpq_counts,
 )
-from deepaccident_devkit.evaluation.metrics.motion.protocol import MotionProtocol, motion_protocol
+from deepaccident_devkit.evaluation.metrics.motion.protocol import RANGES, MotionProtocol, motion_protocol
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.evaluation.metrics.trajectories import (
     instance_paths,
@@ -129,8 +129,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices, and whether paths are compared."""
-        described = asdict(self.protocol) | {"ranges": list(self.protocol.ranges)}
-        return {"protocol": described, "trajectories": self.trajectories}
+        return {"protocol": asdict(self.protocol), "trajectories": self.trajectories}
 
     def update(self, token: str, prediction: MotionOutput, label: MotionLabels) -> None:
         """Count one sample.
@@ -153,7 +152,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """The samples' counts as those of one sample of one frame, which have the same result."""
         sums = {name: sum(each[name] for each in counts) for name in ("samples", "frames", "instance_maps")}
-        ranges = range(len(self.protocol.ranges))
+        ranges = range(len(RANGES))
         cells = [[sum(each["cells"][index][kind] for each in counts) for kind in range(3)] for index in ranges]
         vpq = [
             [[math.fsum(value for each in counts for value in each["vpq"][index][kind])] for kind in range(4)]
@@ -183,14 +182,13 @@ class MotionEvaluator(Evaluator[MotionResult]):
         return self._result([self._counts[order[number]] for number in numbers], [frames[number] for number in numbers])
 
     def _result(self, counts: Collection[Counts], vpq: Sequence[Any]) -> MotionResult:
-        names = self.protocol.range_names
         paths = _path_sums(counts)
         found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
         samples, number = (sum(each[name] for each in counts) for name in ("samples", "instance_maps"))
         return MotionResult(
             ranges={
                 name: self._range_result([each["cells"][index] for each in counts], [each[index] for each in vpq])
-                for index, name in enumerate(names)
+                for index, name in enumerate(RANGES)
             },
             min_ade=ratio(paths["ade"], paths["count"]),
             min_fde=ratio(paths["fde"], paths["count"]),
@@ -251,7 +249,7 @@ def motion_counts(
     actors, instance = (prediction.grid.reorient(maps, grid.orientation) for maps in last)
     true_actors, true_instance = truth.segmentation[:frames] == 1, truth.instance[:frames]
     cells, vpq = [], []
-    for extent in rules.ranges:
+    for extent in RANGES.values():
         within = (slice(None), *cells_within(grid, extent))
         counted = mask_counts(actors[within], true_actors[within])
         cells.append([counted.true_positive, counted.false_positive, counted.false_negative])

@@ -8,17 +8,21 @@ from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
 from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.metrics.warning.cost import AlarmCost, false_alarm_cost
 from deepaccident_devkit.evaluation.metrics.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
-from deepaccident_devkit.evaluation.metrics.warning.field import FieldFigures, FieldQuirks, field_figures
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import AccidentOutcomes, OutcomeTable
+from deepaccident_devkit.evaluation.metrics.warning.field import (
+    FieldFigures,
+    FieldResult,
+    FieldWarnings,
+    field_figures,
+    printed_figures,
+)
 from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
 from deepaccident_devkit.evaluation.metrics.warning.prevention import (
+    AccidentOutcomes,
+    OutcomeTable,
     PreventedResult,
     PreventionCurve,
     PreventionFigures,
 )
-from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
-from deepaccident_devkit.evaluation.metrics.warning.published import FieldResult, FieldWarnings
-from deepaccident_devkit.evaluation.metrics.warning.result import WarningCurve, WarningResult
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 
 __all__ = [
@@ -30,7 +34,6 @@ __all__ = [
     "CleanScores",
     "CleanWarnings",
     "FieldFigures",
-    "FieldQuirks",
     "FieldResult",
     "FieldWarnings",
     "OperatingPoint",
@@ -40,10 +43,8 @@ __all__ = [
     "PreventionCurve",
     "PreventionFigures",
     "ScoreSeries",
-    "WarningCurve",
     "WarningEvaluator",
-    "WarningProtocol",
-    "WarningResult",
     "false_alarm_cost",
     "field_figures",
+    "printed_figures",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Final, get_args
 
@@ -15,10 +15,11 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
-from deepaccident_devkit.evaluation.metrics.warning.clean import WINDOW, CleanScores, OperatingPoint
-from deepaccident_devkit.evaluation.metrics.warning.drives import (
+from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
+from deepaccident_devkit.evaluation.metrics.warning.recordings import (
     GIVEN,
     GROUPS,
+    KINDS,
     PREDICTORS,
     Drive,
     ScoresOf,
@@ -29,8 +30,6 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
     series_of,
     twin_pairs,
 )
-from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
-from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS
 from deepaccident_devkit.text import settle_choices
 
 RANDOM_DRAWS: Final = 20
@@ -51,7 +50,7 @@ class AnticipationFigures(FrozenMappings):
 
     Attributes:
         auc_ahead: the headline: the chance that an accident recording's score is above another recording's as long
-            before the end, ties half, mean over the moments of the last `window` seconds. 0.5 for always and never, and
+            before the end, ties half, mean over the moments of the last 3 seconds. 0.5 for always and never, and
             on average for chance.
         twin_wins: the chance that an accident recording's highest score is above its twin's, ties half; a twin is cut
             to the accident's length.
@@ -108,7 +107,7 @@ class AnticipationResult(TaskResult):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CleanWarnings(WarningRules):
+class CleanWarnings:
     """The accidents that are foreseen, recording by recording, without the quirks of published anticipation metrics.
 
     A recording's score at a sample is that of its surest alarm, below all thresholds without one; from the impact on
@@ -117,26 +116,22 @@ class CleanWarnings(WarningRules):
     Attributes:
         scores_of: whose alarms count where somebody collides: those of the `pair` that does (right ones), or all of the
             `recording`, for predictors that name nobody. Where nobody collides, all do.
-        window: seconds before the impact whose moments the headline compares.
         threshold: the lowest score that is an alarm, chosen on another split (`best_f1` or `quiet` there); None if none
             was.
     """
 
     scores_of: ScoresOf = "pair"
-    window: float = WINDOW
     threshold: float | None = None
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
-        WarningRules.__post_init__(self)
         settle_choices(self, {"scores_of": get_args(ScoresOf)})
-        if not 0 < self.window < math.inf:
-            raise ConfigError(f"window: expected seconds above 0, found {self.window!r}")
         if self.threshold is not None and not math.isfinite(self.threshold):
             raise ConfigError(f"threshold: expected a number, or None, found {self.threshold!r}")
 
-    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
-        return {"scores_of": get_args(ScoresOf), "window": (1.0, 2.0, 3.0)}
+    def settings(self) -> dict[str, Any]:
+        """All choices, as JSON can hold them."""
+        return asdict(self)
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> AnticipationResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""
@@ -180,7 +175,7 @@ class _Table:
         self._predictor, self._rules = predictor, rules
         series = series_of(drives, predictor, rules.scores_of, draw)
         everyone = None if rules.scores_of == "recording" else series_of(drives, predictor, "recording", draw).highest()
-        self._scores = CleanScores(series, rules.window, everyone)
+        self._scores = CleanScores(series, everyone)
         self._pairs = twin_pairs(drives)
         self._part = np.array([each.part for each in drives], dtype=np.int64)
         self._kind = np.array([each.kind for each in drives])

@@ -65,12 +65,11 @@ class CleanScores:
         highest: (N,) the highest score of each.
     """
 
-    def __init__(self, series: ScoreSeries, window: float = WINDOW, any_alarm: FloatArray | None = None) -> None:
+    def __init__(self, series: ScoreSeries, any_alarm: FloatArray | None = None) -> None:
         """Count what figures at any threshold need.
 
         Args:
             series: the scores.
-            window: seconds before the end whose moments `area_at_moments` looks at.
             any_alarm: (N,) highest scores of all alarms, where those of the series are of right ones alone; None where
                 they are of all.
         """
@@ -78,7 +77,7 @@ class CleanScores:
         self.highest = series.highest()
         self._any_alarm = self.highest if any_alarm is None else any_alarm
         self._ranks = _ranks(self.highest)
-        self._moments = [_ranks(scores) for scores in series.before(window).T]
+        self._moments = [_ranks(scores) for scores in series.before(WINDOW).T]
         valid = series.valid
         self._frames = valid.sum(axis=1).astype(np.float64)
         self._scores = np.where(valid, series.scores, -np.inf)

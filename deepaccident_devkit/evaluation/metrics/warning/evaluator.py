@@ -12,29 +12,26 @@ from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import AnticipationResult, CleanWarnings
-from deepaccident_devkit.evaluation.metrics.warning.drives import PART, parts_of
-from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
-from deepaccident_devkit.evaluation.metrics.warning.published import FieldResult, FieldWarnings
-from deepaccident_devkit.evaluation.metrics.warning.recordings import sample_counts, tally_of
-from deepaccident_devkit.evaluation.metrics.warning.result import WarningResult, warning_result
+from deepaccident_devkit.evaluation.metrics.warning.field import FieldResult, FieldWarnings
+from deepaccident_devkit.evaluation.metrics.warning.recordings import PART, parts_of, sample_counts
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.text import choice
 
-Protocol = CleanWarnings | WarningProtocol | FieldWarnings
-Result = AnticipationResult | WarningResult | FieldResult
+Protocol = CleanWarnings | FieldWarnings
+Result = AnticipationResult | FieldResult
 WARNING_PROTOCOLS: Final[Mapping[str, Protocol]] = MappingProxyType(
-    {"clean": CleanWarnings(), "boxes": WarningProtocol(), "field": FieldWarnings()}
+    {"clean": CleanWarnings(), "field": FieldWarnings()}
 )
-"""`clean` ranks predictors, recording by recording; `boxes` looks at alarms one by one; `field` is what published codes
-print. All compare with the labels' boxes, as the accident protocol `boxes`; the paper has no such metrics."""
+"""`clean` ranks predictors, recording by recording; `field` is what published codes print. Both compare with labels as
+the accident protocol `boxes` does; the paper has no such metrics."""
 
 
 class WarningEvaluator(Evaluator[Any]):
-    """Numbers for users of an alarm: seconds of warning, detection in time, false alarms a minute.
+    """Numbers for users of an alarm: whether it knows accidents ahead, seconds of warning, time in false alarm.
 
     Give it whole recordings, normal scenarios among them: the metrics ignore the times of samples that are not given.
 
-    `compute` gives an `AnticipationResult`, a `WarningResult` or a `FieldResult`, by the protocol.
+    `compute` gives an `AnticipationResult` or a `FieldResult`, by the protocol.
 
     >>> evaluator = WarningEvaluator()
     >>> evaluator.compute().samples
@@ -88,28 +85,24 @@ class WarningEvaluator(Evaluator[Any]):
                 f"context: expected an AccidentContext, found {type(context).__name__}; make it with "
                 "accident_context(dataset, sample, horizon=2.0)"
             )
-        self.add(token, sample_counts(token, prediction, label, context, self.protocol))
+        self.add(token, sample_counts(token, prediction, label, context))
 
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""
-        if isinstance(self.protocol, WarningProtocol):
-            return warning_result(tally_of(counts, self.protocol), self.protocol)
         return self.protocol.result(counts)
 
     def compute(self, tokens: Iterable[str] | None = None) -> Result:
         """The metrics of all samples, beside those of the reference predictors; or of some, without."""
-        if tokens is None and not isinstance(self.protocol, WarningProtocol):
+        if tokens is None:
             return self.protocol.result(list(self._counts.values()), references=True)
         result: Result = super().compute(tokens)
         return result
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """Counts with the same result: of the protocol `boxes` the tally of whole recordings.
+        """Counts with the same result, of which no recording is put together with others' recordings.
 
-        Their recordings stay apart from those of others, so that a scenario that is drawn twice counts twice.
+        So a scenario that is drawn twice counts twice.
         """
-        if isinstance(self.protocol, WarningProtocol):
-            return [tally_of(counts, self.protocol)]
         return [{PART: [sample for part in parts_of(counts) for sample in part]}]
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Any]:
@@ -125,6 +118,6 @@ class WarningEvaluator(Evaluator[Any]):
 
 
 def _protocol(protocol: object) -> Protocol:
-    if isinstance(protocol, CleanWarnings | WarningProtocol | FieldWarnings):
+    if isinstance(protocol, CleanWarnings | FieldWarnings):
         return protocol
     return WARNING_PROTOCOLS[choice("protocol", protocol, WARNING_PROTOCOLS)]

@@ -1,4 +1,4 @@
-"""Anticipation metrics as four published evaluations compute them, each of their quirks a named switch.
+"""`FieldWarnings`: the protocol `field`, what four published codes of anticipation compute, with all of their quirks.
 
 UString (Bao et al. 2020), DSTA (Karim et al. 2022), DRIVE (Bao et al. 2021) and DAD (Chan et al. 2016) print numbers of
 one name that are not comparable with each other; docs/protocols.md says what is odd in each. They are here so that a
@@ -8,13 +8,24 @@ number can be put beside a published one. To rank predictors take the protocol `
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts
+from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
+from deepaccident_devkit.evaluation.metrics.warning.recordings import (
+    GIVEN,
+    PREDICTORS,
+    by_group,
+    drives_of,
+    left_out_notes,
+    parts_of,
+    series_of,
+)
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 from deepaccident_devkit.text import choice
 
@@ -23,35 +34,6 @@ FIELD_CODES: Final[tuple[FieldCode, ...]] = get_args(FieldCode)
 _DAD_SECONDS: Final = 5.0
 _NUDGE: Final = 1e-6
 """DRIVE moves its thresholds 0 and 1 inwards by this."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FieldQuirks:
-    """What the published evaluations do; each switch turned over is what a reader would expect.
-
-    Attributes:
-        zero_alarms_negatives: at the threshold 0 a recording without an accident is a true positive, since its scores
-            are multiplied by its label, and 0 ≥ 0; so recall and AP can be above 1 (UString, DSTA).
-        highest_recall_takes_first: of the thresholds of the highest recall the lowest one counts; else, as of all other
-            recalls, the best precision and the longest time (all four).
-        lowest_recall_left_out: the lowest recall is dropped, by which the zeros of unused places are meant (UString,
-            DSTA, DRIVE).
-        as_many_thresholds_as_frames: there is room for one threshold a frame; more raise an error (UString, DSTA).
-        missed_left_out: recordings without a warning do not count in times; else as 0 s (all four).
-        time_by_length: times are shares of `toa`, made seconds by the length of the array of scores; else by `toa`
-            (UString, DSTA).
-        five_seconds: shares are multiplied by 5 s, for recordings of any length; else by the array's length (DAD).
-        nonsense_kept: numbers that can be no recall or precision are given as they come; else NaN, with a note.
-    """
-
-    zero_alarms_negatives: bool = True
-    highest_recall_takes_first: bool = True
-    lowest_recall_left_out: bool = True
-    as_many_thresholds_as_frames: bool = True
-    missed_left_out: bool = True
-    time_by_length: bool = True
-    five_seconds: bool = True
-    nonsense_kept: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,38 +61,44 @@ class FieldFigures(ShortRepr):
     note: str = ""
 
 
-def field_figures(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks | None = None) -> FieldFigures:
-    """The numbers that a published evaluation has for these scores.
+def field_figures(series: ScoreSeries, code: FieldCode) -> FieldFigures:
+    """The numbers that a published evaluation has for these scores, NaN in place of recalls and precisions above 1.
 
     Args:
         series: the recordings; missing scores are as their recording's lowest, and no alarm at all is 0. Of recordings
             without an accident all T columns count, as in these codes.
         code: whose evaluation. DAD knows no `toa`: it takes the array's length, and so does this where they are equal.
-        quirks: None for those that the code has.
 
     Raises:
         ChoiceError: no such code.
     """
-    code = choice("code", code, FIELD_CODES)
-    chosen = quirks or FieldQuirks()
-    if not series.valid.any():
-        return _nothing(code, "there is no score")
-    try:
-        figures, highest_recall = _FIGURES[code](_filled(series), code, chosen)
-    except IndexError as error:
-        return _nothing(code, f"the published code raises an error here: {error}")
-    if not chosen.nonsense_kept and max(highest_recall, figures.average_precision) > 1 + 1e-9:
+    figures, highest_recall = _printed(series, choice("code", code, FIELD_CODES))
+    if max(highest_recall, figures.average_precision) > 1 + 1e-9:
         return _nothing(
             code,
             f"recall {highest_recall:.3g}, AP {figures.average_precision:.3g}: at the threshold 0 recordings without "
-            "an accident count as true positives (switch quirks.zero_alarms_negatives)",
-        )
-    if math.isnan(figures.average_precision) or math.isnan(figures.mean_time):
-        return FieldFigures(
-            **{name: getattr(figures, name) for name in FieldFigures.__slots__ if name != "note"},
-            note="the published code divides 0 by 0: no accident, or thresholds at which none is warned of",
+            "an accident count as true positives",
         )
     return figures
+
+
+def printed_figures(series: ScoreSeries, code: FieldCode) -> FieldFigures:
+    """The same as the published code prints them, recalls and precisions above 1 too; see `field_figures`."""
+    return _printed(series, choice("code", code, FIELD_CODES))[0]
+
+
+def _printed(series: ScoreSeries, code: FieldCode) -> tuple[FieldFigures, float]:
+    """What a published code prints, and its highest recall."""
+    if not series.valid.any():
+        return _nothing(code, "there is no score"), math.nan
+    try:
+        figures, highest_recall = _FIGURES[code](_filled(series), code)
+    except IndexError as error:
+        return _nothing(code, f"the published code raises an error here: {error}"), math.nan
+    if math.isnan(figures.average_precision) or math.isnan(figures.mean_time):
+        note = "the published code divides 0 by 0: no accident, or thresholds at which none is warned of"
+        figures = replace(figures, note=note)
+    return figures, highest_recall
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,25 +110,25 @@ class _Points:
     time: FloatArray
 
 
-def _recordings(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks) -> tuple[FieldFigures, float]:
-    """UString and DSTA: recordings are counted, at thresholds 0.001 apart from the lowest score on."""
+def _recordings(series: ScoreSeries, code: FieldCode) -> tuple[FieldFigures, float]:
+    """UString and DSTA: recordings are counted, at thresholds 0.001 apart from the lowest score on.
+
+    There is room for one threshold a frame, and more are an error. Unused places are 0: to drop them the lowest recall
+    is left out. Shares of `toa` become seconds by the length of the array.
+    """
     valid = series.valid
     lowest = float(np.min(series.scores, initial=np.inf, where=valid))
     thresholds = np.arange(max(lowest, 0.0), 1.0, 0.001)
-    scale = np.full(len(series.toa), float(series.scores.shape[1])) if quirks.time_by_length else series.toa
-    points, raised = _counted(series, thresholds, scale / series.fps, quirks)
+    points, raised = _counted(series, thresholds, series.scores.shape[1] / series.fps)
     there = raised & np.isfinite(points.time) & np.isfinite(points.recall)
-    if quirks.as_many_thresholds_as_frames:
-        room, used = int(valid.sum()), np.cumsum(there, dtype=np.int64) - there
-        if (raised & (used >= room)).any():
-            raise IndexError("more thresholds than frames")
-    else:
-        room = int(there.sum()) + 1
+    room, used = int(valid.sum()), np.cumsum(there, dtype=np.int64) - there
+    if (raised & (used >= room)).any():
+        raise IndexError("more thresholds than frames")
     kept = np.flatnonzero(there)
     padded = [np.zeros(max(room, len(kept))) for _ in range(3)]
     for column, values in zip(padded, (points.precision, points.recall, points.time), strict=True):
         column[: len(kept)] = values[kept]
-    levels = _levels(_Points(*padded), quirks, drop_lowest=quirks.lowest_recall_left_out)
+    levels = _levels(_Points(*padded), drop_lowest=True)
     high = np.flatnonzero(levels.recall >= 0.8)
     if code == "dsta" and not len(high):
         raise IndexError("no recall of 0.8")
@@ -153,15 +141,14 @@ def _recordings(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks) -> tu
     return figures, float(levels.recall[-1])
 
 
-def _dad(series: ScoreSeries, _code: FieldCode, quirks: FieldQuirks) -> tuple[FieldFigures, float]:
-    """DAD: recordings are counted, at every score of every frame but 0."""
+def _dad(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
+    """DAD: recordings are counted, at every score of every frame but 0; shares of `toa` become seconds as of 5 s."""
     thresholds = np.sort(series.scores, axis=None)
     thresholds = thresholds[thresholds != 0]
-    whole = _DAD_SECONDS if quirks.five_seconds else series.scores.shape[1] / series.fps
-    points, _ = _counted(series, thresholds, np.full(len(series.toa), whole), quirks)
+    points, _ = _counted(series, thresholds, _DAD_SECONDS)
     unused = np.zeros(series.scores.size - len(thresholds))
     columns = (np.concatenate([each, unused]) for each in (points.precision, points.recall, points.time))
-    levels = _levels(_Points(*columns), quirks, drop_lowest=False)
+    levels = _levels(_Points(*columns), drop_lowest=False)
     known = np.isfinite(levels.precision)
     if not known.any():
         return _nothing("dad", "no alarm at any threshold"), math.nan
@@ -172,15 +159,15 @@ def _dad(series: ScoreSeries, _code: FieldCode, quirks: FieldQuirks) -> tuple[Fi
     return figures, float(levels.recall[-1])
 
 
-def _drive(series: ScoreSeries, _code: FieldCode, quirks: FieldQuirks) -> tuple[FieldFigures, float]:
-    """DRIVE: frames are counted, at eleven thresholds; times are of recordings."""
+def _drive(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
+    """DRIVE: frames are counted, at eleven thresholds, and the lowest recall is left out; times are of recordings."""
     thresholds = np.arange(0, 1.1, 0.1)
     thresholds[[0, -1]] += (_NUDGE, -_NUDGE)
-    counted = _frames(series, np.append(thresholds, 0.5), quirks)
+    counted = _frames(series, np.append(thresholds, 0.5))
     at_half = (each[-1].item() for each in (counted.precision, counted.recall, counted.time))
     points = _Points(counted.precision[:-1], counted.recall[:-1], counted.time[:-1])
     several = len(np.unique(points.recall)) > 1
-    levels = _levels(points, quirks, drop_lowest=quirks.lowest_recall_left_out and several)
+    levels = _levels(points, drop_lowest=several)
     precision, recall, time = at_half
     figures = FieldFigures(
         average_precision=_area(levels),
@@ -210,32 +197,30 @@ def _filled(series: ScoreSeries) -> ScoreSeries:
     )
 
 
-def _counted(
-    series: ScoreSeries, thresholds: FloatArray, seconds: FloatArray, quirks: FieldQuirks
-) -> tuple[_Points, BoolArray]:
+def _counted(series: ScoreSeries, thresholds: FloatArray, seconds: float) -> tuple[_Points, BoolArray]:
     """Recordings counted at each threshold, NaN for 0 / 0; and (K,) whether any recording raises an alarm.
 
-    Times are shares of `toa` before the impact times `seconds` (N,).
+    Times are shares of `toa` before the impact times `seconds`, missed accidents left out. At the threshold 0 a
+    recording without an accident is a true positive: its scores are multiplied by its label, and 0 ≥ 0.
     """
     share = series.leads(thresholds) * series.fps / series.toa[:, None]
     alarmed = np.isfinite(share)
-    by_zero = alarmed & ~series.positive[:, None] & (thresholds <= 0) & quirks.zero_alarms_negatives
+    by_zero = alarmed & ~series.positive[:, None] & (thresholds <= 0)
     share[by_zero] = 1.0  # their first frame is one already
     warned = (alarmed & series.positive[:, None]) | by_zero
     count = warned.sum(axis=0)
     accidents = int(series.positive.sum())
-    timed = count if quirks.missed_left_out else np.where(count > 0, max(accidents, 1), 0)
-    time = np.where(warned, share * seconds[:, None], 0.0).sum(axis=0)
+    time = np.where(warned, share * seconds, 0.0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        points = _Points(count / alarmed.sum(axis=0), count / np.float64(accidents), time / timed)
+        points = _Points(count / alarmed.sum(axis=0), count / np.float64(accidents), time / count)
     points.time[count == 0] = np.nan
     if not accidents:
         points.recall[:] = np.nan
     return points, np.asarray(alarmed.any(axis=0))
 
 
-def _frames(series: ScoreSeries, thresholds: FloatArray, quirks: FieldQuirks) -> _Points:
-    """Frames counted at each threshold, 0 for 0 / 0."""
+def _frames(series: ScoreSeries, thresholds: FloatArray) -> _Points:
+    """Frames counted at each threshold, 0 for 0 / 0; times are of the accidents that are warned of."""
     valid = series.valid
     right = np.sort(series.scores[valid & series.positive[:, None]])
     wrong = np.sort(series.scores[valid & ~series.positive[:, None]])
@@ -243,16 +228,17 @@ def _frames(series: ScoreSeries, thresholds: FloatArray, quirks: FieldQuirks) ->
     false = len(wrong) - np.searchsorted(wrong, thresholds, side="left")
     leads = series.leads(thresholds)[series.positive]
     warned: IntArray = np.isfinite(leads).sum(axis=0)
-    timed = warned if quirks.missed_left_out else np.full(len(thresholds), len(leads))
     return _Points(
         _over(true, true + false),
         _over(true, np.full(len(thresholds), len(right))),
-        _over(np.nansum(leads, axis=0), timed),
+        _over(np.nansum(leads, axis=0), warned),
     )
 
 
-def _levels(points: _Points, quirks: FieldQuirks, *, drop_lowest: bool) -> _Points:
+def _levels(points: _Points, *, drop_lowest: bool) -> _Points:
     """One point a recall: the best precision and time of its thresholds, in the codes' order (a stable sort).
+
+    Of the thresholds of the highest recall the lowest one counts.
 
     Raises:
         IndexError: no recall is left.
@@ -264,9 +250,8 @@ def _levels(points: _Points, quirks: FieldQuirks, *, drop_lowest: bool) -> _Poin
     if not len(starts):
         raise IndexError("no threshold has another recall than the others")
     best = [np.maximum.reduceat(each, starts) for each in (precision, time)]
-    if quirks.highest_recall_takes_first:
-        for levels, each in zip(best, (precision, time), strict=True):
-            levels[-1] = each[starts[-1]]
+    for levels, each in zip(best, (precision, time), strict=True):
+        levels[-1] = each[starts[-1]]
     return _Points(best[0], recall[starts], best[1])
 
 
@@ -291,3 +276,57 @@ def _nothing(code: FieldCode, why: str) -> FieldFigures:
         "drive": dict.fromkeys(("precision_at_half", "recall_at_half", "time_at_half"), math.nan),
     }.get(code, {})
     return FieldFigures(average_precision=math.nan, mean_time=math.nan, time_at_r80=math.nan, note=why, **known)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldResult(TaskResult):
+    """The result of the protocol `field`: not comparable between codes, and predictors that know nothing can win.
+
+    Attributes:
+        samples: how many.
+        figures: code and involvement of the agent, such as `ustring ego_involved` → what that code prints.
+        references: predictor (of `PREDICTORS` but the given one) → the same.
+        beyond: alarms for later than the horizon, which do not count.
+        notes: sentences that a reader of the numbers should know: why numbers are NaN.
+    """
+
+    task: ClassVar[str] = "warning"
+    samples: int
+    figures: Mapping[str, FieldFigures]
+    references: Mapping[str, Mapping[str, FieldFigures]]
+    beyond: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldWarnings:
+    """Published anticipation metrics, for numbers beside published ones.
+
+    A recording's score is as of `CleanWarnings`, of all its alarms, since dash-cam sets know recordings alone.
+    """
+
+    def settings(self) -> dict[str, Any]:
+        """No choices: it is as those codes are."""
+        return {}
+
+    def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
+        """The metrics of some samples' counts, with those of the reference predictors or without."""
+        parts = parts_of(counts)
+        groups, samples = dict(by_group(drives_of(parts))), [sample for part in parts for sample in part]
+        made = {
+            predictor: {
+                f"{code} {group}": field_figures(series_of(those, predictor, "recording"), code)
+                for group, those in groups.items()
+                for code in FIELD_CODES
+            }
+            for predictor in (PREDICTORS if references else PREDICTORS[:1])
+        }
+        given = made.pop(GIVEN)
+        notes = [*left_out_notes(samples), *(f"{name}: {each.note}" for name, each in given.items() if each.note)]
+        return FieldResult(
+            samples=len(samples),
+            figures=given,
+            references=made,
+            beyond=sum(each["beyond"] for each in samples),
+            notes=(*notes, "times and precisions of different codes are not comparable; the protocol clean ranks"),
+        )

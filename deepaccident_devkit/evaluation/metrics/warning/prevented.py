@@ -18,7 +18,15 @@ from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
     mean_of,
     reference_threshold,
 )
-from deepaccident_devkit.evaluation.metrics.warning.drives import (
+from deepaccident_devkit.evaluation.metrics.warning.evaluator import WarningEvaluator
+from deepaccident_devkit.evaluation.metrics.warning.prevention import (
+    BUDGET,
+    AccidentOutcomes,
+    PreventedResult,
+    PreventionCurve,
+    PreventionFigures,
+)
+from deepaccident_devkit.evaluation.metrics.warning.recordings import (
     GIVEN,
     PREDICTORS,
     TRIVIAL,
@@ -27,16 +35,6 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
     by_group,
     drives_of,
     parts_of,
-)
-from deepaccident_devkit.evaluation.metrics.warning.evaluator import WarningEvaluator
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import (
-    AccidentOutcomes,
-)
-from deepaccident_devkit.evaluation.metrics.warning.prevention import (
-    BUDGET,
-    PreventedResult,
-    PreventionCurve,
-    PreventionFigures,
 )
 from deepaccident_devkit.evaluation.metrics.warning.scored_ends import ScoredEnds
 

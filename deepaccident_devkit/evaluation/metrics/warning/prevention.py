@@ -1,16 +1,82 @@
-"""`PreventedResult`: the accidents that a driver's braking after the alarm prevents, beside the braking for nothing."""
+"""How accidents would have ended (`OutcomeTable`), and `PreventedResult`: those that braking after alarms prevents."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
-from deepaccident_devkit.arrays import FloatArray, FrozenArrays
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL
-from deepaccident_devkit.safety import OUTCOMES, Skipped
+from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Braking, Skipped
+
+SETTINGS: Final = tuple(f"{each.reaction:g} s, {each.deceleration:g} m/s²" for each in BRAKINGS)
+"""Names of the ways of braking, in the order of `BRAKINGS`: reaction time and deceleration."""
+NOMINAL: Final = SETTINGS[BRAKINGS.index(Braking(reaction=1.0, deceleration=6.0))]
+"""The setting of the headline, in the middle of the nine."""
+_NO_FRAME: Final = np.iinfo(np.int64).min
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OutcomeTable(FrozenArrays):
+    """How one accident ends for each moment of the first alarm; arrays are read-only.
+
+    Attributes:
+        frame: (W,) int64 frame numbers of possible first alarms, ascending.
+        outcome: (L, W + 1, K) int8 positions in `safety.OUTCOMES` after each latency, for each first alarm and setting;
+            the last of the W + 1 is that without an alarm.
+        extrapolated: (L, W + 1, K) bool, whether the two touch only after the recording's end, where both go
+            straight on.
+        latencies: L seconds from the alarm to the warning of those who brake.
+        pedestrian: whether one of the two that collide is a pedestrian.
+    """
+
+    frame: IntArray
+    outcome: IntArray
+    extrapolated: BoolArray
+    latencies: tuple[float, ...]
+    pedestrian: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the arrays against each other; raises EvaluationError."""
+        FrozenArrays.__post_init__(self)
+        shape = (len(self.latencies), len(self.frame) + 1, len(BRAKINGS))
+        for name in ("outcome", "extrapolated"):
+            found = np.shape(getattr(self, name))
+            if found != shape:
+                raise EvaluationError(f"OutcomeTable.{name}: expected shape {shape}, found {found}")
+        if np.any(np.diff(self.frame) <= 0):
+            raise EvaluationError("OutcomeTable.frame: expected ascending frame numbers; sort them")
+        if not np.isin(self.outcome, range(len(OUTCOMES))).all():
+            raise EvaluationError(f"OutcomeTable.outcome: expected positions in OUTCOMES, 0 to {len(OUTCOMES) - 1}")
+
+    def rows(self, frames: IntArray) -> IntArray:
+        """(C,) which of the W + 1 rows a first alarm at each frame has; the last one for frames of no sample."""
+        place = np.searchsorted(self.frame, frames)
+        there = np.append(self.frame, _NO_FRAME)[place] == frames
+        rows: IntArray = np.where(there, place, len(self.frame))
+        return rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AccidentOutcomes(ShortRepr):
+    """The tables of accidents, and the scenarios without one.
+
+    Attributes:
+        tables: recording, such as `type1_subtype1_accident/Town03_…/ego_vehicle` → its accident's table, with those
+            braking whom this agent warns.
+        dropped: scenarios whose labels do not show the two near each other at the impact, so that no braking is judged.
+        skipped: scenarios of which the labels or the meta file do not say who moves how.
+    """
+
+    tables: Mapping[str, OutcomeTable] = field(default_factory=dict)
+    dropped: tuple[Skipped, ...] = ()
+    skipped: tuple[Skipped, ...] = ()
+
 
 BUDGET: Final = 1.0
 """Braking seconds a minute, on recordings without an accident, that the headline allows."""
@@ -38,7 +104,7 @@ class OutcomeFigures(FrozenMappings):
 
 
 Ends = Mapping[float, Mapping[str, OutcomeFigures]]
-"""Latency in seconds → setting (`outcome_tables.SETTINGS`) → figures."""
+"""Latency in seconds → setting (`SETTINGS`) → figures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +140,7 @@ class PreventionCurve(FrozenArrays):
 
     Attributes:
         threshold: (C,) descending; the first is infinite: no alarm.
-        braking_seconds_per_minute: (C, K) the cost in the order of `outcome_tables.SETTINGS`; never falls along C.
+        braking_seconds_per_minute: (C, K) the cost in the order of `SETTINGS`; never falls along C.
         avoided: (C, K) share of the accidents that do not happen.
         mitigated: (C, K) share of those with a change of speed that is smaller by a tenth or more.
     """
@@ -111,6 +177,6 @@ class PreventedResult(FrozenMappings):
     notes: tuple[str, ...] = ()
 
     def avoided(self, group: str) -> float:
-        """The headline: the share avoided in the setting `outcome_tables.NOMINAL`, without latency; NaN for none."""
+        """The headline: the share avoided in the setting `NOMINAL`, without latency; NaN for none."""
         ends: Ends = getattr(self.groups[group], self.alarms)
         return next((each[NOMINAL].shares[OUTCOMES[0]] for each in ends.values()), math.nan)

@@ -1,53 +1,49 @@
-"""The counts of samples, and tallies: the sums over their recordings, each one drive of one agent.
-
-All times in a tally are recorded frames, whole numbers, so that no order of the samples and no parts change a bit.
-"""
+"""What one sample adds to the metrics of warnings, and `Drive`: a recording's samples with the scores of predictors."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from itertools import accumulate, chain, groupby, pairwise
+import math
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from operator import itemgetter
-from typing import Any, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.raised import (
-    NamedAlarm,
+    Pair,
     named_alarms,
     position_difference,
     within_horizon,
 )
-from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE
-from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE, AccidentReading
+from deepaccident_devkit.evaluation.metrics.alarms.truth import (
+    REFERENCES,
+    SLACK,
+    UNPLACED_NOTE,
+    AccidentContext,
+    BoxTruth,
+    Involvement,
+)
+from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.predictions import Prediction, checked_prediction
-from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol, WarningRules
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
+from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Kind = Literal["accident", "twins", "others"]
 """Of a recording: somebody collides; nobody does, but in the scenario's twin; nobody does, and none there is known."""
-Tally = Mapping[str, Any]
-"""Of some recordings, as JSON holds it; `united` adds several up.
-
-Numbers: `samples`, `alarms`, `right` (alarms that are), `unjudged`, `beyond`, `unplaced` (samples). `step`: frames, the
-smallest from a sample to the next one of its recording; None where no recording has two. For each `Kind` under its
-name: `recordings`, `alarmed` (those with a false alarm), `seen` (samples before the impact whose alarms are judged),
-`frames` (that the samples of recordings with several stand for), `lone` (recordings of a single sample), `false` (the
-score of the surest false alarm of each sample that has one) and `lasting` (the lower one of two such scores, of samples
-next to each other). Of accidents: `reach`, `first` and `steady`: frames before the impact of the first sample, of the
-first right alarm, and of that from which on each sample has one, of each recording that has it; `gains`: rows of score,
-how many frames more the first right alarm is before the impact if alarms of this score count too, and whether it is the
-recording's surest; `reached` and `in_time`: for each lead, the curve's at last, how many recordings have samples as
-early, and the score of the surest right alarm as early of each that has one.
-"""
+_NEAR: Final = 10.0
+"""Metres: an alarm is right whose positions differ by less in sum from where the pair meets, as errors of `paper`."""
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 UNPLACED: Final = "unplaced"
 """In place of the kind: somebody collides, but no label shows with whom (`BoxTruth.unplaced`); such samples are counted
 and left out, since no alarm in them can be called right or false."""
-_NUMBERS: Final = ("samples", "alarms", "right", "unjudged", "beyond", UNPLACED)
-_KIND_NUMBERS: Final = ("recordings", "alarmed", "seen", "frames", "lone")
-_LISTS: Final = ("reach", "first", "steady", "gains")
 
 
 def sample_counts(
@@ -55,14 +51,17 @@ def sample_counts(
     prediction: Prediction,
     label: MotionLabels | None,
     context: AccidentContext,
-    rules: WarningRules,
 ) -> Counts:
     """What one sample adds, the same for all warning protocols.
 
+    An alarm for later than the horizon does not count. Unlike an accident that counts for APA, the impact may be later
+    than the model looks ahead: an early alarm with the right pair or the right place is a warning. Cells of maps are
+    coarse, so that they raise more false alarms than explicit accidents.
+
     Returns:
         `recording`: scenario and agent; `frame`: its number there; `kind` (or `UNPLACED`) and `involvement` of the
-        recording; `ahead`:
-        recorded frames to the impact, None without one; `to_end`: the same, of a twin to the accident's impact;
+        recording; `ahead`: recorded frames to the impact, None without one; `to_end`: the same, of a twin to the
+        accident's impact;
         `alarms`: [score, whether it is right], the surest first; `unjudged`: scores of those that nothing can refute;
         `beyond`: how many are for later than the horizon, and so none; `references`: of each of `REFERENCES` the scores
         of its surest right alarm and its surest one, empty without any.
@@ -77,7 +76,7 @@ def sample_counts(
         raise EvaluationError(
             "context: warnings need to know what happens, and when; give accident_context(dataset, sample, horizon=2.0)"
         )
-    raised = named_alarms(checked_prediction(prediction), label, truth, rules)
+    raised = named_alarms(checked_prediction(prediction), label, truth, AccidentReading())
     within = within_horizon(raised, truth)
     ahead, kind = context.time_to_impact, _kind(context) if truth.unplaced is None else UNPLACED
     judged = [each for each in within if ahead is not None or each[0].time <= to_end + SLACK]
@@ -89,11 +88,11 @@ def sample_counts(
         "involvement": context.involvement,
         "ahead": None if ahead is None else round(ahead / FRAME_PERIOD),
         "to_end": None if end is None else round(end / FRAME_PERIOD),
-        "alarms": [[each[0].score, int(_is_right(each, truth, context, rules))] for each in judged],
+        "alarms": [[each[0].score, int(_is_right(*each, truth, context))] for each in judged],
         "unjudged": [each[0].score for each in within if each not in judged] if len(judged) < len(within) else [],
         "beyond": len(raised) - len(within),
         "references": [
-            surest([[each.score, int(_is_right((each, each.ids), truth, context, rules))] for each in alarms], kind)
+            surest([[each.score, int(_is_right(each, each.ids, truth, context))] for each in alarms], kind)
             for alarms in context.references.values()
         ],
     }
@@ -106,43 +105,6 @@ def surest(alarms: Sequence[Sequence[float]], kind: str) -> list[float | None]:
     """
     best = max((score for score, _ in alarms), default=None)
     return [max((score for score, right in alarms if right), default=None) if kind == "accident" else best, best]
-
-
-def tally_of(counts: Collection[Counts], protocol: WarningProtocol) -> Tally:
-    """The tally of samples, and of tallies among them: recordings of different tallies are never put together.
-
-    In accident recordings samples at the impact or after it are left out, since no alarm warns there any more.
-    """
-    samples = [each for each in counts if "recording" in each and each["kind"] != UNPLACED]
-    unplaced = {**united([], protocol), UNPLACED: sum(each.get("kind") == UNPLACED for each in counts)}
-    of_recordings = [
-        _recording_tally(list(those), protocol)
-        for _, those in groupby(sorted(samples, key=itemgetter("recording", "frame")), key=itemgetter("recording"))
-    ]
-    return united([unplaced, *of_recordings, *(each for each in counts if "recording" not in each)], protocol)
-
-
-def united(tallies: Sequence[Tally], protocol: WarningProtocol) -> Tally:
-    """The tally of several together."""
-    steps = [each["step"] for each in tallies if each["step"] is not None]
-    leads = range(len(protocol.leads) + 1)
-    return {
-        **{name: sum(each[name] for each in tallies) for name in _NUMBERS},
-        **{name: list(chain.from_iterable(each[name] for each in tallies)) for name in _LISTS},
-        "step": min(steps, default=None),
-        "reached": [sum(each["reached"][lead] for each in tallies) for lead in leads],
-        "in_time": [list(chain.from_iterable(each["in_time"][lead] for each in tallies)) for lead in leads],
-        **{kind: kind_united(each[kind] for each in tallies) for kind in KINDS},
-    }
-
-
-def kind_united(tallies: Iterable[Tally]) -> dict[str, Any]:
-    """Of one kind of recordings, or of several kinds."""
-    given = list(tallies)
-    return {
-        **{name: sum(each[name] for each in given) for name in _KIND_NUMBERS},
-        **{name: list(chain.from_iterable(each[name] for each in given)) for name in ("false", "lasting")},
-    }
 
 
 def _place(token: object) -> tuple[str, int]:
@@ -161,102 +123,164 @@ def _kind(context: AccidentContext) -> Kind:
     return "twins" if context.twin else "others"
 
 
-def _is_right(alarm: NamedAlarm, truth: BoxTruth, context: AccidentContext, rules: WarningRules) -> bool:
-    accident, ids = alarm
-    ahead, impact = context.time_to_impact, truth.impact
-    if ahead is None or context.pair is None:
+def _is_right(accident: Accident, ids: Pair | None, truth: BoxTruth, context: AccidentContext) -> bool:
+    """Whether an alarm names the pair that collides, in either order, or the place where they meet."""
+    if context.time_to_impact is None or context.pair is None:
         return False
-    tolerance = rules.time_tolerance
-    if tolerance is not None and abs(accident.time - ahead) > tolerance + TIE:
-        return False
-    if rules.correct_by != "place" and ids is not None and set(ids) == set(context.pair):
+    if ids is not None and set(ids) == set(context.pair):
         return True
-    if rules.correct_by == "pair" or impact is None:
-        return False
-    return position_difference(accident.positions, impact.positions) < rules.distance - TIE
+    return truth.impact is not None and position_difference(accident.positions, truth.impact.positions) < _NEAR - TIE
 
 
-def _recording_tally(given: Sequence[Counts], protocol: WarningProtocol) -> Tally:
-    """Of one recording's samples, in the order of time."""
-    kind = given[0]["kind"]
-    samples = [each for each in given if each["ahead"] is None or each["ahead"] > 0]
-    if protocol.unjudged_are_false:
-        samples = [
-            {**each, "alarms": [*each["alarms"], *([score, 0] for score in each["unjudged"])]} for each in samples
-        ]
-    step = min((after["frame"] - before["frame"] for before, after in pairwise(samples)), default=None)
-    alarms = [alarm for each in samples for alarm in each["alarms"]]
-    unjudged = [] if protocol.unjudged_are_false else [score for each in given for score in each["unjudged"]]
-    nothing: dict[str, Any] = {name: kind_united([]) for name in KINDS}
-    return {
-        "samples": len(given),
-        "alarms": len(alarms),
-        "right": sum(right for _, right in alarms),
-        "unjudged": len(unjudged),
-        "beyond": sum(each["beyond"] for each in given),
-        UNPLACED: 0,
-        "step": step,
-        **nothing,
-        kind: _false_alarms(samples, step),
-        **_warnings(samples if kind == "accident" else [], step, protocol),
-    }
+ScoresOf = Literal["pair", "recording"]
+"""What a sample's score in an accident recording is: that of its surest right alarm, or of its surest alarm."""
+GIVEN: Final = "given"
+TRIVIAL: Final = ("always", "never", "random per frame", "random per recording")
+PREDICTORS: Final = (GIVEN, *TRIVIAL, *REFERENCES)
+"""Rows of every table: the predictions, four predictors that know nothing, and two that know the present."""
+GROUPS: Final = (*get_args(Involvement), "unknown")
+"""Of recordings, never pooled: by `Involvement`; `unknown` where no context says it."""
+_MOST_FRAMES: Final = 10_000
+"""Of a recording; the longest have some hundred."""
+_PLACE: Final = itemgetter("recording", "frame")
+_COLUMN: Final[Mapping[ScoresOf, int]] = {name: column for column, name in enumerate(get_args(ScoresOf))}
 
 
-def _false_alarms(samples: Sequence[Counts], step: int | None) -> dict[str, Any]:
-    """Of samples that raise a false alarm one after another, all but the first are no new alarm.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Drive(FrozenArrays):
+    """What one agent's recording of a scenario says; arrays are read-only.
 
-    An alarm after a missing sample is a new one: nothing shows that it lasted.
+    Attributes:
+        name: scenario and agent.
+        story: the same of its twin, too: scenario without the ending, and agent.
+        group: of `GROUPS`.
+        kind: whether somebody collides, or in the twin.
+        part: which of several groups of samples it is of.
+        frame: (S,) int64 frame numbers of the samples, ascending.
+        end: frame of the impact; of a twin, that of the accident's impact; else the one after the last sample.
+        scores: predictor, except those of `TRIVIAL` → (S, 2) of its surest right alarm and of its surest one, −inf
+            without one; equal where nobody collides.
     """
-    false = [max((score for score, right in each["alarms"] if not right), default=None) for each in samples]
-    return {
-        "recordings": int(bool(samples)),
-        "alarmed": int(any(score is not None for score in false)),
-        "seen": sum(score is not None or not sample["unjudged"] for score, sample in zip(false, samples, strict=True)),
-        "frames": len(samples) * (step or 0),
-        "lone": int(len(samples) == 1),
-        "false": [score for score in false if score is not None],
-        "lasting": [
-            min(score, later_score)
-            for (score, sample), (later_score, later) in pairwise(zip(false, samples, strict=True))
-            if score is not None and later_score is not None and later["frame"] - sample["frame"] == step
-        ],
-    }
+
+    name: str
+    story: str
+    group: str
+    kind: Kind
+    part: int
+    frame: IntArray
+    end: int
+    scores: Mapping[str, FloatArray]
 
 
-def _warnings(samples: Sequence[Counts], step: int | None, protocol: WarningProtocol) -> dict[str, Any]:
-    """What the right alarms of an accident recording say."""
-    surest = [max((score for score, right in each["alarms"] if right), default=None) for each in samples]
-    right = [(score, each["ahead"]) for score, each in zip(surest, samples, strict=True) if score is not None]
-    reach = samples[0]["ahead"] if samples else 0
-    leads = [lead / FRAME_PERIOD - 0.5 for lead in (*protocol.leads, protocol.curve_lead)]
-    in_time = [max((score for score, ahead in right if ahead >= lead), default=None) for lead in leads]
-    return {
-        "reach": [each["ahead"] for each in samples[:1]],
-        "first": [ahead for _, ahead in right[:1]],
-        "steady": _steady(samples, surest, step),
-        "gains": _gains(right),
-        "reached": [int(reach >= lead) for lead in leads],
-        "in_time": [[] if score is None else [score] for score in in_time],
-    }
+PART: Final = "part"
+"""Under this name counts hold those of several samples, whose recordings are never put together with others'."""
 
 
-def _steady(samples: Sequence[Counts], surest: Sequence[float | None], step: int | None) -> list[int]:
-    """Frames before the impact from which on every sample has a right alarm, without a sample missing; [] for never."""
-    since: list[int] = []
-    frame = None
-    for sample, score in zip(reversed(samples), reversed(surest), strict=True):
-        if score is None or (frame is not None and frame - sample["frame"] != step):
-            break
-        since, frame = [sample["ahead"]], sample["frame"]
-    return since
+def parts_of(counts: Collection[Counts]) -> list[Sequence[Counts]]:
+    """The samples' counts: those by themselves, then each group of them that was pooled."""
+    return [[each for each in counts if PART not in each], *(each[PART] for each in counts if PART in each)]
 
 
-def _gains(right: Sequence[tuple[float, int]]) -> list[list[Any]]:
-    """By how many frames right alarms come earlier than all surer ones: [score, frames, whether it is the surest]."""
-    ranked = sorted(right, key=lambda each: (-each[0], -each[1]))
-    earliest = list(accumulate((ahead for _, ahead in ranked), max, initial=0))
+def drives_of(parts: Sequence[Collection[Counts]]) -> list[Drive]:
+    """The recordings of each part's samples, by name; those of unplaced accidents (`UNPLACED`) left out."""
     return [
-        [score, after - before, int(place == 0)]
-        for place, ((score, _), (before, after)) in enumerate(zip(ranked, pairwise(earliest), strict=True))
-        if after > before
+        _drive(name, list(those), part)
+        for part, counts in enumerate(parts)
+        for name, those in groupby(
+            sorted((each for each in counts if each["kind"] != UNPLACED), key=_PLACE), key=itemgetter("recording")
+        )
     ]
+
+
+def left_out_notes(samples: Collection[Counts]) -> Iterator[str]:
+    """What is said of samples and alarms that do not count."""
+    unplaced = sum(each["kind"] == UNPLACED for each in samples)
+    if unplaced:
+        yield UNPLACED_NOTE.format(unplaced)
+    beyond = sum(each["beyond"] for each in samples)
+    if beyond:
+        yield f"{beyond} alarms are for later than the horizon and do not count"
+
+
+def series_of(drives: Sequence[Drive], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:
+    """The scores of some recordings, a column a step: the smallest from a sample to the next of any of them.
+
+    Lengths must not tell which recordings end in an accident. So twins end where their accident does, and others at
+    the latest after the median length of the accidents.
+
+    Args:
+        drives: the recordings.
+        predictor: of `PREDICTORS`.
+        scores_of: whose alarms count where somebody collides.
+        draw: of a random predictor.
+    """
+    gaps = [int(np.diff(each.frame).min()) for each in drives if len(each.frame) > 1]
+    step = max(min(gaps, default=1), 1)
+    begin = np.array([each.frame[0] for each in drives], dtype=np.float64)
+    columns = [np.rint((each.frame - each.frame[0]) / step).astype(np.int64) for each in drives]
+    scores = np.full((len(drives), 1 + max((int(each[-1]) for each in columns), default=0)), np.nan)
+    for row, (drive, column) in enumerate(zip(drives, columns, strict=True)):
+        known = drive.scores.get(predictor)
+        scores[row, column] = _trivial(predictor, drive, draw) if known is None else known[:, _COLUMN[scores_of]]
+    kinds = np.array([each.kind for each in drives])
+    toa = (np.array([each.end for each in drives], dtype=np.float64) - begin) / step
+    if (kinds == "accident").any():
+        toa[kinds == "others"] = np.minimum(toa, np.median(toa[kinds == "accident"]))[kinds == "others"]
+    return ScoreSeries(scores=scores, positive=kinds == "accident", toa=toa, fps=1 / (step * FRAME_PERIOD))
+
+
+def twin_pairs(drives: Sequence[Drive]) -> IntArray:
+    """(P, 2) rows of the accident recordings and of their twins', of one part each."""
+    rows = {(each.story, each.part, each.kind): row for row, each in enumerate(drives)}
+    pairs = [
+        (row, rows.get((each.story, each.part, "twins"))) for row, each in enumerate(drives) if each.kind == "accident"
+    ]
+    return np.array([pair for pair in pairs if pair[1] is not None], dtype=np.int64).reshape(-1, 2)
+
+
+def _drive(name: str, samples: Sequence[Counts], part: int) -> Drive:
+    first = samples[0]
+    scenario, _, agent = name.rpartition("/")
+    frame = np.array([each["frame"] for each in samples], dtype=np.int64)
+    if not (frame.min() >= 0 and frame.max() <= _MOST_FRAMES):  # a column each: else one could ask for gigabytes
+        raise EvaluationError(f"{name}: expected frames up to {_MOST_FRAMES:,}, found {frame.min()} to {frame.max()}")
+    kind: Kind = first["kind"]
+    ends = [each["frame"] + each["to_end"] for each in samples if each["to_end"] is not None]
+    given = [[*each["alarms"], *([score, 0] for score in each["unjudged"])] for each in samples]
+    scores = {GIVEN: _scores(surest(each, kind) for each in given)}
+    for number, each in enumerate(REFERENCES):
+        known = [sample["references"][number] if sample["references"] else [None, None] for sample in samples]
+        scores[each] = _scores(known)
+    return Drive(
+        name=name,
+        story=f"{cluster_of(scenario)}/{agent}",
+        group=first["involvement"] or GROUPS[-1],
+        kind=kind,
+        part=part,
+        frame=frame,
+        end=ends[0] if kind != "others" and ends else int(frame[-1]) + 1,
+        scores=scores,
+    )
+
+
+def _scores(pairs: Iterable[Sequence[float | None]]) -> FloatArray:
+    """(S, 2) of pairs of scores, None for no alarm."""
+    scores = np.array([[math.nan if each is None else each for each in pair] for pair in pairs], dtype=np.float64)
+    return np.nan_to_num(scores.reshape(-1, 2), nan=-np.inf, neginf=-np.inf)
+
+
+def _trivial(predictor: str, drive: Drive, draw: int) -> FloatArray:
+    """(S,) scores of a predictor that knows nothing; random ones are seeded by the recording and the draw."""
+    if predictor in ("always", "never"):
+        return np.full(len(drive.frame), 1.0 if predictor == "always" else -np.inf)
+    source = np.random.default_rng([zlib.crc32(drive.name.encode()), TRIVIAL.index(predictor), draw])
+    frames = 1 if predictor == "random per recording" else int(drive.frame[-1]) + 1
+    return source.random(frames)[drive.frame % frames]
+
+
+def by_group(drives: Sequence[Drive]) -> Iterator[tuple[str, list[Drive]]]:
+    """Group → its recordings, of the groups that there are."""
+    for group in GROUPS:
+        chosen = [each for each in drives if each.group == group]
+        if chosen:
+            yield group, chosen

@@ -13,9 +13,16 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
 from deepaccident_devkit.evaluation.metrics.warning.cost import MINUTE, AlarmRuns
-from deepaccident_devkit.evaluation.metrics.warning.drives import Drive, ScoresOf, series_of
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS, OutcomeTable
-from deepaccident_devkit.evaluation.metrics.warning.prevention import BUDGET, Ends, OutcomeFigures, PreventionCurve
+from deepaccident_devkit.evaluation.metrics.warning.prevention import (
+    BUDGET,
+    NOMINAL,
+    SETTINGS,
+    Ends,
+    OutcomeFigures,
+    OutcomeTable,
+    PreventionCurve,
+)
+from deepaccident_devkit.evaluation.metrics.warning.recordings import Drive, ScoresOf, series_of
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 

@@ -18,7 +18,7 @@ from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.evaluation.runs.sanity.motion import actor_cells
 from deepaccident_devkit.evaluation.runs.sanity.probes import percent
 from deepaccident_devkit.motion import PostProcessing
-from deepaccident_devkit.motion.postprocessing.predict import foreground_cells
+from deepaccident_devkit.motion.postprocessing.predict import FOREGROUND_THRESHOLD, foreground_cells
 
 NOT_COUNTED: Final[tuple[int, ...]] = (0, 0, 0)
 _MANY_TIMES: Final = 2.0
@@ -63,7 +63,7 @@ def foreground_warnings(facts: Collection[Mapping[str, Any]], settings: PostProc
     warning = (
         f"the rule by which accidents and paths are read off heads takes {percent(by_rule / cells)} of the cells for "
         f"actors, argmax {percent(by_argmax / cells)}: it takes each cell where sigmoid(actor's logit) is above "
-        f"{settings.foreground_threshold:g}, whatever the background's logit is. Write logits and not probabilities, "
+        f"{FOREGROUND_THRESHOLD:g}, whatever the background's logit is. Write logits and not probabilities, "
         "such as −x and x with x = (actor − background) / 2"
     )
     return [warning]

@@ -39,7 +39,7 @@ def test_the_numbers_of_a_result() -> None:
         ("beside/sample_choice=mean_first/within/5/accuracy", (0, 1)),
         ("mean_errors/ASE", (0, 1)),
         ("mean_errors/ATE", (0, math.inf)),
-        ("false_alarms_per_minute/twins", (0, math.inf)),
+        ("episodes_per_minute", (0, math.inf)),
         ("lateness", (-math.inf, math.inf)),
     ],
 )
@@ -61,7 +61,7 @@ def test_a_number_of_others_is_what_its_clusters_are(alone: list[float], expecte
 
 
 def test_totals_settings_and_medians_have_no_interval() -> None:
-    for path in ("minutes/normal", "within/5/distance", "median_warning", "beside/a=b/within/5/distance"):
+    for path in ("false_recordings", "within/5/distance", "median_warning", "beside/a=b/within/5/distance"):
         assert not has_interval(path)
     assert all(has_interval(path.replace("*", "5")) for path in HEADLINE_UNITS)
 

@@ -80,10 +80,10 @@ def test_every_file_says_version_protocol_and_partial(run: EvaluationRun, tmp_pa
 
 
 def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
-    switched = replace(run, setup=replace(run.setup, switches={"scoring.limit_counts": True}))
+    switched = replace(run, setup=replace(run.setup, switches={"reading.present": False}))
     summary = switched.summary()
-    assert summary["switches"] == {"scoring.limit_counts": True}
-    assert summary["settings"]["choices"]["scoring"]["limit_counts"] is True
+    assert summary["switches"] == {"reading.present": False}
+    assert summary["settings"]["choices"]["reading"]["present"] is False
     assert summary["counts"] == {"samples": 6, "scenarios": 2, "left_out": 0}
     assert summary["metrics"]["positives"] == 3
     assert {"python", "numpy"} <= summary["environment"].keys()

@@ -242,9 +242,10 @@ class TestRefused:
             EvaluationError, match=r"by the same rules: task 'accident' and 'motion'; protocol .*, and \d+"
         ):
             compare_bundles(a, motion_bundles[0], FEW)
-        other = saved("b", setup=replace(run.setup, switches={"min_score": 0.5}))
+        other = saved("b", setup=replace(run.setup, switches={"reading.present": False}))
         with pytest.raises(
-            EvaluationError, match=r"switches/min_score 'absent' and 0.5; settings/choices/min_score 0.0 and 0.5; eval"
+            EvaluationError,
+            match=r"switches/reading.present 'absent' and False; settings/choices/reading/present True and False; eval",
         ):
             compare_bundles(a, other, FEW)
 

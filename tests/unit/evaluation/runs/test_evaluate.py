@@ -119,9 +119,9 @@ class TestRefused:
         with pytest.raises(EvaluationError, match=r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the"):
             evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection)
 
-    @pytest.mark.parametrize("task", ["accident", "warning"])
+    @pytest.mark.parametrize(("task", "protocol"), [("accident", "boxes"), ("warning", "clean")])
     def test_scenarios_without_meta_are_counted_before_the_start(
-        self, da_b: DeepAccident, own_release: Path, tmp_path: Path, task: TaskName
+        self, da_b: DeepAccident, own_release: Path, tmp_path: Path, task: TaskName, protocol: str
     ) -> None:
         every = SampleSelection(split="train", samples="all", scope="all")
         silent = [scenario["token"] for scenario in da_b.find(split="train")][:1]
@@ -132,7 +132,7 @@ class TestRefused:
             for sample in every.tokens(partial):
                 writer.add(sample, [])
         with pytest.raises(EvaluationError, match=r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'"):
-            evaluate_results(partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol="boxes"), every)
+            evaluate_results(partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every)
         save_selection(partial.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
         chosen = replace(every, split=str(tmp_path / "mine.txt"))
         check_metas(partial, chosen.tokens(partial), chosen.split)
@@ -255,7 +255,7 @@ class TestBrokenOff:
         loaded = broken_after(None)
         self.run_of(da_b, ten, out)
         assert loaded == []
-        self.run_of(da_b, ten, out, switches={"min_score": 0.5})
+        self.run_of(da_b, ten, out, switches={"reading.danger_distance": 0.5})
         assert len(loaded) == 10
         self.run_of(da_b, write_accidents(tmp_path / "more.json", ten.tokens, moved=3.0), out)
         assert len(loaded) == 20
@@ -274,16 +274,15 @@ class TestBrokenOff:
     def test_the_name_says_all_that_counts(self, tmp_path: Path) -> None:
         prints = {"results": "a", "release": "b"}
         names = {
-            checkpoint_path(tmp_path / "out", setup, tokens, {**prints, **other}, *purpose)
-            for setup, tokens, other, purpose in (
-                (SETUP, ["x"], {}, ()),
-                (replace(SETUP, horizon=3.0), ["x"], {}, ()),
-                (SETUP, ["y"], {}, ()),
-                (SETUP, ["x"], {"release": "c"}, ()),
-                (SETUP, ["x"], {}, ("explanation",)),
+            checkpoint_path(tmp_path / "out", setup, tokens, {**prints, **other})
+            for setup, tokens, other in (
+                (SETUP, ["x"], {}),
+                (replace(SETUP, horizon=3.0), ["x"], {}),
+                (SETUP, ["y"], {}),
+                (SETUP, ["x"], {"release": "c"}),
             )
         }
-        assert len(names) == 5
+        assert len(names) == 4
         assert {name.parent for name in names} == {tmp_path / "out.unfinished"}
 
     def test_removing_leaves_what_is_not_its_own(self, tmp_path: Path) -> None:

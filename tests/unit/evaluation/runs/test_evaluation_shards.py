@@ -22,7 +22,6 @@ from deepaccident_devkit.evaluation.runs import (
     scenario_hashes,
     verify_bundle,
 )
-from deepaccident_devkit.evaluation.runs.explanation import explain
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
@@ -194,7 +193,7 @@ class TestStale:
         self, job: Job, counted: Path, tmp_path: Path, write_accidents: Write
     ) -> None:
         others = (
-            replace(job, setup=replace(SETUP, switches={"min_score": 0.5})),
+            replace(job, setup=replace(SETUP, switches={"reading.danger_distance": 0.5})),
             replace(job, results=write_accidents(tmp_path / "moved.json", job.results.tokens, moved=3.0)),
         )
         for other in others:
@@ -279,7 +278,6 @@ CALLS: dict[str, Callable[..., Any]] = {
     "hashes": lambda job, **how: scenario_hashes(job.dataset, map(scenario_of, job.results.tokens), **how),
     "breakdowns": lambda job, **how: job.whole().broken_down(["agent", "all"], FEW, **how).summary(),
     "sanity": lambda job, **how: check_sanity(job.dataset, job.results, SETUP, job.results.tokens, samples=2, **how),
-    "explain": lambda job, **how: explain(job.dataset, job.results, SETUP, job.results.tokens[:1], **how),
 }
 
 

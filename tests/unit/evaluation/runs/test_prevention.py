@@ -21,8 +21,8 @@ from deepaccident_devkit.evaluation import (
     WarningEvaluator,
     accident_context,
 )
-from deepaccident_devkit.evaluation.metrics.warning.drives import REFERENCES
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.recordings import REFERENCES
 from deepaccident_devkit.evaluation.runs import prevented_accidents, with_prevented
 from deepaccident_devkit.evaluation.runs.prevention import accident_outcomes
 from deepaccident_devkit.evaluation.runs.prevention_text import prevention_tables, prevention_text
@@ -107,7 +107,7 @@ def test_any_workers_give_the_same_bits(da_motion: DeepAccident, crash: str) -> 
 
 
 def test_other_evaluators_have_no_scores_of_recordings(da_motion: DeepAccident) -> None:
-    for evaluator in (WarningEvaluator("boxes"), MotionEvaluator()):
+    for evaluator in (WarningEvaluator("field"), MotionEvaluator()):
         with pytest.raises(EvaluationError, match="need one of warnings, protocol clean, which scores whole recording"):
             prevented_accidents(da_motion, evaluator)
 

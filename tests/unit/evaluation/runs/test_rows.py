@@ -99,7 +99,7 @@ def test_detection(da_b: DeepAccident, selection: SampleSelection, tmp_path: Pat
 
 
 def test_warning(da_b: DeepAccident, results: Results, selection: SampleSelection) -> None:
-    run = evaluate_results(da_b, results, EvaluationSetup(task="warning", protocol="boxes"), selection, workers=1)
+    run = evaluate_results(da_b, results, EvaluationSetup(task="warning", protocol="clean"), selection, workers=1)
     rows = sample_rows(run)
     assert column(rows, "alarms_count") == [len(results.prediction(token)) for token in sorted(selection.tokens(da_b))]
     assert len(rows) == 6

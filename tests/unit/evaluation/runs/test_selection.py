@@ -36,7 +36,7 @@ def test_whole_scenarios_of_accidents_alone(da_motion: DeepAccident) -> None:
 def test_defaults_by_task() -> None:
     motion, warning = (
         default_selection(EvaluationSetup(task=task, protocol=protocol, horizon=3.0))
-        for task, protocol in (("motion", "paper"), ("warning", "boxes"))
+        for task, protocol in (("motion", "paper"), ("warning", "clean"))
     )
     assert motion == SampleSelection(split="val", horizon=3.0)
     assert warning == SampleSelection(split="val", samples="all", scope="all", horizon=3.0)

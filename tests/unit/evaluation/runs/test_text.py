@@ -57,9 +57,9 @@ def test_intervals_and_why_there_is_none(run: EvaluationRun) -> None:
 
 
 def test_switches_and_no_intervals(run: EvaluationRun) -> None:
-    switched = replace(run, setup=replace(run.setup, switches={"min_score": 0.5}))
+    switched = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
     lines = lines_of(summary_text(switched.summary()))
-    assert "task accident, protocol boxes with min_score=0.5" in lines
+    assert "task accident, protocol boxes with reading.danger_distance=0.5" in lines
     assert "number value" in lines
 
 

@@ -188,10 +188,9 @@ class TestNamed:
         assert found(verify(bundle, da_b))[0] == ("file", "files.json")
 
     def test_another_protocol_claimed(self, bundle: Path, da_b: DeepAccident) -> None:
-        changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"min_score": 2.0}))
+        changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.present": False}))
         wheres = [where for kind, where in found(verify(bundle, da_b)) if kind == "number"]
-        assert "settings/choices/min_score" in wheres
-        assert "metrics/apa" in wheres
+        assert wheres == ["settings/choices/reading/present"]
 
     def test_many_of_a_kind_are_counted(self) -> None:
         many = tuple(Difference(kind="number", where=str(index), stored=0, found=1) for index in range(12))

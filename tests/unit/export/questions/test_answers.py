@@ -63,7 +63,7 @@ def results(asked: Asked, folder: Path, answers: Lines) -> Path:
 def evaluated(dataset: DeepAccident, path: Path, task: Any) -> Any:
     listed = "all" if task == "warning" else "evaluate"
     selection = SampleSelection(split=SPLIT, samples=listed, scope="all", horizon=3.0, agents=EGOS)
-    setup = EvaluationSetup(task=task, protocol="boxes", horizon=3.0)
+    setup = EvaluationSetup(task=task, protocol="clean" if task == "warning" else "boxes", horizon=3.0)
     partial = task == "accident"  # whose list lacks some samples that were asked about
     return evaluate_results(dataset, path, setup, selection, workers=1, allow_partial=partial)
 
@@ -80,9 +80,9 @@ def test_one_who_knows_the_truth_gets_full_marks(da_motion: DeepAccident, asked:
     assert found.time_error == pytest.approx(0, abs=1e-9)
     warned = evaluated(da_motion, path, "warning")
     assert warned.partial is None
-    assert (warned.result.warned_share, warned.result.lasting_share, warned.result.precision) == (1, 1, 1)
-    assert warned.result.mean_warning == warned.result.mean_reach == pytest.approx(3.0)
-    assert set(warned.result.false_alarms.values()) == {0}
+    at = warned.result.groups["ego_involved"].operating
+    assert (at.recall, at.precision, at.time_in_alarm) == (1, 1, 0)
+    assert at.tta0 == pytest.approx(3.0)
 
 
 def test_one_who_always_says_no_gets_none(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
@@ -90,7 +90,8 @@ def test_one_who_always_says_no_gets_none(da_motion: DeepAccident, asked: Asked,
     found = evaluated(da_motion, path, "accident").result
     assert (found.apa, found.recall, found.false_alarm_rate, found.precision) == (0, 0, 0, None)
     warned = evaluated(da_motion, path, "warning").result
-    assert (warned.warned_share, warned.alarms, warned.recordings["accident"]) == (0, 0, 2)
+    figures = warned.groups["ego_involved"]
+    assert (figures.operating.recall, figures.recordings["accident"]) == (0, 1)
 
 
 def test_answers_become_accidents(asked: Asked, tmp_path: Path) -> None:

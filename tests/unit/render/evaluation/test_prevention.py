@@ -6,8 +6,7 @@ from drawing import new_axes, words
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation.metrics.warning import PreventedResult, PreventionCurve, PreventionFigures
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
-from deepaccident_devkit.evaluation.metrics.warning.prevention import OutcomeFigures
+from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS, OutcomeFigures
 from deepaccident_devkit.render.evaluation import render_prevention
 from deepaccident_devkit.safety import OUTCOMES
 

@@ -29,7 +29,7 @@ SETUPS = (
     EvaluationSetup(task="accident", protocol="boxes"),
     EvaluationSetup(task="accident", protocol="paper"),
     EvaluationSetup(task="detection"),
-    EvaluationSetup(task="warning", protocol="boxes"),
+    EvaluationSetup(task="warning", protocol="clean"),
     EvaluationSetup(task="warning", protocol="clean"),
 )
 
@@ -141,26 +141,12 @@ def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list
         "unchecked": [EVIL],
         "verdict": EVIL,
     }
-    explanation = {
-        "samples": 6,
-        "protocol": EVIL,
-        "units": {"apa": "share"},
-        "chosen": {"apa": 0.5},
-        "protocols": {EVIL: {"apa": 0.5}, "paper": {}},
-        "numbers": [
-            {"choice": EVIL, "headline": "apa", "value": 0.75, "change": 0.25, "changed": True},
-            {"choice": "idle=no", "headline": "apa", "value": 0.5, "change": 0.0, "changed": False},
-        ],
-        "refused": {EVIL: EVIL},
-    }
-    run = evaluation_run(da_motion, SETUPS[1], tokens, meta=meta, sanity=sanity, explanation=explanation)
+    run = evaluation_run(da_motion, SETUPS[1], tokens, meta=meta, sanity=sanity)
     path = save_report(run, tmp_path)
     page = page_of(path)
     assert not page.all("script")
     assert all(str(image["src"]).startswith("data:") for image in page.all("img"))
-    assert page.text.count(EVIL) >= 13
-    assert "+0.250" in page.text
-    assert "No number changes with: idle=no." in page.text
+    assert page.text.count(EVIL) >= 8
     assert "http" not in re.sub(
         r"http-equiv", "", path.read_text().replace("<wbr>", "").replace("http://x.example/y.png", "")
     )

@@ -8,12 +8,11 @@ from accident_scenes import as_heads, as_maps, scene, standing
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.truth import UNPLACED_NOTE, AccidentContext
 from deepaccident_devkit.evaluation.metrics.predictions import Accident
@@ -21,7 +20,6 @@ from deepaccident_devkit.motion import OWN_BOX_ID
 from deepaccident_devkit.taxonomy import AGENTS
 
 BOXES = BoxAccidents()
-GIVEN = BoxAccidents(naming="given")
 STEPS = 21
 FIRST, SECOND, THIRD = 11, 22, 33
 
@@ -100,8 +98,8 @@ def test_every_alarm_counts_and_the_surest_of_those_near_enough_is_the_right_one
     assert (made.time_error, made.lateness) == (0.5, 0.5)
     assert made.average_precision == 0.5  # the surer alarm was false
     assert made.precision == pytest.approx(1 / 3)
-    surer = replace(BOXES, min_score=0.8)
-    assert tallies(result(alarms, CRASH, surer)) == [(0, 1, 1)] * 3
+    below = [*alarms, alarm(0, score=-0.1)]  # none
+    assert tallies(result(below, CRASH)) == [(1, 2, 0)] * 3
 
 
 def test_equally_sure_alarms_are_one_step_of_the_precision() -> None:
@@ -109,11 +107,9 @@ def test_equally_sure_alarms_are_one_step_of_the_precision() -> None:
     assert made.average_precision == 0.5
 
 
-def test_ids_count_only_where_somebody_is_named() -> None:
-    assert result([alarm()], CRASH, GIVEN).id_error is None
-    for protocol in (BOXES, GIVEN):
-        assert result([alarm(ids=(FIRST, THIRD))], CRASH, protocol).id_error == 1
-        assert result([alarm(ids=(SECOND, FIRST))], CRASH, protocol).id_error == 0
+def test_ids_are_those_of_actors_in_any_order() -> None:
+    assert result([alarm(ids=(FIRST, THIRD))], CRASH).id_error == 1
+    assert result([alarm(ids=(SECOND, FIRST))], CRASH).id_error == 0
 
 
 def test_without_ids_the_nearest_boxes_at_that_time_are_named() -> None:
@@ -138,19 +134,8 @@ def test_two_positions_name_two_actors() -> None:
     """The second position is nearer to the first car, which is taken; nobody else is near enough, or near at all."""
     close = Accident(positions=np.array([[20.0, 10.0], [18.5, 10.0]]), time=2.0)
     assert result([close], CRASH).id_error == 0
-    assert result([close], CRASH, replace(BOXES, match_distance=2.0)).id_error == 1
     nobody = replace(CRASH, footprint=np.full_like(CRASH.footprint, np.nan))
     assert result([alarm()], nobody).id_error == 1
-
-
-def test_moments_can_be_asked_for() -> None:
-    late = [alarm(time=2.6)]
-    strict = replace(BOXES, scoring=Scoring(time_tolerance=0.5))
-    assert tallies(result(late, CRASH)) == [(1, 0, 0)] * 3
-    assert tallies(result(late, CRASH, strict)) == [(0, 1, 1)] * 3
-    decimals = truth_of(np.linspace(3, 0, 7), seconds=0.6)
-    assert tallies(result([alarm(time=1.1)], decimals, strict)) == [(1, 0, 0)] * 3
-    assert tallies(result([alarm(time=1.15)], decimals, strict)) == [(0, 1, 1)] * 3
 
 
 def test_what_the_recording_cannot_refute_is_not_judged() -> None:
@@ -158,8 +143,6 @@ def test_what_the_recording_cannot_refute_is_not_judged() -> None:
     assert (tallies(calm)[0], calm.unjudged) == ((0, 0, 0), 1)
     refuted = result([alarm(time=2.0)], PASSING)
     assert (tallies(refuted)[0], refuted.unjudged, refuted.false_alarm_rate) == ((0, 1, 0), 0, 1)
-    harsh = result([alarm(time=2.1)], PASSING, replace(BOXES, unjudged_are_false=True))
-    assert tallies(harsh)[0] == (0, 1, 0)
 
 
 def test_whom_the_boxes_bring_near() -> None:
@@ -257,7 +240,7 @@ def test_normal_scenarios_have_no_accident(da_motion: DeepAccident) -> None:
 
 def test_label_maps_against_the_boxes_of_a_release(da_motion: DeepAccident) -> None:
     """Of the colliding pair alone, where both are seen: nothing is lost in the rasters but half a cell of place."""
-    evaluator = AccidentEvaluator(protocol=BOXES, explain=True)
+    evaluator = AccidentEvaluator(protocol=BOXES)
     scenario = next(each for each in da_motion.scenario if each["collision"])
     for agent in AGENTS:
         token = f"{scenario['token']}/{agent}/{scenario['num_frames'] - 10:03d}"
@@ -274,24 +257,17 @@ def test_label_maps_against_the_boxes_of_a_release(da_motion: DeepAccident) -> N
     assert made.recall == 1
     assert made.id_error == 0
     assert made.position_error < 0.71
-    assert set(evaluator.explained()) == set(BOXES.variants())
 
 
 def test_what_cannot_be_evaluated(da_motion: DeepAccident) -> None:
-    assert json.loads(json.dumps(BOXES.settings()))["match_distance"] == BOXES.match_distance
+    assert json.loads(json.dumps(BOXES.settings())) == BOXES.settings()
     with pytest.raises(EvaluationError, match="accident_context"):
         BOXES.counts([alarm()], None, META)
     with pytest.raises(EvaluationError, match="list of Accidents"):
         counted([(1, 2)], CRASH)
-    with pytest.raises(ConfigError, match="min_score"):
-        BoxAccidents(min_score=math.nan)
-    with pytest.raises(ChoiceError, match="naming: expected one of nearest, given, found 'all'"):
-        BoxAccidents(naming="all")
-    assert [BOXES.variants()[f"match_distance={metres}"].match_distance for metres in (2.0, 8.0)] == [2, 8]
-    for protocol in (BoxAccidents, PaperAccidents):
-        for metres in (0, math.inf):
-            with pytest.raises(ConfigError, match="match_distance"):
-                protocol(match_distance=metres)
+    for metres in (0, math.inf):
+        with pytest.raises(ConfigError, match="match_distance"):
+            PaperAccidents(match_distance=metres)
 
 
 def test_a_pair_that_no_label_shows(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading, accident_of
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.metrics.choices import switch_names
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
@@ -123,9 +122,8 @@ def test_the_better_pairing_of_positions_counts() -> None:
     assert result(as_maps(scene({2: HIT[2], 1: HIT[1]})), label).position_error == 0
 
 
-def test_the_limit_and_the_missed_one_are_choices() -> None:
+def test_the_missed_one_is_a_choice() -> None:
     label, predicted = scene(HIT), as_maps(scene(moved(HIT, y=2.5)))
-    assert tallies(result(predicted, label, replace(PAPER, scoring=Scoring(limit_counts=True))))[0] == (1, 0, 0)
     lenient = replace(PAPER, scoring=Scoring(far_is_missed=False))
     assert tallies(result(predicted, label, lenient))[0] == (0, 1, 0)
     assert tallies(result(as_maps(scene(CALM)), label, lenient))[0] == (0, 0, 1)
@@ -315,8 +313,6 @@ def test_what_cannot_be_compared() -> None:
         PAPER.counts(as_maps(label), None, AccidentContext())
     with pytest.raises(EvaluationError, match="expected those of the label protocol 'released'"):
         PAPER.counts(as_maps(label), scene(HIT, protocol="clean"), AccidentContext())
-    assert result(as_maps(label), scene(HIT, protocol="clean"), PaperAccidents(labels="clean")).positives == 1
-    assert result(as_maps(label), scene(HIT, protocol="clean"), PaperAccidents(labels=None)).positives == 1
     with pytest.raises(EvaluationError, match="expected at least 5 frames from the present on, found 3"):
         PAPER.counts(MotionOutput(grid=label.config.grid, instances=label.instance[None, :3]), label, AccidentContext())
     other = BevGrid(x=(-25, 25, 0.25), y=(-25, 25, 0.25))
@@ -326,10 +322,6 @@ def test_what_cannot_be_compared() -> None:
         PAPER.counts(as_maps(label), scene(HIT, frames=0), AccidentContext())
     with pytest.raises(ChoiceError, match="sample_choice: expected one of best, mean_first"):
         PaperAccidents(sample_choice="worst")
-    with pytest.raises(ChoiceError, match="alarm_choice: expected one of surest, any"):
-        PaperAccidents(alarm_choice="all")
-    with pytest.raises(ChoiceError, match="naming: expected one of nearest, given"):
-        PaperAccidents(naming="all")
     with pytest.raises(ChoiceError, match="outline: expected one of centers, cells"):
         AccidentReading(outline="contour")
     with pytest.raises(ConfigError, match="danger_distance"):
@@ -361,9 +353,6 @@ def test_the_surest_explicit_accident_counts_and_of_equally_sure_ones_the_earlie
     unsure, elsewhere = alarm(score=0.5), alarm(x=40)
     for alarms in ([unsure, elsewhere], [elsewhere, unsure]):
         assert tallies(result(alarms, label)) == [(0, 1, 1)] * 3
-        every = result(alarms, label, PaperAccidents(alarm_choice="any"))
-        assert tallies(every) == [(1, 0, 0)] * 3
-        assert tallies(every.beside["sample_choice=mean_first"]) == [(0, 1, 1)] * 3
     early, late = alarm(x=1, time=1.0), alarm(time=1.5)
     assert result([late, early], label).position_error == 2
 
@@ -374,17 +363,12 @@ def test_explicit_accidents_after_the_labels_end_are_cut_like_maps() -> None:
     later = [alarm(time=1.3), alarm(score=0.5, time=1.0)]
     assert result(later, label).time_error == 0.5
     assert tallies(result(later[:1], label)) == [(0, 0, 1)] * 3
-    kept = PaperAccidents(alarms_cut=False)
-    assert tallies(result(later[:1], label, kept)) == [(1, 0, 0)] * 3
 
 
 def test_whom_an_explicit_accident_names() -> None:
     label = scene(HIT | {3: standing(15.5, 13)})
     assert result([alarm(ids=(2, 1))], label).id_error == 0
     assert result([alarm(ids=(2, 3))], label).id_error == 1
-    given = PaperAccidents(naming="given")
-    assert result([alarm()], label, given).id_error is None
-    assert result([alarm(ids=(2, 3))], label, given).id_error == 1
     aside = Accident(positions=np.array([[15.5, 11.6], [20.0, 10.0]]), time=1.5)
     assert result([aside], label).id_error == 1  # the third is nearer
     assert result([replace(aside, positions=aside.positions - [0, 0.2])], label).id_error == 0
@@ -409,20 +393,19 @@ def test_orientations_of_prediction_and_label_may_differ() -> None:
         assert PAPER.counts(as_maps(lying), label, AccidentContext()) == expected
 
 
-def test_counts_are_json_and_each_choice_is_explained() -> None:
-    evaluator = AccidentEvaluator(protocol=PAPER, explain=True)
+def test_counts_are_json_and_choices_change_them() -> None:
     label = scene(HIT)
-    evaluator.update("one", as_heads(*[scene(moved(HIT, y=2.5))] * 2), label)
-    evaluator.update("two", as_maps(label), label)
+
+    def evaluated(**choices: object) -> AccidentEvaluator:
+        evaluator = AccidentEvaluator(protocol=replace(PAPER, **choices))
+        evaluator.update("one", as_heads(*[scene(moved(HIT, y=2.5))] * 2), label)
+        evaluator.update("two", as_maps(label), label)
+        return evaluator
+
+    evaluator = evaluated()
     assert json.loads(json.dumps(evaluator.counts["one"])) == evaluator.counts["one"]
     json.dumps(evaluator.settings)
     json.dumps(evaluator.compute().as_dict())
-    explained = evaluator.explained()
-    assert set(explained) == set(PAPER.variants())
     assert evaluator.compute().within[5.0].tp == 1
-    assert explained["scoring.limit_counts=True"].within[5.0].tp == 2
-    assert explained["scoring.far_is_missed=False"].within[5.0].fn == 0
-    assert explained["reading.danger_distance=0.5"].positives == 0
-    names = {name.split("=")[0] for name in explained}
-    assert {f"reading.{each.name}" for each in fields(AccidentReading)} | {"sample_choice"} <= names
-    assert names <= set(switch_names(PAPER))
+    assert evaluated(scoring=Scoring(far_is_missed=False)).compute().within[5.0].fn == 0
+    assert evaluated(reading=AccidentReading(danger_distance=0.5)).compute().positives == 0

@@ -5,7 +5,7 @@ import pytest
 from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
-from deepaccident_devkit.evaluation.metrics.accident import AccidentReading, BoxAccidents, accidents_of
+from deepaccident_devkit.evaluation.metrics.accident import AccidentReading, accidents_of
 from deepaccident_devkit.evaluation.metrics.alarms.raised import foreseen_accident, named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.truth import BoxTruth
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
@@ -59,7 +59,7 @@ def test_a_foreseen_accident_is_the_alarm_of_the_protocol_boxes(cars, score, fra
     labels = [scene(each, **config) for each in cars]
     output, settings = form(*labels), labels[0].config
     found = foreseen_accident(output, labels=settings.protocol)
-    alarms = named_alarms(output, labels[0], NOBODY, BoxAccidents())
+    alarms = named_alarms(output, labels[0], NOBODY, AccidentReading())
     if score is None:
         assert found is None
         assert alarms == []

@@ -6,7 +6,6 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation.metrics.detection import (
     DETECTION_PROTOCOLS,
     DetectionEvaluator,
-    DetectionProtocol,
     detection_protocol,
 )
 
@@ -33,30 +32,6 @@ def test_protocols_and_switches_that_cannot_be() -> None:
             detection_protocol("paper", **switches)
     assert detection_protocol("paper", thresholds=[1, 2, 4]).thresholds == (1, 2, 4)
     assert detection_protocol("paper", points=2, min_recall=0.99).points == 2
-
-
-@pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS.values(), ids=DETECTION_PROTOCOLS)
-def test_each_variant_of_a_protocol_makes_the_choice_that_it_is_named_by(protocol: DetectionProtocol) -> None:
-    variants = protocol.variants()
-    for name, variant in variants.items():
-        choice, value = name.split("=", 1)
-        assert str(getattr(variant, choice)) == value != str(getattr(protocol, choice))
-    always = {
-        "truth",
-        "frame",
-        "measure",
-        "curve",
-        "area",
-        "matching",
-        "own_box",
-        "single_precision",
-        "threshold_included",
-    }
-    assert {name.split("=")[0] for name in variants} >= always
-    in_metres = protocol.measure.startswith("distance")
-    assert any(name.startswith("thresholds=") for name in variants) == in_metres
-    of_one_agent = protocol.frame == "lidar" and protocol.truth != "cooperative"
-    assert (f"label_velocity={not protocol.label_velocity}" in variants) == of_one_agent
 
 
 def test_the_numbers_of_published_procedures() -> None:

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,23 +14,21 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context
 from deepaccident_devkit.evaluation.metrics.alarms import truth
-from deepaccident_devkit.evaluation.metrics.alarms.constant_velocity import constant_velocity_alarms
+from deepaccident_devkit.evaluation.metrics.alarms.truth import constant_velocity_alarms
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
 from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.evaluation.metrics.warning import (
     AnticipationResult,
     CleanScores,
     CleanWarnings,
-    FieldQuirks,
-    FieldWarnings,
     ScoreSeries,
     WarningEvaluator,
     anticipation,
     field_figures,
+    printed_figures,
 )
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import mean_of
-from deepaccident_devkit.evaluation.metrics.warning.drives import REFERENCES, TRIVIAL
-from deepaccident_devkit.evaluation.metrics.warning.recordings import surest
+from deepaccident_devkit.evaluation.metrics.warning.recordings import REFERENCES, TRIVIAL, surest
 
 PAIR = (11, 22)
 MEETING = np.array([[20.0, 10.0], [16.0, 10.0]])
@@ -72,9 +70,10 @@ def evaluated(
     pairs: int = 16,
     ids: tuple[int, int] = PAIR,
     time: float = 1.0,
+    away: float = 0.0,
     agents: Sequence[tuple[str, str]] = (("ego_vehicle", "ego_involved"),),
 ) -> WarningEvaluator:
-    """Accident recordings of 6 s and twins of 9 s, two samples a second."""
+    """Accident recordings of 6 s and twins of 9 s, two samples a second; alarms `away` metres off."""
     evaluator = WarningEvaluator(protocol)
     for number in range(pairs):
         for ending, last in (("accident", 61), ("normal", 91)):
@@ -82,7 +81,7 @@ def evaluated(
                 frames = np.arange(1, last + 1, 5)
                 given = scores(ending == "accident", (last - frames) / 10)
                 for frame, score in zip(frames, given, strict=True):
-                    alarm = Accident(positions=MEETING, time=time, score=float(np.nan_to_num(score)), ids=ids)
+                    alarm = Accident(positions=MEETING + away, time=time, score=float(np.nan_to_num(score)), ids=ids)
                     evaluator.update(
                         f"type1_subtype1_{ending}/s{number}/{agent}/{frame:03d}",
                         [] if math.isnan(score) else [alarm],
@@ -152,16 +151,16 @@ def test_a_siren_pays_in_precision_and_time_and_names_do_not_help_it(ids: tuple[
 
 
 def test_whoever_names_others_foresees_nothing_but_where_recordings_count() -> None:
-    """The place is wrong, too, if only the pair counts."""
+    """The place is wrong, too."""
 
     def right_time(crash: bool, ahead: np.ndarray) -> np.ndarray:
         return np.where(crash & (ahead <= 2), 0.9, np.nan)
 
-    of_pair = evaluated(right_time, CleanWarnings(correct_by="pair", threshold=0.5), pairs=4, ids=(33, 44))
+    of_pair = evaluated(right_time, CleanWarnings(threshold=0.5), pairs=4, ids=(33, 44), away=50)
     misled = of_pair.compute().groups["ego_involved"]
     assert (misled.average_precision, misled.operating.precision, misled.operating.recall) == (0, 0, 0)
-    whole = CleanWarnings(correct_by="pair", scores_of="recording", threshold=0.5)
-    figures = evaluated(right_time, whole, pairs=4, ids=(33, 44)).compute().groups["ego_involved"]
+    whole = CleanWarnings(scores_of="recording", threshold=0.5)
+    figures = evaluated(right_time, whole, pairs=4, ids=(33, 44), away=50).compute().groups["ego_involved"]
     assert (figures.average_precision, figures.area_under_curve, figures.twin_wins) == (1, 1, 1)
     assert (figures.operating.recall, figures.operating.tta0, figures.operating.time_in_alarm) == (1, 2, 0)
 
@@ -264,57 +263,24 @@ def test_draws_are_as_the_result_of_the_same_samples_given_so_often() -> None:
 
 
 def test_recall_and_lead_never_stand_without_precision_and_time_in_alarm() -> None:
-    for protocol in ("clean", "boxes"):
-        names = [each.name for each in headlines("warning", evaluated(skilled(0), protocol, pairs=3).compute())]
-        leads = [at for at, name in enumerate(names) if name.startswith(("recall", "tta", "warned", "mean_warning"))]
-        assert leads
-        for word in ("precision", "time_in_alarm"):
-            assert min(at for at, name in enumerate(names) if word in name) < min(leads)
-
-
-@pytest.mark.parametrize("quirk", [each.name for each in fields(FieldQuirks) if each.name != "five_seconds"])
-def test_each_published_quirk_can_be_left_out(quirk: str) -> None:
-    """On recordings that show them all: an exact zero, ties, a miss, an early impact, few frames."""
-    scores = np.array([[0.0, 0.2, 0.9, 0.1], [0.3, 0.3, 0.3, 0.3], [0.0, 0.1, 0.2, 0.9], [0.0, 0.9, 0.0, 0.0]] * 100)
-    series = ScoreSeries(
-        scores=scores, positive=np.array([True, True, False, False] * 100), toa=np.array([3.0, 2, 4, 4] * 100), fps=2.0
-    )
-    if quirk == "as_many_thresholds_as_frames":
-        series = ScoreSeries(scores=scores[:4], positive=series.positive[:4], toa=series.toa[:4], fps=2.0)
-    if quirk == "highest_recall_takes_first":  # perfect, but for alarms of all at the lowest threshold
-        series = ScoreSeries(
-            scores=np.tile([[0.1] * 40 + [0.9] * 40, [0.1] * 80], (20, 1)),
-            positive=np.array([True, False] * 20),
-            toa=np.full(40, 80.0),
-            fps=10.0,
-        )
-    kept = replace(FieldQuirks(), nonsense_kept=quirk != "nonsense_kept")
-    as_it_is, without = (field_figures(series, "ustring", each) for each in (kept, _other(kept, quirk)))
-    assert as_it_is != without
-
-
-def test_seconds_of_dad() -> None:
-    series = ScoreSeries(
-        scores=np.array([[0.1, 0.9, 0.9, 0.9], [0.1, 0.1, 0.1, 0.2]]),
-        positive=np.array([True, False]),
-        toa=np.array([4.0, 4.0]),
-        fps=2.0,
-    )
-    five, two = (field_figures(series, "dad", FieldQuirks(five_seconds=each)).mean_time for each in (True, False))
-    assert five == pytest.approx(2.5 * two)
-
-
-def _other(quirks: FieldQuirks, name: str) -> FieldQuirks:
-    return replace(quirks, **{name: not getattr(quirks, name)})
+    names = [each.name for each in headlines("warning", evaluated(skilled(0), pairs=3).compute())]
+    leads = [at for at, name in enumerate(names) if name.startswith(("recall", "tta"))]
+    assert leads
+    for word in ("precision", "time_in_alarm"):
+        assert min(at for at, name in enumerate(names) if word in name) < min(leads)
 
 
 def test_field_says_why_a_number_is_none() -> None:
     result = evaluated(never, "field", pairs=2).compute()
     figures = result.figures["ustring ego_involved"]
     assert math.isnan(figures.average_precision)
-    assert any("zero_alarms_negatives" in note for note in result.notes)
-    kept = FieldWarnings(quirks=FieldQuirks(nonsense_kept=True))
-    assert evaluated(never, kept, pairs=2).compute().figures["ustring ego_involved"].average_precision == 2.0
+    assert any("recordings without an accident count as true positives" in note for note in result.notes)
+
+
+def test_what_a_code_prints_may_be_above_1() -> None:
+    nothing = ScoreSeries(scores=np.zeros((4, 6)), positive=np.array([True, False] * 2), toa=np.full(4, 6.0), fps=2.0)
+    assert printed_figures(nothing, "ustring").average_precision == 2.0
+    assert math.isnan(field_figures(nothing, "ustring").average_precision)
 
 
 def test_without_recordings_there_is_nothing() -> None:
@@ -329,20 +295,12 @@ def test_without_recordings_there_is_nothing() -> None:
     ("choices", "error", "message"),
     [
         ({"scores_of": "scene"}, ChoiceError, "scores_of: expected one of pair, recording"),
-        ({"window": 0.0}, ConfigError, "window: expected seconds above 0"),
-        ({"window": math.inf}, ConfigError, "window: expected seconds above 0"),
         ({"threshold": math.inf}, ConfigError, "threshold: expected a number, or None"),
-        ({"correct_by": "luck"}, ChoiceError, "correct_by: expected one of either, pair, place"),
     ],
 )
 def test_choices_are_checked(choices: dict, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         CleanWarnings(**choices)
-
-
-def test_field_knows_pairs_and_recordings_alone() -> None:
-    with pytest.raises(ChoiceError, match="scores_of: expected one of pair, recording, found 'scene'"):
-        FieldWarnings(scores_of="scene")
 
 
 def test_means_over_draws_leave_unknown_numbers_out_and_keep_counts_and_words() -> None:
@@ -406,11 +364,9 @@ def test_results_are_as_json_holds_them() -> None:
     assert result.as_dict()["groups"]["ego_involved"]["recordings"] == {"accident": 3, "twins": 3, "others": 0}
 
 
-@pytest.mark.parametrize("protocol", ["clean", "field"])
-def test_settings_are_the_protocols(protocol: str) -> None:
-    evaluator = WarningEvaluator(protocol)
-    assert evaluator.settings == evaluator.protocol.settings()
-    assert evaluator.settings
+def test_settings_are_the_protocols_choices() -> None:
+    assert WarningEvaluator().settings == {"scores_of": "pair", "threshold": None}
+    assert WarningEvaluator("field").settings == {}
 
 
 def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     PreventedResult,
     anticipation,
 )
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Skipped
 
 FRAMES = np.arange(1, 62, 5)
@@ -304,8 +304,8 @@ def test_no_alarm_at_the_impact_or_after_it_warns() -> None:
 
 
 def test_other_protocols_have_no_scores_of_recordings() -> None:
-    with pytest.raises(EvaluationError, match="counted by the protocol clean, found WarningProtocol"):
-        PreventedEvaluator(AccidentOutcomes(), "boxes")
+    with pytest.raises(EvaluationError, match="counted by the protocol clean, found FieldWarnings"):
+        PreventedEvaluator(AccidentOutcomes(), "field")
 
 
 @pytest.mark.parametrize(

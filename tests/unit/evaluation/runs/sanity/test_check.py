@@ -202,7 +202,7 @@ def test_swapped_classes_are_told_unless_the_boxes_are_elsewhere(da_motion: Deep
     assert [each.name for each in report.candidates if each.suspected] == ["left-handed world"]
 
 
-@pytest.mark.parametrize(("task", "protocol"), [("accident", "boxes"), ("accident", "paper"), ("warning", "boxes")])
+@pytest.mark.parametrize(("task", "protocol"), [("accident", "boxes"), ("accident", "paper"), ("warning", "clean")])
 def test_explicit_accidents(da_motion: DeepAccident, tokens: list[str], task: Any, protocol: str) -> None:
     setup = EvaluationSetup(task=task, protocol=protocol)
     known = {token: accident_context(da_motion, token, 2.0).truth for token in tokens}
@@ -212,7 +212,7 @@ def test_explicit_accidents(da_motion: DeepAccident, tokens: list[str], task: An
     }
     report = sanity(da_motion, MemoryResults("accident", right), setup, tokens)
     assert report.warnings == ()
-    name = "warned_share" if task == "warning" else "apa"
+    name = "recall ego_involved" if task == "warning" else "apa"
     assert (report.perfect[name], report.empty[name]) == (1.0, 0.0)
     late = {token: [delayed(each) for each in alarms] for token, alarms in right.items()}
     (warning,) = sanity(da_motion, MemoryResults("accident", late), setup, tokens, samples=10).warnings
