@@ -144,7 +144,7 @@ def _task_verb(task: TaskName) -> click.Command:
     )
     @resamples_parameter
     @click.option(
-        "--sanity", is_flag=True, help="Test whether the predictions are mirrored, rotated, shifted, scaled, …"
+        "--sanity", is_flag=True, help="Look for classic mistakes: mirrored axes, another frame, swapped classes, …"
     )
     @click.option(
         "--explain", "explained", is_flag=True, help="Show how much each field of the protocol changes the numbers."

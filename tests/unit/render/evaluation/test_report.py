@@ -132,14 +132,8 @@ def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list
     meta: Mapping[str, Any] = {"method": EVIL, EVIL: [{EVIL: EVIL}]}
     sanity = {
         "samples": 20,
-        "perfect": {"apa": 1.0},
-        "empty": {"apa": 0.0},
-        "given": {"apa": None},
-        "units": {"apa": "share"},
-        "candidates": [{"name": EVIL, "description": EVIL, "score": 0.5, "given": None, "suspected": True}],
+        "candidates": [{"name": EVIL, "description": EVIL, "score": 0.5, "given": 0.1, "suspected": True}],
         "warnings": [EVIL],
-        "unchecked": [EVIL],
-        "verdict": EVIL,
     }
     explanation = {
         "samples": 6,
@@ -158,7 +152,7 @@ def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list
     page = page_of(path)
     assert not page.all("script")
     assert all(str(image["src"]).startswith("data:") for image in page.all("img"))
-    assert page.text.count(EVIL) >= 13
+    assert page.text.count(EVIL) >= 11
     assert "+0.250" in page.text
     assert "No number changes with: idle=no." in page.text
     assert "http" not in re.sub(
