@@ -11,7 +11,7 @@ from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import Clusters
-from deepaccident_devkit.evaluation.runs.bundles import Bundle, counted, read_bundle
+from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.differences import differing
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.reading import shortened
@@ -66,7 +66,7 @@ def comparable_pair(first: Path, second: Path, *, common: bool = False) -> Compa
     """
     one, other = read_bundle(first), read_bundle(second)
     _check_rules(one, other)
-    evaluators = counted(one), counted(other)
+    evaluators = one.evaluator(), other.evaluator()
     tokens = _shared_tokens((one, other), evaluators, common=common)
     scenarios: dict[str, list[str]] = {}
     for token in tokens:
