@@ -13,10 +13,10 @@ from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines, value_text
 from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.evaluation.runs.notes import reading_notes
 from deepaccident_devkit.evaluation.runs.predictors import PredictorTable, predictor_tables
-from deepaccident_devkit.evaluation.runs.prevention_text import prevention_tables
+from deepaccident_devkit.evaluation.runs.prevention import prevention_tables
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
+from deepaccident_devkit.evaluation.runs.text import reading_notes
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
 from deepaccident_devkit.render.markup import Markup, facts, joined, number, scalar, table, tag, tree
 
