@@ -63,6 +63,7 @@ _NEAR: Final = 2.0
 _NEAR_IN_HEIGHT: Final = 0.7
 """Metres: nearer, since LiDAR and ego frame differ by the LiDAR's height alone, some 2 m."""
 _NEAR_IN_TIME: Final = 0.15
+"""Seconds, of accidents."""
 _ALIKE: Final = 0.25
 """A size is right that differs from the true one by at most this share."""
 _FEWEST: Final = 5
@@ -200,8 +201,11 @@ def check_sanity(
         f"{each.given:.0%} as it is)"
         for each in suspected
     ]
-    ranked = not lists or setup.task == "warning" or isinstance(setup.rules, BoxAccidents)
-    warnings += _facts(seen, setup, ranked=ranked)
+    warnings += _facts(
+        seen, setup, ranked=not lists or setup.task == "warning" or isinstance(setup.rules, BoxAccidents)
+    )
+    if not any(each.name in _SAYS["place"] for each in suspected):
+        warnings += _headings_text(seen)
     return SanityReport(samples=len(seen), candidates=candidates, warnings=tuple(warnings))
 
 
@@ -271,7 +275,7 @@ def _worst(part: FloatArray, whole: FloatArray) -> float:
 
 
 def _facts(seen: Sequence[_Seen], setup: EvaluationSetup, *, ranked: bool) -> Iterable[str]:
-    """What shows without the labels, and headings that look random."""
+    """What shows without the labels."""
     if all(each.empty for each in seen):
         yield f"all {len(seen)} predictions looked at are empty: nothing is predicted in them"
     scores = [score for each in seen for score in each.scores]
@@ -291,6 +295,9 @@ def _facts(seen: Sequence[_Seen], setup: EvaluationSetup, *, ranked: bool) -> It
             f"half of the accidents are more than {np.median(times):g} s ahead, the horizon is {setup.horizon:g} s: "
             "times are seconds after the present, not frames, and not of the recording"
         )
+
+
+def _headings_text(seen: Sequence[_Seen]) -> Iterable[str]:
     right, every = (sum(each.headings[index] for each in seen) for index in (0, 1))
     if every >= _EVIDENCE["detection"] and right < _RANDOM * every:
         yield (
