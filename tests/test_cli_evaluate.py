@@ -243,9 +243,10 @@ class TestVerify:
         summary["metrics"]["apa"] = 0.5
         path.write_text(json.dumps(summary))
         try:
-            assert "number: metrics/apa: stored 0.5, found 1.0" in evaluate(*words, status=1).output
+            assert "metrics_summary.json: metrics/apa: stored 0.5, found 1.0" in evaluate(*words, status=1).output
             stated = json.loads(evaluate(*words, "--json", status=1).stdout)
-            assert [each["where"] for each in stated["differences"]] == ["metrics_summary.json", "metrics/apa"]
+            changed = [each["where"] for each in stated["differences"]]
+            assert changed == ["files.json: metrics_summary.json", "metrics_summary.json: metrics/apa"]
         finally:
             path.write_text(before)
 

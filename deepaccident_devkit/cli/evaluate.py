@@ -142,7 +142,7 @@ def _task_verb(task: TaskName) -> click.Command:
     )
     @resamples_parameter
     @click.option(
-        "--sanity", is_flag=True, help="Test whether the predictions are mirrored, rotated, shifted, scaled, …"
+        "--sanity", is_flag=True, help="Look for classic mistakes: mirrored axes, another frame, swapped classes, …"
     )
     @click.option(
         "--out", type=click.Path(path_type=Path), help="Folder to write all numbers, figures and a report into."

@@ -7,36 +7,65 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+import msgspec
+
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING
 from deepaccident_devkit.evaluation.metrics.headlines import LIMITS, value_text
 from deepaccident_devkit.evaluation.runs import Bundle
-from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
-from deepaccident_devkit.evaluation.runs.shapes import EACH, LINE, NUMBER, OBJECT, WHOLE, misfits
+from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE, Line
 from deepaccident_devkit.explore.scenarios import UNKNOWN
+from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
 from deepaccident_devkit.render.markup import scalar
 
-_GROUP: Final = {
-    "value": (None, LINE),
-    "samples": WHOLE,
-    "scenarios": WHOLE,
-    "headlines": {EACH: (None, NUMBER)},
-    "intervals": {EACH: [(None, NUMBER)]},
-    "notes": [LINE],
-}
-_SHOWN: Final = {
-    "devkit_version": LINE,
-    "counts": {"samples": WHOLE, "scenarios": WHOLE},
-    "results": {"fingerprint": LINE, "meta": OBJECT},
-    "headlines": [{"name": LINE, "text": LINE, "path": LINE, "unit": LINE}],
-    "breakdowns": {EACH: {"resampling": {"confidence": NUMBER}, "groups": [_GROUP]}},
-}
-"""Of a summary what is shown beyond what `read_bundle` has checked."""
 _METHOD: Final = ("method", "name", "authors", "url", "date")
 """What results say of themselves, and is shown if they do."""
 Json = Mapping[str, Any]
 Ends = tuple[float, float]
+
+
+class _Counted(msgspec.Struct):
+    samples: int
+    scenarios: int
+
+
+class _Results(msgspec.Struct):
+    fingerprint: Line
+    meta: dict[str, Any]
+
+
+class _Headline(msgspec.Struct):
+    name: Line
+    text: Line
+    path: Line
+    unit: Line
+
+
+class _Resampling(msgspec.Struct):
+    confidence: float
+
+
+class _Group(_Counted):
+    value: Line | None
+    headlines: dict[str, float | None]
+    intervals: dict[str, list[float | None]]
+    notes: list[Line]
+
+
+class _Breakdown(msgspec.Struct):
+    resampling: _Resampling
+    groups: list[_Group]
+
+
+class _Shown(msgspec.Struct):
+    """Of a summary what is shown beyond what `read_bundle` has checked."""
+
+    devkit_version: Line
+    counts: _Counted
+    results: _Results
+    headlines: list[_Headline]
+    breakdowns: dict[str, _Breakdown]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,8 +153,10 @@ class Evaluated:
 def evaluated(bundle: Bundle) -> Evaluated:
     """A bundle's numbers; raises ResultsError if its summary does not hold them."""
     summary = bundle.summary
-    for misfit in misfits(summary, _SHOWN):
-        raise ResultsError(f"{bundle.folder / SUMMARY_FILE}: cannot be shown ({misfit}); evaluate again")
+    try:
+        as_record(summary, _Shown)
+    except ValueError as error:
+        raise ResultsError(f"{bundle.folder / SUMMARY_FILE}: cannot be shown ({error}); evaluate again") from error
     everything = summary["breakdowns"].get(EVERYTHING)
     group = next(iter(everything["groups"]), None) if everything is not None else None
     main = _main_number(summary)

@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.headlines import headlines, value_text
 from deepaccident_devkit.evaluation.results import Results, read_results
-from deepaccident_devkit.evaluation.runs import Bundle, read_bundle, read_rows
-from deepaccident_devkit.evaluation.runs.bundles import ROWS_FILE, counted, own_file
+from deepaccident_devkit.evaluation.runs import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
 from deepaccident_devkit.explore.background import Job, Jobs
@@ -91,11 +89,7 @@ class Model:
         """Token → the row of `samples.parquet`; empty without a bundle."""
         if self.bundle is None:
             return {}
-        path = own_file(self.bundle.folder / ROWS_FILE)
-        rows, _ = read_rows(path)
-        if any(not isinstance(row.get("token"), str) for row in rows):
-            raise ResultsError(f"{path}: has rows without a sample's token; evaluate again")
-        return {row["token"]: row for row in rows}
+        return self.bundle.rows()
 
     @property
     def tokens(self) -> Iterable[str]:
@@ -138,7 +132,7 @@ class Model:
     def _scores(self) -> Scores | None:
         if self.bundle is None:
             return None
-        evaluator, task = counted(self.bundle), self.setup.task
+        evaluator, task = self.bundle.evaluator(), self.setup.task
         known = {each.path: each for each in headlines(task, evaluator.compute())}
         main = next((known[path] for path in MAIN_NUMBERS[task] if path in known), None)
         if main is None:  # this protocol has no such number

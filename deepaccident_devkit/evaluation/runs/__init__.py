@@ -7,7 +7,6 @@ says which differences of two are real.
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
 from deepaccident_devkit.evaluation.runs.compare import compare_bundles
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
-from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
 from deepaccident_devkit.evaluation.runs.differences import Difference
 from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results, evaluate_shard
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
@@ -20,7 +19,7 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
 )
 from deepaccident_devkit.evaluation.runs.prevention import prevented_accidents, with_prevented
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
-from deepaccident_devkit.evaluation.runs.selection import SampleSelection
+from deepaccident_devkit.evaluation.runs.selection import Coverage, SampleSelection, coverage
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
 from deepaccident_devkit.evaluation.runs.verification import Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes

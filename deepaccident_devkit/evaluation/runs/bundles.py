@@ -9,7 +9,9 @@ import stat
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+import msgspec
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ResultsError
@@ -17,12 +19,11 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results.header import check_token
 from deepaccident_devkit.evaluation.runs.checkpoints import remove_checkpoints
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
-from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
+from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.evaluation.runs.shapes import FILES, SCENARIOS, SUMMARY, misfits
 from deepaccident_devkit.files import path_of, remove_in, replacing_folder, temporary_path
-from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.json_text import Record, as_record, parsed_json
 from deepaccident_devkit.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
@@ -34,9 +35,70 @@ FILES_FILE: Final = "files.json"
 RESULTS_FOLDER: Final = "results"
 SCENARIOS_FORMAT: Final = "DeepAccident scenario hashes"
 FILES_FORMAT: Final = "DeepAccident evaluation bundle"
+Line = Annotated[
+    str,
+    msgspec.Meta(
+        max_length=1000,
+        pattern=r"^[^\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]*\Z",
+    ),
+]
+"""A name, a path, a checksum: what shows in a terminal, in a line."""
 _MOST_TOLD: Final = 600
 """Characters of what is wrong, names in the file among them."""
 _REMEDY: Final = "give a folder that `deepaccident evaluate … --out` wrote, or evaluate again"
+
+
+class _Release(msgspec.Struct):
+    version: Line
+    dataroot: Line
+
+
+class _Results(msgspec.Struct):
+    path: Line
+    form: dict[str, Any] | None
+
+
+class _Counts(msgspec.Struct):
+    left_out: int
+
+
+class _Partial(msgspec.Struct):
+    mark: Line
+
+
+class _Breakdown(msgspec.Struct):
+    resampling: dict[str, Any]
+
+
+class _Summary(msgspec.Struct):
+    """Of `metrics_summary.json` all that is used, and not only compared."""
+
+    task: Line
+    protocol: Line
+    switches: dict[str, Any]
+    horizon: float
+    split: Line
+    samples: Line
+    scope: Line
+    agents: list[Line] | None
+    counts: _Counts
+    partial: _Partial | None
+    release: _Release
+    results: _Results
+    breakdowns: dict[str, _Breakdown]
+    environment: dict[str, Line]
+
+
+class _Scenarios(msgspec.Struct):
+    """Of `scenarios.json`: scenario → hashes of its label, meta and calib files."""
+
+    scenarios: dict[Line, dict[str, Line | None]]
+
+
+class _Files(msgspec.Struct):
+    """Of `files.json`: file → checksum."""
+
+    files: dict[Line, Line]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,13 +171,39 @@ class Bundle(ShortRepr):
 
     def scenarios(self) -> dict[str, dict[str, str | None]]:
         """Scenario → hashes of its label, meta and calib files; raises ResultsError."""
-        stored: dict[str, dict[str, str | None]] = self._checked(SCENARIOS_FILE, SCENARIOS_FORMAT, SCENARIOS)
-        return stored
+        return _stated(self.folder / SCENARIOS_FILE, SCENARIOS_FORMAT, _Scenarios).scenarios
 
     def checksums(self) -> dict[str, str]:
         """File → checksum of all that was written, except the list itself; raises ResultsError."""
-        stored: dict[str, str] = self._checked(FILES_FILE, FILES_FORMAT, FILES)
-        return stored
+        return _stated(self.folder / FILES_FILE, FILES_FORMAT, _Files).files
+
+    def counts(self) -> dict[str, Any]:
+        """Token → the counts of a sample, as they are stored; raises ResultsError."""
+        counts = read_json(self.folder / COUNTS_FILE, None).get("counts")
+        if not isinstance(counts, dict):
+            raise ResultsError(f"{self.folder / COUNTS_FILE}: holds no counts; {_REMEDY}")
+        return counts
+
+    def rows(self) -> dict[str, Row]:
+        """Token → the row of a sample; raises ResultsError."""
+        path = own_file(self.folder / ROWS_FILE)
+        rows, _ = read_rows(path)
+        if any(not isinstance(row.get("token"), str) for row in rows):
+            raise ResultsError(f"{path}: has rows without a sample's token; {_REMEDY}")
+        return {row["token"]: row for row in rows}
+
+    def evaluator(self) -> Evaluator[Any]:
+        """All counts, of which a result can be computed; raises ResultsError or EvaluationError."""
+        path = own_file(self.folder / COUNTS_FILE)
+        evaluator = self.setup.evaluator().resume(path)
+        try:
+            for token in evaluator.tokens:
+                check_token(token)
+            evaluator.compute()
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            told = f"{type(error).__name__}: {shortened(str(error))}"
+            raise ResultsError(f"{path}: does not hold counts of its protocol ({told}); evaluate again") from error
+        return evaluator
 
     def results_copy(self) -> Path | None:
         """The copy of the results in the bundle; None without one.
@@ -134,17 +222,9 @@ class Bundle(ShortRepr):
             raise ResultsError(f"{copies}: expected one results file or folder, found {len(inside)}; {_REMEDY}")
         return inside[0]
 
-    def _checked(self, name: str, form: str, shape: Mapping[str, Any]) -> Any:
-        """The part of one of the files that a shape is of; raises ResultsError."""
-        stored = read_json(self.folder / name, form)
-        for misfit in misfits(stored, shape):
-            raise ResultsError(f"{self.folder / name}: {misfit}; {_REMEDY}")
-        (part,) = shape
-        return stored[part]
-
     def _damaged(self, reason: object) -> ResultsError:
         told = shortened(str(reason), _MOST_TOLD)
-        return ResultsError(f"{self.folder / SUMMARY_FILE}: does not say what was evaluated ({told}); {_REMEDY}")
+        return ResultsError(f"{self.folder / SUMMARY_FILE}: does not say what was evaluated: {told}; {_REMEDY}")
 
 
 def read_bundle(folder: Path) -> Bundle:
@@ -154,23 +234,20 @@ def read_bundle(folder: Path) -> Bundle:
         raise ResultsError(f"{folder}: no such folder; {_REMEDY}")
     path = folder / SUMMARY_FILE
     summary = read_json(path, SUMMARY_FORMAT)
-    for misfit in misfits(summary, SUMMARY):
-        raise ResultsError(f"{path}: does not say what was evaluated ({misfit}); {_REMEDY}")
+    _record(path, summary, _Summary, "does not say what was evaluated: ")
     return Bundle(folder=folder, summary=summary)
 
 
-def counted(bundle: Bundle) -> Evaluator[Any]:
-    """A bundle's counts, of which a result can be computed; raises ResultsError or EvaluationError."""
-    path = own_file(bundle.folder / COUNTS_FILE)
-    evaluator = bundle.setup.evaluator().resume(path)
+def _stated(path: Path, form: str, kind: type[Record]) -> Record:
+    """What one of a bundle's JSON files states; raises ResultsError."""
+    return _record(path, read_json(path, form), kind)
+
+
+def _record(path: Path, content: object, kind: type[Record], told: str = "") -> Record:
     try:
-        for token in evaluator.tokens:
-            check_token(token)
-        evaluator.compute()
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        told = f"{type(error).__name__}: {shortened(str(error))}"
-        raise ResultsError(f"{path}: does not hold counts of its protocol ({told}); evaluate again") from error
-    return evaluator
+        return as_record(content, kind)
+    except ValueError as error:
+        raise ResultsError(f"{path}: {told}{error}; {_REMEDY}") from error
 
 
 def own_file(path: Path) -> Path:

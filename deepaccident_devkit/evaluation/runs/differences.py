@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.reading import shortened
 
-DifferenceKind = Literal["version", "file", "scenario", "results", "number", "sample", "evaluation"]
 ABSENT: Final = "absent"
 """Stands for a missing value."""
 _LONGEST: Final = 60
@@ -22,29 +21,23 @@ class Difference(ShortRepr):
     """What a bundle says, and what was found.
 
     Attributes:
-        kind: `version` of the devkit; `file` of the bundle; `scenario`, whose label, meta or calib files changed or are
-            gone; `results`, the predictions; `number` of the summary; `sample`, its counts or its row; `evaluation`,
-            which could not be made again.
-        where: its place, such as `metrics/apa` or `<scenario>: label`.
+        where: its file and its place there, such as `metrics_summary.json: metrics/apa`.
         stored: what the bundle says.
         found: what was found.
     """
 
-    kind: DifferenceKind
     where: str
     stored: Any
     found: Any
 
     def text(self) -> str:
         """In a line."""
-        if self.kind == "evaluation":
-            return f"{self.kind}: {self.where}: cannot be made again: {self.found}"
         where = shortened(self.where if self.where.isprintable() else ascii(self.where), _LONGEST_PLACE)
-        return f"{self.kind}: {where}: stored {_short(self.stored)}, found {_short(self.found)}"
+        return f"{where}: stored {_short(self.stored)}, found {_short(self.found)}"
 
     def as_dict(self) -> dict[str, Any]:
         """By name."""
-        return {"kind": self.kind, "where": self.where, "stored": self.stored, "found": self.found}
+        return {"where": self.where, "stored": self.stored, "found": self.found}
 
 
 def differing(stored: Any, found: Any, *, without: Collection[str] = ()) -> Iterator[tuple[str, Any, Any]]:

@@ -15,10 +15,16 @@ from deepaccident_devkit.evaluation.metrics.attributes import sample_attributes
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, stored_shards, whole_counts
-from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, Partial, ReleaseInfo, ResultsInfo
 from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples, take_stored
-from deepaccident_devkit.evaluation.runs.selection import SampleList, SampleSelection, ScopeName, scenario_of
+from deepaccident_devkit.evaluation.runs.selection import (
+    Coverage,
+    SampleList,
+    SampleSelection,
+    ScopeName,
+    coverage,
+    scenario_of,
+)
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.parallel import Shard, check_whole
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes

@@ -1,16 +1,15 @@
-"""`verify_bundle`: recompute an evaluation from its results, and list what differs from what was written."""
+"""`verify_bundle`: an evaluation run again, and what its bundle says in another way."""
 
 from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import chain
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import DeepAccidentError, ResultsError
@@ -24,33 +23,22 @@ from deepaccident_devkit.evaluation.runs.bundles import (
     SUMMARY_FILE,
     Bundle,
     checksums_of,
-    own_file,
     read_bundle,
-    read_json,
 )
 from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
 from deepaccident_devkit.evaluation.runs.evaluate import evaluate_results
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.evaluation.runs.prevention import with_prevented
-from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
-from deepaccident_devkit.evaluation.runs.selection import SampleSelection
+from deepaccident_devkit.evaluation.runs.rows import sample_rows
 from deepaccident_devkit.files import path_of
-from deepaccident_devkit.release.fingerprints import scenario_hashes
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-_SHOWN: Final = 10
-"""Differences of a kind that the text lists."""
-_NOT_COMPARED: Final = (
-    "devkit_version",
-    "environment",
-    "sanity",
-    "release/dataroot",
-    "results/path",
-    "results/fingerprint",
-)
-"""Of a summary: what is distinguished, is not made again, or says where things were."""
+_SHOWN: Final = 20
+"""Differences that the text lists."""
+_NOT_COMPARED: Final = ("environment", "sanity", "release/dataroot", "results/path")
+"""Of a summary: what is told in notes, or says where things were."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,8 +48,8 @@ class Verification(ShortRepr):
     Attributes:
         folder: of the bundle.
         samples: how many were evaluated again.
-        differences: all that were found.
-        notes: sentences on what could not differ, or does not matter.
+        differences: all that were found, file by file.
+        notes: sentences on what is not compared, or explains differences.
     """
 
     folder: Path
@@ -75,19 +63,12 @@ class Verification(ShortRepr):
         return not self.differences
 
     def to_text(self) -> str:
-        """A line a difference, the first of each kind, and how many more there are."""
-        if self.is_same:
-            head = f"{self.folder}: the same; {self.samples} samples evaluated again, all numbers are equal"
-        else:
-            head = f"{self.folder}: {len(self.differences)} differences; {self.samples} samples evaluated again"
-        by_kind: dict[str, list[Difference]] = {}
-        for each in self.differences:
-            by_kind.setdefault(each.kind, []).append(each)
-        lines = [head]
-        for kind, those in by_kind.items():
-            lines += [f"  {each.text()}" for each in those[:_SHOWN]]
-            if len(those) > _SHOWN:
-                lines.append(f"  {kind}: {len(those) - _SHOWN} more")
+        """A line a difference, the first ones, and how many more there are."""
+        found = f"{len(self.differences)} differences; {self.samples} samples evaluated again"
+        same = f"the same; {self.samples} samples evaluated again, all numbers are equal"
+        lines = [f"{self.folder}: {same if self.is_same else found}"]
+        lines += [f"  {each.text()}" for each in self.differences[:_SHOWN]]
+        lines += [f"  and {len(self.differences) - _SHOWN} more"] * (len(self.differences) > _SHOWN)
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
     def as_dict(self) -> dict[str, Any]:
@@ -132,21 +113,31 @@ def verify_bundle(
     check_repeated(bundle, {"dataroot": dataset.dataroot, "results": results, "split": split})
     given = bundle.results_path if results is None else results
     opened = given if isinstance(given, Results) else read_results(given)
-    engine = {"workers": workers, "executor": executor}
-    found = [*_version(bundle), *_files(bundle), *_scenarios(bundle, dataset, engine), *_results(bundle, opened)]
-    run: EvaluationRun | None = None
+    engine: dict[str, Any] = {"workers": workers, "executor": executor}
+    found = list(_compared(FILES_FILE, bundle.checksums, partial(checksums_of, bundle.folder)))
+    notes, run = [], None
     try:
-        selection = bundle.selection if split is None else replace(bundle.selection, split=os.fspath(split))
-        run = _again(bundle, dataset, opened, selection, engine, progress=progress)
+        run = _again(bundle, dataset, opened, split, engine, progress=progress)
     except DeepAccidentError as error:
-        found.append(Difference(kind="evaluation", where="all numbers", stored="evaluated", found=str(error)))
-    if run is not None:
-        found += chain(_numbers(bundle, run), _unlisted(bundle, run), _counts(bundle, run), _rows(bundle, run))
+        found.append(Difference(where="all numbers", stored="evaluated", found=ABSENT))
+        notes.append(f"cannot be evaluated again: {error}")
+    else:
+        found += _differences(bundle, run)
+        here = run.summary()["environment"]
+        for name, stored, now in differing(bundle.summary["environment"], here):
+            notes.append(f"evaluated with {name} {stored}, verified with {now}")
+    if any(each.where.startswith(SCENARIOS_FILE) for each in found):
+        notes.append(
+            "numbers are made of the index, which does not see that a file was edited in place; bring it up to date "
+            "with: deepaccident index DATAROOT --check"
+        )
+    if bundle.summary.get("sanity") is not None:
+        notes.append("the sanity check is not made again")
     return Verification(
         folder=bundle.folder,
         samples=0 if run is None else len(run.evaluator),
         differences=tuple(found),
-        notes=tuple(_notes(bundle, run, found)),
+        notes=tuple(notes),
     )
 
 
@@ -166,21 +157,17 @@ def _again(
     bundle: Bundle,
     dataset: Dataset,
     results: Results,
-    selection: SampleSelection,
+    split: str | os.PathLike[str] | None,
     engine: Mapping[str, Any],
     *,
     progress: bool,
 ) -> EvaluationRun:
-    run = evaluate_results(
-        dataset,
-        results,
-        bundle.setup,
-        selection,
-        allow_partial=bundle.summary["partial"] is not None or bool(bundle.summary["counts"]["left_out"]),
-        progress=progress,
-        **engine,
-    )
-    breakdowns, prevented = bundle.summary["breakdowns"], bundle.summary.get("prevented")
+    summary, selection = bundle.summary, bundle.selection
+    if split is not None:
+        selection = replace(selection, split=os.fspath(split))
+    partly = summary["partial"] is not None or bool(summary["counts"]["left_out"])
+    run = evaluate_results(dataset, results, bundle.setup, selection, allow_partial=partly, progress=progress, **engine)
+    breakdowns, prevented = summary["breakdowns"], summary.get("prevented")
     if breakdowns:
         run = run.broken_down(list(breakdowns), _resampling(next(iter(breakdowns.values()))), **engine)
     return run if prevented is None else with_prevented(run, dataset, _resampling(prevented), **engine)
@@ -194,93 +181,24 @@ def _resampling(part: Any) -> Resampling:
         raise ResultsError(f"{SUMMARY_FILE}: does not say how intervals were made ({error})") from error
 
 
-def _version(bundle: Bundle) -> Iterator[Difference]:
-    stored = bundle.summary.get("devkit_version", ABSENT)
-    if stored != __version__:
-        yield Difference(kind="version", where="devkit_version", stored=stored, found=__version__)
-
-
-def _files(bundle: Bundle) -> Iterator[Difference]:
-    try:
-        stored = bundle.checksums()
-    except ResultsError as error:
-        yield Difference(kind="file", where=FILES_FILE, stored="a list of all files", found=str(error))
-        return
-    for name, one, other in differing(stored, checksums_of(bundle.folder, stored)):
-        yield Difference(kind="file", where=name, stored=one, found=other)
-
-
-def _scenarios(bundle: Bundle, dataset: Dataset, engine: Mapping[str, Any]) -> Iterator[Difference]:
-    try:
-        stored = bundle.scenarios()
-    except ResultsError as error:
-        yield Difference(kind="file", where=SCENARIOS_FILE, stored="hashes", found=str(error))
-        return
-    found = {token: each.as_dict() for token, each in scenario_hashes(dataset, stored, **engine).items()}
-    for token, hashes in stored.items():
-        if token not in found:
-            yield Difference(kind="scenario", where=token, stored="in the release", found=ABSENT)
-            continue
-        for kind, one, other in differing(hashes, found[token]):
-            yield Difference(kind="scenario", where=f"{token}: {kind}", stored=one, found=other)
-
-
-def _unlisted(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
-    """Scenarios that are evaluated, and whose hashes the bundle does not state."""
-    try:
-        stored = bundle.scenarios()
-    except ResultsError:  # told already
-        return
-    for token in run.release.scenarios.keys() - stored.keys():
-        yield Difference(kind="scenario", where=token, stored=ABSENT, found="evaluated")
-
-
-def _results(bundle: Bundle, results: Results) -> Iterator[Difference]:
-    stored = bundle.summary["results"].get("fingerprint", ABSENT)
-    if stored != results.fingerprint:
-        where = f"fingerprint of {results.path}"
-        yield Difference(kind="results", where=where, stored=stored, found=results.fingerprint)
-
-
-def _numbers(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
+def _differences(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
+    """Of all files but their list."""
     elsewhere = ("split",) if "split" in bundle.outside_paths() else ()
     for where, stored, found in differing(bundle.summary, run.summary(), without=(*_NOT_COMPARED, *elsewhere)):
-        yield Difference(kind="number", where=where, stored=stored, found=found)
+        yield Difference(where=f"{SUMMARY_FILE}: {where}", stored=stored, found=found)
+    hashes = {token: each.as_dict() for token, each in run.release.scenarios.items()}
+    rows = {row["token"]: row for row in sample_rows(run)}
+    yield from _compared(SCENARIOS_FILE, bundle.scenarios, lambda _: hashes)
+    yield from _compared(COUNTS_FILE, bundle.counts, lambda _: dict(run.evaluator.counts))
+    yield from _compared(ROWS_FILE, bundle.rows, lambda _: rows)
 
 
-def _counts(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
-    path = bundle.folder / COUNTS_FILE
+def _compared(name: str, read: Callable[[], Any], again: Callable[[Any], Any]) -> Iterator[Difference]:
+    """The differences of a bundle's file; one if it cannot be read."""
     try:
-        stored = read_json(path, None)["counts"]
-    except (ResultsError, KeyError) as error:
-        yield Difference(kind="file", where=COUNTS_FILE, stored="counts", found=str(error))
+        stored = read()
+    except ResultsError as error:
+        yield Difference(where=name, stored="readable", found=str(error))
         return
-    for where, one, other in differing(stored, dict(run.evaluator.counts)):
-        yield Difference(kind="sample", where=f"{COUNTS_FILE} {where}", stored=one, found=other)
-
-
-def _rows(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
-    try:
-        rows, _ = read_rows(own_file(bundle.folder / ROWS_FILE))
-        stored = {row["token"]: row for row in rows}
-    except (ResultsError, KeyError) as error:
-        yield Difference(kind="file", where=ROWS_FILE, stored="rows", found=str(error))
-        return
-    found = {row["token"]: row for row in sample_rows(run)}
-    for where, one, other in differing(stored, found):
-        yield Difference(kind="sample", where=f"{ROWS_FILE} {where}", stored=one, found=other)
-
-
-def _notes(bundle: Bundle, run: EvaluationRun | None, found: Sequence[Difference]) -> Iterator[str]:
-    if any(each.kind == "scenario" for each in found):
-        yield (
-            "numbers are made of the index, which does not see that a file was edited in place; bring it up to date "
-            "with: deepaccident index DATAROOT --check"
-        )
-    if bundle.summary.get("sanity") is not None:
-        yield "the sanity check is not made again"
-    if run is None:
-        return
-    here = run.summary()["environment"]
-    for name, stored, now in differing(bundle.summary["environment"], here):
-        yield f"evaluated with {name} {stored}, verified with {now}"
+    for where, one, other in differing(stored, again(stored)):
+        yield Difference(where=f"{name}: {where}", stored=one, found=other)

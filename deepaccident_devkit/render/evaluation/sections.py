@@ -13,9 +13,10 @@ from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines, value_text
 from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.evaluation.runs.notes import reading_notes
 from deepaccident_devkit.evaluation.runs.predictors import PredictorTable, predictor_tables
-from deepaccident_devkit.evaluation.runs.prevention_text import prevention_tables
+from deepaccident_devkit.evaluation.runs.prevention import prevention_tables
+from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
+from deepaccident_devkit.evaluation.runs.text import reading_notes
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
 from deepaccident_devkit.render.markup import Markup, facts, joined, number, scalar, table, tag, tree
 
@@ -32,7 +33,6 @@ _COUNTED: Final = ("thresholds", "truths", "detections")
 """What is known of a class without true boxes."""
 _SHOWN_META: Final = ("method", "name", "authors", "url", "date")
 """Fields that results give about themselves and that are shown at the top, if there are any."""
-_SIDES: Final = {"empty": "nothing predicted", "given": "given", "perfect": "perfect"}
 
 
 def header(run: EvaluationRun) -> Markup:
@@ -123,24 +123,14 @@ def sanity(report: Mapping[str, Any]) -> Markup:
     Args:
         report: as `SanityReport.as_dict` has it.
     """
-    rows = [
-        [name, *(value_text(report[side][name], unit) for side in _SIDES)] for name, unit in report["units"].items()
-    ]
     looked = [
         [each["name"], _share(each["given"]), _share(each["score"]), scalar(each["suspected"]), each["description"]]
         for each in report["candidates"]
     ]
-    found = [tag("p", each, class_="warning") for each in report["warnings"]]
-    found += [tag("p", report["verdict"])] * bool(report["verdict"])
-    found += [tag("p", f"Not looked at: {each}") for each in report["unchecked"]]
-    heading = ["mistake", "fits as given", "fits if corrected", "suspected", "what it is"]
-    return joined(
-        [
-            table(["number", *_SIDES.values()], rows, f"of {report['samples']:,} samples"),
-            *found,
-            tag("details", tag("summary", "All mistakes that were checked"), table(heading, looked)),
-        ]
-    )
+    found = [tag("p", each, class_="warning") for each in report["warnings"]] or [tag("p", NOTHING_WRONG)]
+    heading = ["mistake", "fits as given", "fits if undone", "suspected", "what is right"]
+    mistakes = table(heading, looked, f"of {report['samples']:,} samples")
+    return joined([*found, tag("details", tag("summary", "All mistakes that were looked for"), mistakes)])
 
 
 def choices(run: EvaluationRun) -> Markup:

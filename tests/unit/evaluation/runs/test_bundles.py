@@ -28,20 +28,21 @@ from deepaccident_devkit.reading import file_checksum
 
 FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}
 MISFITS: dict[str, tuple[Callable[[Any], object], str]] = {
-    "no task": (lambda summary: summary.pop("task"), "task is missing"),
-    "agents": (lambda summary: summary.update(agents=3), "agents: expected a list, found int 3"),
-    "an agent": (lambda summary: summary.update(agents=["ego_vehicle", 1]), "agents/1: expected a printable text"),
-    "a dataroot": (lambda summary: summary["release"].update(dataroot=3), "release/dataroot: expected a printable"),
-    "a long path": (lambda summary: summary["results"].update(path="x" * 5000), "results/path: .*x … x{3}"),
-    "no number": (
-        lambda summary: summary["counts"].update(left_out=True),
-        "counts/left_out: expected a whole number",
+    "no task": (lambda summary: summary.pop("task"), "object missing required field `task`"),
+    "agents": (lambda summary: summary.update(agents=3), r"expected `array \| null`, got `int` - at `\$.agents`"),
+    "an agent": (
+        lambda summary: summary.update(agents=["ego_vehicle", 1]),
+        r"expected `str`, got `int` - at `\$.agents",
     ),
-    "a partial one": (
-        lambda summary: summary.update(partial={"mark": "\x1b[2J"}),
-        "partial/mark: expected a printable",
+    "a dataroot": (lambda summary: summary["release"].update(dataroot=3), r".* at `\$.release.dataroot`"),
+    "a long path": (
+        lambda summary: summary["results"].update(path="x" * 5000),
+        r".*length <= 1000 - at `\$.results.path",
     ),
-    "breakdowns": (lambda summary: summary["breakdowns"].update(all=[]), "breakdowns/all: expected an object"),
+    "no number": (lambda summary: summary["counts"].update(left_out=True), r".* got `bool` - at `\$.counts.left_out`"),
+    "a partial one": (lambda summary: summary.update(partial={"mark": "\x1b[2J"}), r".* at `\$.partial.mark`"),
+    "a second line": (lambda summary: summary.update(split="val\n"), r".* at `\$.split`"),
+    "breakdowns": (lambda summary: summary["breakdowns"].update(all=[]), r"expected `object`, got `array` - at .*"),
     "a task": (lambda summary: summary.update(task="x" * 900), "task: expected one of"),
     "a horizon of years": (
         lambda summary: summary.update(horizon=1e9),
@@ -226,7 +227,7 @@ class TestDamaged:
         summary = read(path)
         change(summary)
         path.write_text(json.dumps(summary), encoding="utf-8")
-        with pytest.raises(ResultsError, match=rf"metrics_summary.json: does not say what was evaluated \({told}") as e:
+        with pytest.raises(ResultsError, match=rf"metrics_summary.json: does not say what was evaluated: {told}") as e:
             _ = read_bundle(path.parent).setup, read_bundle(path.parent).selection
         assert len(str(e.value)) < 1000
 
@@ -240,5 +241,5 @@ def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: 
     path = bundle.folder / "scenarios.json"
     stated = read(path)
     path.write_text(json.dumps({**stated, "scenarios": ["s"]}), encoding="utf-8")
-    with pytest.raises(ResultsError, match=r"scenarios.json: scenarios: expected an object, found list"):
+    with pytest.raises(ResultsError, match=r"scenarios.json: expected `object`, got `array` - at `\$.scenarios`"):
         bundle.scenarios()

@@ -23,9 +23,9 @@ from deepaccident_devkit.evaluation.runs import (
     scenario_hashes,
 )
 from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, remove_checkpoints
-from deepaccident_devkit.evaluation.runs.coverage import Coverage
 from deepaccident_devkit.evaluation.runs.evaluate import _partial, check_metas
 from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of
+from deepaccident_devkit.evaluation.runs.selection import Coverage
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
 from deepaccident_devkit.splits import save_selection
 

@@ -293,7 +293,7 @@ def test_any_executor_gives_the_same(job: Job, call: str, tmp_path: Path) -> Non
 def test_a_bundle_is_verified_on_any_executor(job: Job, bundle: Path) -> None:
     with Counting(2) as executor:
         found = verify_bundle(bundle, job.dataset, results=job.results, split=job.selection.split, executor=executor)
-        assert executor.given > 6 + 4  # hashes, samples and breakdowns
+        assert executor.given > 4  # hashes, samples and breakdowns
     assert found.is_same, found.to_text()
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from deepaccident_devkit.evaluation.runs.notes import reading_notes
+from deepaccident_devkit.evaluation.runs.text import reading_notes
 
 FORM = {
     "stored": "heads",

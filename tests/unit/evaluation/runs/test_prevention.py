@@ -24,8 +24,7 @@ from deepaccident_devkit.evaluation import (
 from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS
 from deepaccident_devkit.evaluation.metrics.warning.recordings import REFERENCES
 from deepaccident_devkit.evaluation.runs import prevented_accidents, with_prevented
-from deepaccident_devkit.evaluation.runs.prevention import accident_outcomes
-from deepaccident_devkit.evaluation.runs.prevention_text import prevention_tables, prevention_text
+from deepaccident_devkit.evaluation.runs.prevention import accident_outcomes, prevention_tables, prevention_text
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, accident_of, outcomes, outcomes_of
 

@@ -27,6 +27,7 @@ from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, 
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
 
 Write = Callable[..., Results]
+SUMMARY_CHANGED = "files.json: metrics_summary.json"
 
 
 @pytest.fixture
@@ -46,8 +47,8 @@ def changed(path: Path, change: Callable[[Any], object]) -> None:
     path.write_text(json.dumps(content))
 
 
-def found(verification: Verification) -> list[tuple[str, str]]:
-    return [(each.kind, each.where) for each in verification.differences]
+def found(verification: Verification) -> list[str]:
+    return [each.where for each in verification.differences]
 
 
 class TestSame:
@@ -85,11 +86,10 @@ class TestNamed:
     def test_a_number(self, bundle: Path, da_b: DeepAccident) -> None:
         changed(bundle / "metrics_summary.json", lambda summary: summary["metrics"].update(apa=0.99))
         verification = verify(bundle, da_b)
-        assert found(verification) == [("file", "metrics_summary.json"), ("number", "metrics/apa")]
-        assert verification.to_text().splitlines()[2] == "  number: metrics/apa: stored 0.99, found 1.0"
+        assert found(verification) == [SUMMARY_CHANGED, "metrics_summary.json: metrics/apa"]
+        assert verification.to_text().splitlines()[2] == "  metrics_summary.json: metrics/apa: stored 0.99, found 1.0"
         assert verification.as_dict()["differences"][1] == {
-            "kind": "number",
-            "where": "metrics/apa",
+            "where": "metrics_summary.json: metrics/apa",
             "stored": 0.99,
             "found": 1.0,
         }
@@ -99,18 +99,18 @@ class TestNamed:
             summary["breakdowns"]["all"]["groups"][0]["metrics"]["position_error"] += 1e-15
 
         changed(bundle / "metrics_summary.json", change)
-        assert ("number", "breakdowns/all/groups/0/metrics/position_error") in found(verify(bundle, da_b))
+        assert "metrics_summary.json: breakdowns/all/groups/0/metrics/position_error" in found(verify(bundle, da_b))
 
     def test_another_version(self, bundle: Path, da_b: DeepAccident) -> None:
         changed(bundle / "metrics_summary.json", lambda summary: summary.update(devkit_version="0.0.9"))
         verification = verify(bundle, da_b)
-        assert found(verification) == [("version", "devkit_version"), ("file", "metrics_summary.json")]
+        assert found(verification) == [SUMMARY_CHANGED, "metrics_summary.json: devkit_version"]
         assert verification.samples == 6
 
     def test_another_numpy_is_a_note(self, bundle: Path, da_b: DeepAccident) -> None:
         changed(bundle / "metrics_summary.json", lambda summary: summary["environment"].update(numpy="1.0"))
         verification = verify(bundle, da_b)
-        assert found(verification) == [("file", "metrics_summary.json")]
+        assert found(verification) == [SUMMARY_CHANGED]
         assert verification.notes[0].startswith("evaluated with numpy 1.0, verified with ")
 
     @pytest.mark.slow
@@ -122,52 +122,55 @@ class TestNamed:
         path.write_bytes(path.read_bytes() + b"\n")
         token = min(opened.split_scenarios("val"))
         verification = verify(bundle, opened)
-        assert found(verification) == [("scenario", f"{token}: {kind}"), ("number", "release/fingerprint")]
+        assert found(verification) == ["metrics_summary.json: release/fingerprint", f"scenarios.json: {token}/{kind}"]
         assert "edited in place" in verification.notes[0]
 
     def test_a_scenario_that_is_gone(self, bundle: Path, own_release: Path) -> None:
         for folder in own_release.glob("val/*_normal"):
             shutil.rmtree(folder)
         verification = verify(bundle, DeepAccident(dataroot=own_release, verbose=False))
-        assert found(verification)[0] == ("scenario", min(read_scenarios(bundle, "_normal")))
-        assert found(verification)[1] == ("evaluation", "all numbers")
-        assert "3 predictions are of no sample of this release" in str(verification.differences[1].found)
+        assert found(verification) == ["all numbers"]
+        assert "3 predictions are of no sample of this release" in verification.notes[0]
         assert verification.samples == 0
 
     def test_a_scenario_that_the_bundle_does_not_state(self, bundle: Path, da_b: DeepAccident) -> None:
         gone = min(read_scenarios(bundle, "_normal"))
         changed(bundle / "scenarios.json", lambda stored: stored["scenarios"].pop(gone))
-        assert found(verify(bundle, da_b)) == [("file", "scenarios.json"), ("scenario", gone)]
+        assert found(verify(bundle, da_b)) == ["files.json: scenarios.json", f"scenarios.json: {gone}"]
 
     def test_why_nothing_can_be_made_again_is_told_in_full(
         self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
     ) -> None:
         other = write_accidents(tmp_path / "other.json", results.tokens[1:])
         text = verify(bundle, da_b, results=other).to_text()
-        assert f"evaluation: all numbers: cannot be made again: {other.path}: 1 of 6 samples have no pred" in text
+        assert "all numbers: stored 'evaluated', found absent" in text
+        assert f"note: cannot be evaluated again: {other.path}: 1 of 6 samples have no pred" in text
         assert "marks every number as partial" in text
 
     def test_other_results(
         self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
     ) -> None:
         other = write_accidents(tmp_path / "other.json", results.tokens, moved=1.0)
-        kinds = {kind for kind, _ in found(verify(bundle, da_b, results=other))}
-        assert kinds == {"results", "number", "sample"}
-        assert ("results", f"fingerprint of {other.path}") in found(verify(bundle, da_b, results=other.path))
+        differing = found(verify(bundle, da_b, results=other.path))
+        assert {each.split(": ")[0] for each in differing} == {"metrics_summary.json", "counts.json", "samples.parquet"}
+        assert "metrics_summary.json: results/fingerprint" in differing
 
     def test_counts_of_a_sample(self, bundle: Path, da_b: DeepAccident) -> None:
         token = min(json.loads((bundle / "counts.json").read_text())["counts"])
         changed(bundle / "counts.json", lambda state: state["counts"][token].update(unjudged=7))
-        assert found(verify(bundle, da_b)) == [("file", "counts.json"), ("sample", f"counts.json {token}/unjudged")]
+        assert found(verify(bundle, da_b)) == [
+            "files.json: counts.json",
+            f"counts.json: {token}/unjudged",
+        ]
 
     def test_a_row(self, bundle: Path, da_b: DeepAccident) -> None:
         rows, stamp = read_rows(bundle / "samples.parquet")
         rows[2]["tp_10m"] = 5
         write_rows(bundle / "samples.parquet", rows[:-1], stamp)
         assert found(verify(bundle, da_b)) == [
-            ("file", "samples.parquet"),
-            ("sample", f"samples.parquet {rows[2]['token']}/tp_10m"),
-            ("sample", f"samples.parquet {rows[-1]['token']}"),
+            "files.json: samples.parquet",
+            f"samples.parquet: {rows[2]['token']}/tp_10m",
+            f"samples.parquet: {rows[-1]['token']}",
         ]
 
     def test_files_foreign_missing_and_damaged(self, bundle: Path, da_b: DeepAccident) -> None:
@@ -176,28 +179,22 @@ class TestNamed:
         (bundle / "samples.parquet").write_bytes(b"PAR1")
         (bundle / "scenarios.json").write_text("{}")
         assert found(verify(bundle, da_b)) == [
-            ("file", "counts.json"),
-            ("file", "samples.parquet"),
-            ("file", "scenarios.json"),
-            ("file", "mine.txt"),
-            ("file", "scenarios.json"),
-            ("file", "counts.json"),
-            ("file", "samples.parquet"),
+            *("files.json: counts.json", "files.json: samples.parquet", "files.json: scenarios.json"),
+            *("files.json: mine.txt", "scenarios.json", "counts.json", "samples.parquet"),
         ]
         (bundle / "files.json").write_text("")
-        assert found(verify(bundle, da_b))[0] == ("file", "files.json")
+        assert found(verify(bundle, da_b))[0] == "files.json"
 
     def test_another_protocol_claimed(self, bundle: Path, da_b: DeepAccident) -> None:
         changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.present": False}))
-        wheres = [where for kind, where in found(verify(bundle, da_b)) if kind == "number"]
-        assert wheres == ["settings/choices/reading/present"]
+        assert found(verify(bundle, da_b)) == ["metrics_summary.json: settings/choices/reading/present"]
 
-    def test_many_of_a_kind_are_counted(self) -> None:
-        many = tuple(Difference(kind="number", where=str(index), stored=0, found=1) for index in range(12))
+    def test_many_are_counted(self) -> None:
+        many = tuple(Difference(where=str(index), stored=0, found=1) for index in range(22))
         text = Verification(folder=Path("b"), samples=3, differences=many, notes=("so",)).to_text().splitlines()
-        assert text[0] == "b: 12 differences; 3 samples evaluated again"
-        assert text[-2:] == ["  number: 2 more", "note: so"]
-        assert len(text) == 13
+        assert text[0] == "b: 22 differences; 3 samples evaluated again"
+        assert text[-2:] == ["  and 2 more", "note: so"]
+        assert len(text) == 23
 
 
 class TestRefused:
@@ -234,8 +231,8 @@ def test_differing(stored: Any, found: Any, expected: list[tuple[str, Any, Any]]
 
 
 def test_long_values_are_cut_in_a_line() -> None:
-    text = Difference(kind="number", where="x", stored="y" * 100, found=ABSENT).text()
-    assert text == f"number: x: stored '{'y' * 58}…, found absent"
+    text = Difference(where="x", stored="y" * 100, found=ABSENT).text()
+    assert text == f"x: stored '{'y' * 58}…, found absent"
 
 
 class TestStrangers:
@@ -253,10 +250,10 @@ class TestStrangers:
         with (bundle / "counts.json").open("r+b") as file:
             file.truncate(5 << 30)
         verification = verify(bundle, da_b)
-        named = {each.where: each.found for each in verification.differences if each.kind == "file"}
-        assert named["a pipe"] == "not a regular file (a named pipe)"
-        assert named["loop"] == named["a link"] == "a link"
-        assert named["extra\x1b.bin"] == "a file that is not listed"
+        named = {each.where: each.found for each in verification.differences}
+        assert named["files.json: a pipe"] == "not a regular file (a named pipe)"
+        assert named["files.json: loop"] == named["files.json: a link"] == "a link"
+        assert named["files.json: extra\x1b.bin"] == "a file that is not listed"
         assert "is a link, which is not followed" in named["scenarios.json"]
         assert "has 5,368,709,120 bytes" in named["counts.json"]
         assert "\x1b" not in verification.to_text()
@@ -271,7 +268,7 @@ class TestStrangers:
             with pytest.raises(ResultsError, match=r"metrics_summary.json: not a regular file \(a named pipe\)"):
                 verify(bundle, da_b)
         else:
-            assert ("file", name) in found(verify(bundle, da_b))
+            assert name in found(verify(bundle, da_b))
 
     def test_paths_that_lead_out_are_opened_only_if_they_are_given(
         self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path
@@ -287,7 +284,7 @@ class TestStrangers:
         splits.unlink()
         scenarios = sorted({token.rsplit("/", 2)[0] for token in results.tokens})
         splits.write_text("".join(f"{token.replace('/', ' ')}\n" for token in scenarios))
-        assert found(verify(bundle, da_b, split=splits)) == [("file", "metrics_summary.json")]
+        assert found(verify(bundle, da_b, split=splits)) == [SUMMARY_CHANGED]
 
     @pytest.mark.parametrize("kind", ["the folder", "the file", "a loop", "a pipe"])
     def test_a_copy_of_the_results_that_leads_out_is_refused(
@@ -326,12 +323,12 @@ class TestStrangers:
             bundle / "metrics_summary.json",
             lambda summary: summary["breakdowns"]["all"].update(resampling=resampling),
         )
-        assert ("evaluation", "all numbers") in found(verify(bundle, da_b))
+        assert "all numbers" in found(verify(bundle, da_b))
 
     def test_deep_nesting_is_refused(self, bundle: Path, da_b: DeepAccident) -> None:
         path = bundle / "counts.json"
         path.write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
-        assert ("file", "counts.json") in found(verify(bundle, da_b))
+        assert "counts.json" in found(verify(bundle, da_b))
         (bundle / "metrics_summary.json").write_text("[" * 900 + "]" * 900)
         with pytest.raises(ResultsError, match="is nested more than 64 levels deep"):
             verify(bundle, da_b)

@@ -1,0 +1,481 @@
+"""`check_sanity`: do the predictions fit the labels much better once a classic mistake is undone?
+
+A mistake is a transform that undoes it. Of each sample it says which part of the truth the predictions hit once it is
+undone, and which part as they are given. These parts are summed over the samples; the mistake is suspected if the
+first share is large enough, and clearly larger than the second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import permutations
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxAccidents
+from deepaccident_devkit.evaluation.metrics.alarms.raised import LABEL_STEP, by_sureness, position_difference
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
+from deepaccident_devkit.evaluation.metrics.frames import frames_there, labels_at_present
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+Group = Literal["place", "time", "size", "class"]
+NOTHING_WRONG: Final = "Nothing looks wrong with the predictions."
+_AXES: Final = {
+    "x mirrored": (-1, 2),
+    "y mirrored": (1, -2),
+    "x and y mirrored": (-1, -2),
+    "x and y swapped": (2, 1),
+    "x and y swapped and mirrored": (-2, -1),
+    "turned left": (2, -1),
+    "turned right": (-2, 1),
+}
+"""Name → what x and y are once it is undone: 1 is the given x, 2 the given y, −2 its negative."""
+_SAMPLES: Final = 20
+_LISTS: Final = 60
+"""Samples that are looked at, of maps and boxes, and of accident lists, which are short."""
+_MARGIN: Final = 2.0
+"""How many times as large the share has to be once a mistake is undone."""
+_LEAST: Final[Mapping[Group, float]] = {"place": 0.2, "time": 0.4, "size": 0.5, "class": 0.5}
+"""The share that it has to reach; in time, slow predictions reach a part, too."""
+_EVIDENCE: Final = {"motion": 100, "accident": 4, "detection": 10}
+"""Cells, accidents or boxes that have to be hit."""
+_NEAR: Final = 2.0
+"""Metres: as near on the ground, a box is found, and both places of an accident are hit on average."""
+_NEAR_IN_HEIGHT: Final = 0.7
+"""Metres: nearer, since LiDAR and ego frame differ by the LiDAR's height alone, some 2 m."""
+_NEAR_IN_TIME: Final = 0.15
+"""Seconds, of accidents."""
+_ALIKE: Final = 0.25
+"""A size is right that differs from the true one by at most this share."""
+_FEWEST: Final = 5
+"""Boxes of a class from which on its name tells."""
+_MOVING: Final = 4.0
+"""m/s: within a step, slower actors do not move enough."""
+_STRAIGHT: Final = np.deg2rad(15)
+"""A heading that is nearer to one of the true box's four directions is right; at random, a third of them are."""
+_RANDOM: Final = 0.5
+"""Share of right headings below which they look random."""
+_LATEST: Final = 2.0
+"""Horizons: half of the alarms are later only in another unit of time."""
+_ORDERS: Final = {
+    f"sizes in the order {', '.join(('length', 'width', 'height')[axis] for axis in order)}": order
+    for order in permutations(range(3))
+    if order != (0, 1, 2)
+}
+_CLASSES: Final = "classes swapped"
+_LATE: Final = {"one step late": 1, "two steps late": 2}
+_SAYS: Final[Mapping[Group, Mapping[str, str]]] = {
+    "place": {
+        **dict.fromkeys(_AXES, "x is forward and y to the left; of maps, state the orientation that they have"),
+        "world y mirrored": "the world frame is right-handed, and CARLA's is not: negate y, and headings with it",
+        "world frame for ego frame": "places are given in the world frame; give them in the present ego frame",
+        "ego frame for world frame": 'boxes are given in the ego frame; move them by da.world_from(token, "ego")',
+        "LiDAR frame for world frame": 'boxes are given in the LiDAR frame; move them by da.world_from(token, "lidar")',
+        "LiDAR frame for ego frame": "boxes of the LiDAR frame were moved by the ego pose; take the LiDAR's pose",
+        "ego frame for LiDAR frame": "boxes of the ego frame were moved by the LiDAR's pose; take the ego pose",
+        "actors and background swapped": "channel 0 and id 0 are the background; channel 1, and ids from 1, actors",
+    },
+    "time": {
+        "frames reversed": "the first frame of a prediction is the present, and times are counted from there",
+        **dict.fromkeys(_LATE, "frames and boxes show earlier moments; the first frame is the sample's own: no past"),
+    },
+    "size": dict.fromkeys(_ORDERS, "results files hold width, length, height; Boxes hold length, width, height"),
+    "class": {_CLASSES: f"the classes are, counted from 0, {', '.join(CATEGORIES)}"},
+}
+MISTAKES: Final[Mapping[str, str]] = MappingProxyType(
+    {name: says for group in _SAYS.values() for name, says in group.items()}
+)
+"""All mistakes that are undone on trial → what is right."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate(FrozenMappings):
+    """How well predictions fit the labels once one mistake is undone.
+
+    Attributes:
+        name: of `MISTAKES`.
+        description: what is right.
+        score: the share of the truth that is hit once it is undone, in [0, 1].
+        given: that share of the predictions as they were given.
+        suspected: whether the score is so much better that it should be looked into.
+    """
+
+    name: str
+    description: str
+    score: float
+    given: float
+    suspected: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SanityReport(FrozenMappings):
+    """What a few samples say on predictions as a whole.
+
+    Attributes:
+        samples: how many were looked at.
+        candidates: all mistakes that these samples can show, suspected or not.
+        warnings: sentences; none if nothing looks wrong.
+    """
+
+    samples: int
+    candidates: tuple[Candidate, ...]
+    warnings: tuple[str, ...]
+
+    def to_text(self) -> str:
+        """How much was looked at, and the warnings."""
+        head = f"Sanity check of {self.samples} samples; {len(self.candidates)} mistakes looked for."
+        return "\n".join([head, self.warnings_text() or NOTHING_WRONG])
+
+    def warnings_text(self) -> str:
+        """The warnings alone, a line each; empty if there is none."""
+        return "\n".join(f"WARNING: {each}" for each in self.warnings)
+
+
+def check_sanity(
+    dataset: Dataset,
+    results: Results,
+    setup: EvaluationSetup,
+    tokens: Collection[str],
+    *,
+    samples: int | None = None,
+    workers: int | None = 1,
+    executor: Executor | None = None,
+) -> SanityReport:
+    """Whether predictions look as if a classic mistake (`MISTAKES`) was made in all of them; or empty, or constant.
+
+    Correct predictions raise no suspicion, nor do bad ones that make none of these mistakes.
+
+    Args:
+        dataset: the release.
+        results: the predictions.
+        setup: the rules that they are evaluated by.
+        tokens: the samples that are evaluated, each with a prediction.
+        samples: how many of them are looked at, always the same; None for 20, or 60 of accident lists.
+        workers: processes.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+
+    Raises:
+        ConfigError: `samples` is less than 1.
+        EvaluationError: the results are not of a kind that the task takes, or there is no sample.
+    """
+    lists = results.task == "accident"
+    count = (_LISTS if lists else _SAMPLES) if samples is None else samples
+    if count < 1:
+        raise ConfigError(f"samples: expected at least 1, found {samples}")
+    if not tokens:
+        raise EvaluationError("tokens: there is no sample to look at")
+    alarmed = [token for token in tokens if lists and results.prediction(token)]  # few may be
+    listed = sorted(alarmed or tokens)
+    drawn = np.random.default_rng(0).permutation(len(listed))[:count]
+    loader = SampleLoader(dataset, results, setup)
+    seen = run_batch(
+        partial(_seen, loader),
+        [listed[each] for each in drawn],
+        workers=workers,
+        executor=executor,
+        places=loader.places,
+    )
+    candidates = _candidates(seen, results.task)
+    suspected = [each for each in candidates if each.suspected]
+    warnings = [
+        f"{each.name}: {each.description} ({each.score:.0%} of the truth is hit once that is undone, "
+        f"{each.given:.0%} as it is)"
+        for each in suspected
+    ]
+    warnings += _facts(
+        seen, setup, ranked=not lists or setup.task == "warning" or isinstance(setup.rules, BoxAccidents)
+    )
+    if not any(each.name in _SAYS["place"] for each in suspected):
+        warnings += _headings_text(seen)
+    return SanityReport(samples=len(seen), candidates=candidates, warnings=tuple(warnings))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Seen:
+    """What one sample says.
+
+    Attributes:
+        tallies: mistake → (4, N) what is hit once it is undone and how much there is, then both as given. Of N such
+            measurements, the worst one counts. Of classes, (C, C) how many of the true boxes of each class (rows)
+            are found under the name of each (columns).
+        empty: whether nothing is predicted.
+        scores: of all boxes or accidents.
+        time: of the surest accident, seconds.
+        probabilities: whether all logits are in [0, 1].
+        headings: of the boxes found, those that are right, and all.
+    """
+
+    tallies: Mapping[str, FloatArray]
+    empty: bool = False
+    scores: Sequence[float] = ()
+    time: float | None = None
+    probabilities: bool = False
+    headings: tuple[int, int] = (0, 0)
+
+
+def _seen(loader: SampleLoader, token: str) -> _Seen:
+    """Look at a sample."""
+    prediction, truth, *more = loader(token)
+    if isinstance(prediction, MotionOutput):
+        return _motion_seen(prediction, truth)
+    raw = loader.results.prediction(token)  # of boxes, in the world
+    if isinstance(raw, DetectedBoxes):
+        world_boxes = truth.transform(loader.dataset.world_from(token, truth.frame), "world")
+        others = world_boxes.select(world_boxes.actor_id != OWN_ACTOR_ID)
+        return _detection_seen(loader.dataset, token, raw, others)
+    return _accidents_seen(loader, token, prediction, more[0])
+
+
+def _candidates(seen: Sequence[_Seen], task: str) -> tuple[Candidate, ...]:
+    """All that was looked for; of a group at most the best one is suspected, and none beside a wrong place."""
+    sums: dict[str, FloatArray] = {}
+    for name, tally in (each for one in seen for each in one.tallies.items()):
+        sums[name] = sums.get(name, 0.0) + tally
+    if _CLASSES in sums:
+        sums[_CLASSES] = _class_tally(sums[_CLASSES])
+    found: list[Candidate] = []
+    misplaced = False
+    for group, says in _SAYS.items():
+        told = [name for name in says if name in sums and sums[name][1].any()]
+        tried = [_candidate(name, sums[name], _LEAST[group], _EVIDENCE[task]) for name in told]
+        best = max((each for each in tried if each.suspected), key=lambda each: each.score, default=None)
+        found += [replace(each, suspected=each is best and not misplaced) for each in tried]
+        misplaced = misplaced or (group == "place" and best is not None)
+    return tuple(found)
+
+
+def _candidate(name: str, tally: FloatArray, least: float, evidence: int) -> Candidate:
+    score, given = _worst(*tally[:2]), _worst(*tally[2:])
+    suspected = score >= max(least, _MARGIN * given) and tally[0].sum() >= evidence
+    return Candidate(name=name, description=MISTAKES[name], score=score, given=given, suspected=bool(suspected))
+
+
+def _worst(part: FloatArray, whole: FloatArray) -> float:
+    tells = whole > 0
+    return float((part[tells] / whole[tells]).min(initial=1.0))
+
+
+def _facts(seen: Sequence[_Seen], setup: EvaluationSetup, *, ranked: bool) -> Iterable[str]:
+    """What shows without the labels."""
+    if all(each.empty for each in seen):
+        yield f"all {len(seen)} predictions looked at are empty: nothing is predicted in them"
+    scores = [score for each in seen for score in each.scores]
+    if ranked and len(scores) > 1 and len(set(scores)) == 1:
+        yield (
+            f"all {len(scores)} scores are {scores[0]:g}: numbers that depend on their order, such as an average "
+            "precision, then say little; give surer predictions higher scores"
+        )
+    if any(each.probabilities for each in seen) and all(each.probabilities or each.empty for each in seen):
+        yield (
+            "all values of the heads' segmentation are between 0 and 1: write logits and not probabilities, which the "
+            "released accident rule takes for actors everywhere"
+        )
+    times = [each.time for each in seen if each.time is not None]
+    if times and np.median(times) > _LATEST * setup.horizon:
+        yield (
+            f"half of the accidents are more than {np.median(times):g} s ahead, the horizon is {setup.horizon:g} s: "
+            "times are seconds after the present, not frames, and not of the recording"
+        )
+
+
+def _headings_text(seen: Sequence[_Seen]) -> Iterable[str]:
+    right, every = (sum(each.headings[index] for each in seen) for index in (0, 1))
+    if every >= _EVIDENCE["detection"] and right < _RANDOM * every:
+        yield (
+            f"headings look random: {right} of {every} are right, apart from quarters of a turn; are they degrees in "
+            "place of radians, or not predicted? A heading is counted counter-clockwise from x of the world"
+        )
+
+
+def _tally(undone: ArrayLike, given: ArrayLike, whole: float) -> FloatArray:
+    """(4, 1) of which of some things are hit."""
+    return np.array([[np.sum(undone)], [whole], [np.sum(given)], [whole]], dtype=np.float64)
+
+
+def _motion_seen(prediction: MotionOutput, label: MotionLabels) -> _Seen:
+    """Compare the cells of actors: for places in the present frame, for times where the frames differ."""
+    frames, grid = frames_there(label), label.config.grid
+    true = grid.reorient(labels_at_present(label).segmentation[:frames] == 1, "devkit")
+    every = prediction.grid.reorient(_actor_cells(prediction), "devkit")
+    given = every[:frames]
+    places = {
+        name: _turned_maps(given[:1], axes) for name, axes in _AXES.items() if grid.x == grid.y or abs(axes[0]) == 1
+    }
+    places["actors and background swapped"] = ~given[:1]
+    tallies = {name: _overlap(undone, true[:1], given[:1], true[:1]) for name, undone in places.items()}
+    changing = np.asarray(true.any(axis=0) & ~true.all(axis=0))
+    true, given, backwards = true & changing, given & changing, every[::-1][:frames] & changing
+    times = {"frames reversed": _overlap(backwards, true, given, true)}
+    for name, lag in _LATE.items():
+        if frames > lag + 2:  # in fewer frames, slow predictions look late
+            times[name] = _overlap(given[lag:], true[:-lag], given[lag:], true[lag:])
+    tallies |= {name: np.pad(each, ((0, 0), (0, len(every) - each.shape[1]))) for name, each in times.items()}
+    values = (prediction.heads or ())[-1].segmentation if prediction.instances is None else None
+    empty = not every.any()
+    probabilities = values is not None and not empty and bool(values.min() >= 0 and values.max() <= 1)
+    return _Seen(tallies=tallies, empty=empty, probabilities=probabilities)
+
+
+def _actor_cells(prediction: MotionOutput) -> BoolArray:
+    """(T, H, W) which cells are actors in the last prediction, as it lies."""
+    if prediction.instances is not None:
+        return np.asarray(prediction.instances[-1] > 0)
+    segmentation = (prediction.heads or ())[-1].segmentation
+    return np.asarray(segmentation[:, 1] > segmentation[:, 0])
+
+
+def _turned_maps(maps: AnyArray, axes: tuple[int, int]) -> AnyArray:
+    """Maps (T, rows, columns) in the devkit's orientation with other axes."""
+    x, y = axes
+    laid = maps if abs(x) == 1 else maps.swapaxes(1, 2)
+    return laid[:, :: np.sign(y), :: np.sign(x)]
+
+
+def _turned(points: FloatArray, axes: tuple[int, int]) -> FloatArray:
+    """Points (N, 2) or (N, 3) with other axes."""
+    x, y = (np.sign(axis) * points[:, abs(axis) - 1] for axis in axes)
+    return np.column_stack([x, y, points[:, 2:]])
+
+
+def _overlap(undone: AnyArray, true: AnyArray, given: AnyArray, given_true: AnyArray) -> FloatArray:
+    """(4, T) cells of the intersections and unions, frame by frame."""
+    cells = (undone & true, undone | true, given & given_true, given | given_true)
+    return np.array([each.sum(axis=(1, 2)) for each in cells], dtype=np.float64)
+
+
+def _detection_seen(dataset: Dataset, token: str, found: DetectedBoxes, truth: Boxes) -> _Seen:
+    """Compare detections with the boxes of others, both in the world frame: first their places."""
+    scores: list[float] = found.scores.tolist()
+    if not len(found) or not len(truth):
+        return _Seen(tallies={}, empty=not len(found), scores=scores)
+    boxes = found.boxes.select(columns_of(found.boxes, found.scores).surest_first[: 2 * len(truth)])
+    near = _near(boxes.center, truth.center)
+    hits = near.any(axis=1)
+    tallies = {
+        name: _tally(_near(center, truth.center).any(axis=1), hits, len(truth))
+        for name, center in _moved_back(dataset, token, boxes.center).items()
+    }
+    world = dataset.boxes(token, "world")  # the velocities of some protocols are in another frame
+    moving = world.select(
+        np.isin(world.actor_id, truth.actor_id) & (np.linalg.norm(world.velocity[:, :2], axis=1) >= _MOVING)
+    )
+    way = LABEL_STEP * moving.velocity[:, :2]
+    late, there = (_follows(boxes.center, moving.center[:, :2] - off, way) for off in (way, 0))
+    tallies["one step late"] = _tally(late, there, len(moving))
+    nearest = np.linalg.norm(truth.center[:, None] - boxes.center, axis=-1).argmin(axis=1)
+    return _pairs_seen(boxes.select(nearest[hits]), truth.select(hits), _Seen(tallies=tallies, scores=scores))
+
+
+def _pairs_seen(found: Boxes, true: Boxes, seen: _Seen) -> _Seen:
+    """Compare the sizes, headings and classes of true boxes with those of the boxes found there."""
+    sizes = {}
+    for name, order in _ORDERS.items():
+        tells = ~_same_size(true.size[:, order], true.size)
+        given, undone = (_same_size(size, true.size)[tells] for size in (found.size, found.size[:, np.argsort(order)]))
+        sizes[name] = _tally(undone, given, int(tells.sum()))
+    turn = np.abs((found.yaw - true.yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+    names = np.zeros((len(CATEGORIES), len(CATEGORIES)))
+    np.add.at(names, (true.category, found.category), 1)
+    right = int(np.count_nonzero(turn <= _STRAIGHT))
+    return replace(seen, tallies={**seen.tallies, **sizes, _CLASSES: names}, headings=(right, len(true)))
+
+
+def _near(found: FloatArray, true: FloatArray) -> BoolArray:
+    """(M, N) whether true centres and found ones are near each other."""
+    apart = true[:, None] - found
+    return np.asarray(np.hypot(apart[..., 0], apart[..., 1]) < _NEAR) & (np.abs(apart[..., 2]) < _NEAR_IN_HEIGHT)
+
+
+def _follows(found: FloatArray, places: FloatArray, way: FloatArray) -> BoolArray:
+    """(M,) whether anything found is at places (M, 2), as near as a quarter of the way from there."""
+    apart = np.linalg.norm(places[:, None] - found[:, :2], axis=-1)
+    return np.asarray(apart.min(axis=1) < np.linalg.norm(way, axis=-1) / 4)
+
+
+def _moved_back(dataset: Dataset, token: str, center: FloatArray) -> dict[str, FloatArray]:
+    """Mistake → the centres (N, 3) in the world where they should be."""
+    ego, lidar = (dataset.world_from(token, name) for name in ("ego", "lidar"))
+    in_ego = ego.inverse().apply(center)
+    return {
+        **{name: ego.apply(_turned(in_ego, axes)) for name, axes in _AXES.items()},
+        "world y mirrored": center * (1, -1, 1),
+        "ego frame for world frame": ego.apply(center),
+        "LiDAR frame for world frame": lidar.apply(center),
+        "LiDAR frame for ego frame": lidar.apply(in_ego),
+        "ego frame for LiDAR frame": ego.apply(lidar.inverse().apply(center)),
+    }
+
+
+def _same_size(found: FloatArray, true: FloatArray) -> BoolArray:
+    return np.asarray((np.abs(found - true) <= _ALIKE * true).all(axis=1))
+
+
+def _class_tally(names: FloatArray) -> FloatArray:
+    """(4, N) of the N classes that have another one's name by the one-to-one renaming that explains most."""
+    from scipy.optimize import linear_sum_assignment
+
+    number = names.sum(axis=1)
+    share = names / np.maximum(number, 1.0)[:, None]
+    _, other = linear_sum_assignment(
+        share + 1e-3 * np.eye(len(names)), maximize=True
+    )  # who is not found keeps its name
+    changed = np.flatnonzero((other != np.arange(len(names))) & (number >= _FEWEST))
+    if len(changed) == 1 and 2 * number[changed].sum() < number.sum():
+        changed = changed[:0]  # one rare class that is taken for another is no mistake of order
+    whole = number[changed]
+    return np.array([names[changed, other[changed]], whole, names[changed, changed], whole])
+
+
+def _accidents_seen(loader: SampleLoader, token: str, alarms: Sequence[Accident], context: AccidentContext) -> _Seen:
+    """Compare the surest accident with the true one: its places, and its time."""
+    scores = [each.score for each in alarms]
+    if not alarms:
+        return _Seen(tallies={}, empty=True)
+    surest = min(alarms, key=by_sureness)
+    if context.truth is None or context.truth.accident is None:
+        return _Seen(tallies={}, scores=scores, time=surest.time)
+    true, given = context.truth.accident, surest.positions
+    world = np.column_stack([given, np.zeros(2)])
+    places = {name: _turned(given, axes) for name, axes in _AXES.items()}
+    places["world frame for ego frame"] = loader.dataset.world_from(token, "ego").inverse().apply(world)[:, :2]
+    tallies = {
+        name: _told(
+            position_difference(undone, true.positions),
+            position_difference(given, true.positions),
+            position_difference(undone, given),
+            2 * _NEAR,
+        )
+        for name, undone in places.items()
+    }
+    times = {name: surest.time - lag * LABEL_STEP for name, lag in _LATE.items()}
+    times["frames reversed"] = loader.setup.horizon - surest.time
+    tallies |= {
+        name: _told(abs(undone - true.time), abs(surest.time - true.time), abs(undone - surest.time), _NEAR_IN_TIME)
+        for name, undone in times.items()
+    }
+    return _Seen(tallies=tallies, scores=scores, time=surest.time)
+
+
+def _told(undone: float, given: float, change: float, near: float) -> FloatArray:
+    """Whether the truth is as near, where both cannot be."""
+    tells = change > 2 * near
+    return _tally(tells and undone <= near, tells and given <= near, tells)
