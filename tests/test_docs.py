@@ -83,7 +83,6 @@ NOT_RUN = {
     "evaluate motion DATAROOT --results results/motion ": "likewise",
     "baseline predict DATAROOT --split": "docs/make_safety_page.py has them, and tests/test_cli_baseline.py their like",
     "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
-    "labels explain": "tests/unit/motion/test_explaining.py has it; this sample is of the demo",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
     "explore ": "tests/browser/test_explore.py has it; it runs until Ctrl-C",

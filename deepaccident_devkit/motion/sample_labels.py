@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.from_boxes import motion_labels_from_boxes
-from deepaccident_devkit.motion.explaining.samples import SampleOrigin
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_boxes import sample_boxes
-from deepaccident_devkit.tables.opened import token_of
 
 
 def motion_labels(
@@ -44,7 +41,6 @@ def motion_labels(
     """
     chosen = label_config(config)
     source = sample_boxes(dataset, sample, chosen)
-    labels = motion_labels_from_boxes(
+    return motion_labels_from_boxes(
         source.frames, source.egomotion, chosen, valid=source.valid, is_vehicle=source.is_vehicle, id_map=id_map
     )
-    return replace(labels, origin=SampleOrigin(dataset, token_of(sample)))
