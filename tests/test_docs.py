@@ -75,7 +75,6 @@ STAND_FOR = {
 NOT_RUN = {
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
     "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
-    "baseline v2x": "tests/test_cli_baseline.py has it, on smaller releases",
     "info s3:": "tests/cloud has releases on S3",
     "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",
     "predict ": "likewise",
