@@ -4,7 +4,7 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 
 | step | from → to | where |
 |---|---|---|
-| what a sample shows | tables → `FrameBoxes`, ego motion | `sample_boxes` (and `sample_lists`: which samples) |
+| what a sample shows | tables → `FrameBoxes`, ego motion | `sample_labels` (and `sample_lists`: which samples) |
 | who is rasterised, and where | boxes → `FramePolygons` | `drawing.box_polygons` |
 | which cells those are | polygons → cells | `drawing.polygon_fill` |
 | ids, centres, flow | cells → centres here and at the next frame | `drawing.from_boxes` |
