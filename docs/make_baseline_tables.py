@@ -1,4 +1,4 @@
-"""Make the tables of docs/baselines.md: `python docs/make_baseline_tables.py [FOLDER]`, from a checkout; 10 minutes.
+"""Make the tables of docs/baselines.md: `python docs/make_baseline_tables.py [FOLDER]`, from a checkout; some minutes.
 
 All numbers are of the functions of `deepaccident baseline predict`, `evaluate` and `evaluate compare`. FOLDER keeps the
 releases and predictions, so that an interrupted call goes on.
@@ -140,7 +140,8 @@ def decided_table(views: Views, bases: Mapping[str, str]) -> str:
             for row, ends in differences.items():
                 low, high = ends[name]
                 sides["more" if low > 0 else "less" if high < 0 else "not decided"].append(f"`{row}`")
-            lines.append([name, view, *(", ".join(each) or "–" for each in sides.values())])
+            words = ["every one" if len(each) == len(bases) else ", ".join(each) or "–" for each in sides.values()]
+            lines.append([name, view, *words])
     return table(["number", "view", "more", "less", "not decided"], lines)
 
 

@@ -81,6 +81,8 @@ NOT_RUN = {
     "evaluate motion training_data": "of what predict makes; likewise",
     "evaluate motion DATAROOT --results results/motion ": "likewise",
     "baseline predict DATAROOT --split": "docs/make_safety_page.py has them, and tests/test_cli_baseline.py their like",
+    "baseline predict hidden_release": "docs/make_baseline_tables.py has it and the next one",
+    "evaluate motion hidden_release": "likewise",
     "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",

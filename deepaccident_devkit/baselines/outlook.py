@@ -6,9 +6,8 @@ turn rate besides.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 
@@ -21,11 +20,11 @@ from deepaccident_devkit.v2x import Agents, Link
 from deepaccident_devkit.v2x.seen import SeenActors, seen_actors
 
 MotionModel = Literal["constant_velocity", "constant_turn_rate"]
+MOTION_MODELS: Final[tuple[MotionModel, ...]] = get_args(MotionModel)
 HISTORY: Final = 5
 """Recorded frames that turn rates look back, at most: 0.5 s."""
 _STRAIGHT: Final = 1e-6
 """Radians of turn below which a path is straight to all digits."""
-_Rates = Callable[[Dataset, RowArgument, Agents, Link | None, int], FloatArray]
 
 
 def constant_velocity(pose: FloatArray, velocity: FloatArray, times: FloatArray) -> FloatArray:
@@ -140,19 +139,6 @@ def outlook(
     """
     model = choice("model", model, MOTION_MODELS)
     seen = seen_actors(dataset, sample, agents=agents, link=link)
-    return Outlook(seen=seen, turn_rate=MOTION_MODELS[model](dataset, sample, agents, link, len(seen.boxes)))
-
-
-def _straight(_dataset: Dataset, _sample: RowArgument, _agents: Agents, _link: Link | None, count: int) -> FloatArray:
-    return np.zeros(count)
-
-
-def _turning(dataset: Dataset, sample: RowArgument, agents: Agents, link: Link | None, _count: int) -> FloatArray:
-    return turn_rates(dataset, sample, agents=agents, link=link)
-
-
-MOTION_MODELS: Final[Mapping[MotionModel, _Rates]] = {
-    "constant_velocity": _straight,
-    "constant_turn_rate": _turning,
-}
-"""Turn rates, by model."""
+    turns = model == "constant_turn_rate"
+    rate = turn_rates(dataset, sample, agents=agents, link=link) if turns else np.zeros(len(seen.boxes))
+    return Outlook(seen=seen, turn_rate=rate)
