@@ -86,7 +86,7 @@ _STEPS: Final = {
     "indexing": 1.0,
     "pictures": 5.0,
     "model": 5.0,
-    "table": 2.0,
+    "table": 3.0,
     "evaluation": 4.0,
     "replay": 4.0,
 }
