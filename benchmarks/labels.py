@@ -10,8 +10,14 @@ from benchmarks import labels_postprocess, labels_warp
 from benchmarks.measure import Figure, best_of, one_core
 from benchmarks.releases import labels_only_release
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig, write_label_files
-from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
+from deepaccident_devkit.motion import (
+    LABEL_PROTOCOLS,
+    FrameBoxes,
+    LabelFiles,
+    MotionLabelConfig,
+    motion_labels_from_boxes,
+    write_label_files,
+)
 from deepaccident_devkit.motion.drawing.label_maps import LabelMaps
 from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
 

@@ -35,7 +35,6 @@ GROUPS = {
     "all classes": tuple(colors.CATEGORY_COLORS.values()),
     "series": colors.SERIES_COLORS,
     "splits": tuple(colors.SPLIT_COLORS.values()),
-    "configurations": tuple(colors.CONFIGURATION_COLORS.values()),
 }
 """Colours that stand together in a picture and must be distinguished."""
 GROUNDS = {"white": "#ffffff", "road": colors.BEV_COLORS["road"], "mid-grey image": "#808080"}

@@ -5,8 +5,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
-from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
-from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
+from deepaccident_devkit.motion import (
+    FrameBoxes,
+    MotionHeads,
+    MotionLabelConfig,
+    MotionLabels,
+    motion_labels_from_boxes,
+)
 
 Path = Sequence[tuple[float, float] | None]
 """Where a car is at each of the five label frames: x forward, y left; None where it is not."""

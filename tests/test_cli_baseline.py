@@ -1,7 +1,5 @@
 """`deepaccident baseline`: one library call a verb."""
 
-import csv
-import json
 import shutil
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import Baseline, conditions, figures
+from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import NotAvailableError, ResultsError, UnfinishedError
 from deepaccident_devkit.evaluation.results import read_results
@@ -88,28 +86,6 @@ def test_predict_takes_every_half_second_of_all_scenarios(da_motion: DeepAcciden
     assert list(read_results(tmp_path / "detection.json").tokens) == da_motion.samples("train", "all")
 
 
-def test_the_study_is_printed_and_written(
-    da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(conditions, "_QUICK_HORIZONS", (2.0,))
-    monkeypatch.setattr(conditions, "_QUICK_STEPS", (0.0, 0.5))
-    out = tmp_path / "study"
-    options = "--split train --quick --seed 3 --seed 5 --resamples 20 --workers 1"
-    text = run("v2x", da_motion.dataroot, *options.split(), "--out", out)
-    assert "Who cooperates" in text
-    assert "written: 11 files in" in text
-    names = ("configurations", "horizons", "latency", "pose_noise", "visibility")
-    files = sorted([*(f"{name}{end}" for name in names for end in (".csv", ".png")), "v2x_study.json"])
-    assert sorted(path.name for path in out.iterdir()) == files
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in out.glob("*.png"))
-    described = json.loads((out / "v2x_study.json").read_text(encoding="utf-8"))
-    assert described["config"]["protocol"] == "paper"
-    assert described["config"]["seeds"] == [3, 5]
-    assert described["config"]["resampling"]["resamples"] == 20
-    with (out / "configurations.csv").open(encoding="utf-8") as file:
-        assert next(csv.DictReader(file))["agents"] == "single"
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -141,31 +117,8 @@ def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, t
         run(*words, "--task", "accident", "--agents", "all")
 
 
-def test_parts_of_the_study_make_the_same_files(
-    da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(conditions, "_QUICK_HORIZONS", (2.0,))
-    monkeypatch.setattr(conditions, "_QUICK_STEPS", (0.0,))
-    monkeypatch.setattr(figures, "save_panels", lambda _, title, path: path.write_text(title))
-    words = ("v2x", da_motion.dataroot, "--split", "train", "--scope", "all", "--quick", "--workers", 1)
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    printed = run(*words, "--out", whole)
-    told = "part 2/2: 4 samples; next: the same with --merge\n"
-    assert told in run(*words, "--out", parts, "--shard", "2/2")
-    with pytest.raises(UnfinishedError, match="4 of 8 are not done"):
-        run(*words, "--out", parts, "--merge")
-    run(*words, "--out", parts, "--shard", "1/2")
-    tables = [
-        text[text.index("V2X") : text.index("written:")] for text in (printed, run(*words, "--out", parts, "--merge"))
-    ]
-    assert tables[0] == tables[1]
-    assert contents(parts) == contents(whole)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["parts", "whole"]
-
-
-@pytest.mark.parametrize("verb", ["predict", "v2x"])
-def test_the_verbs_have_the_grammar_of_all_others(verb: str) -> None:
-    text = CliRunner().invoke(deepaccident, ["baseline", verb, "--help"]).output
+def test_predict_has_the_grammar_of_all_other_verbs() -> None:
+    text = CliRunner().invoke(deepaccident, ["baseline", "predict", "--help"]).output
     for word in (
         "DATAROOT",
         "--version",

@@ -1,21 +1,100 @@
-"""`Outlook`: where an agent and its partners expect the actors that they see now."""
+"""`Outlook`: where an agent and its partners expect the actors that they see now.
+
+Who is seen, and where, is by the labels (`v2x.seen`): an oracle. Actors go on at a constant velocity, or at a constant
+turn rate besides.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays
-from deepaccident_devkit.baselines.motion_models import MotionModel, constant_turn_rate
-from deepaccident_devkit.baselines.oracle import SeenActors, seen_actors, turn_rates
 from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, Link
+from deepaccident_devkit.v2x.seen import SeenActors, seen_actors
 
-_Rates = Callable[[Dataset, RowArgument, Agents, Link | None, int], FloatArray]
+MotionModel = Literal["constant_velocity", "constant_turn_rate"]
+MOTION_MODELS: Final[tuple[MotionModel, ...]] = get_args(MotionModel)
+HISTORY: Final = 5
+"""Recorded frames that turn rates look back, at most: 0.5 s."""
+_STRAIGHT: Final = 1e-6
+"""Radians of turn below which a path is straight to all digits."""
+
+
+def constant_velocity(pose: FloatArray, velocity: FloatArray, times: FloatArray) -> FloatArray:
+    """Straight on.
+
+    Args:
+        pose: (N, 3) x, y (metres), yaw (radians) at time 0, in any right-handed frame.
+        velocity: (N, 2) m/s over the ground, in the same frame; NaN counts as standing.
+        times: (T,) seconds.
+
+    Returns:
+        (T, N, 3) x, y, yaw.
+    """
+    return constant_turn_rate(pose, velocity, np.zeros(len(pose)), times)
+
+
+def constant_turn_rate(pose: FloatArray, velocity: FloatArray, turn_rate: FloatArray, times: FloatArray) -> FloatArray:
+    """At a constant speed, while velocity and heading turn alike.
+
+    Args:
+        pose: as of `constant_velocity`.
+        velocity: as of `constant_velocity`.
+        turn_rate: (N,) radians a second, counter-clockwise; 0 goes straight on.
+        times: (T,) seconds.
+
+    Returns:
+        (T, N, 3) x, y, yaw.
+    """
+    moving = np.where(np.isfinite(velocity), velocity, 0.0)
+    turn = times[:, None] * turn_rate
+    straight = np.abs(turn) < _STRAIGHT
+    divisor = np.where(straight, 1.0, turn)
+    # ∫ (cos, sin)(rate · s) ds from 0 to t, over t
+    ahead = np.where(straight, 1.0, np.sin(turn) / divisor)
+    aside = np.where(straight, turn / 2, (1 - np.cos(turn)) / divisor)
+    x = ahead * moving[:, 0] - aside * moving[:, 1]
+    y = aside * moving[:, 0] + ahead * moving[:, 1]
+    way = times[:, None, None] * np.stack([x, y], axis=-1)
+    return np.concatenate([pose[:, :2] + way, (pose[:, 2] + turn)[..., None]], axis=-1)
+
+
+def turn_rates(
+    dataset: Dataset, sample: RowArgument, *, agents: Agents = "single", link: Link | None = None
+) -> FloatArray:
+    """The turn rates of the actors of `seen_actors`, by their headings at the present and up to 0.5 s before it.
+
+    For each actor the earliest of these moments counts at which the agents saw it. Arguments and errors as of
+    `seen_actors`.
+
+    Returns:
+        (N,) radians a second, counter-clockwise; 0 for actors not seen before.
+    """
+    scenario, agent, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
+    present = seen_actors(dataset, sample, agents=agents, link=link, frame="world").boxes
+    rate, known = np.zeros(len(present)), np.zeros(len(present), dtype=bool)
+    delay = 0 if link is None else link.latency_frames
+    for back in range(min(HISTORY, int(number) - 1 - delay), 0, -1):
+        if known.all():
+            break
+        token = sample_token(scenario, agent, int(number) - back)
+        before = seen_actors(dataset, token, agents=agents, link=link, frame="world").boxes
+        _, now, then = np.intersect1d(present.actor_id, before.actor_id, return_indices=True)
+        turned = present.yaw[now] - before.yaw[then]
+        found = np.zeros(len(present), dtype=bool)
+        found[now] = True
+        values = np.zeros(len(present))
+        values[now] = np.arctan2(np.sin(turned), np.cos(turned)) / (back * FRAME_PERIOD)
+        fresh = found & ~known
+        rate[fresh], known = values[fresh], known | found
+    return rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,19 +139,6 @@ def outlook(
     """
     model = choice("model", model, MOTION_MODELS)
     seen = seen_actors(dataset, sample, agents=agents, link=link)
-    return Outlook(seen=seen, turn_rate=MOTION_MODELS[model](dataset, sample, agents, link, len(seen.boxes)))
-
-
-def _straight(_dataset: Dataset, _sample: RowArgument, _agents: Agents, _link: Link | None, count: int) -> FloatArray:
-    return np.zeros(count)
-
-
-def _turning(dataset: Dataset, sample: RowArgument, agents: Agents, link: Link | None, _count: int) -> FloatArray:
-    return turn_rates(dataset, sample, agents=agents, link=link)
-
-
-MOTION_MODELS: Final[Mapping[MotionModel, _Rates]] = {
-    "constant_velocity": _straight,
-    "constant_turn_rate": _turning,
-}
-"""Turn rates, by model."""
+    turns = model == "constant_turn_rate"
+    rate = turn_rates(dataset, sample, agents=agents, link=link) if turns else np.zeros(len(seen.boxes))
+    return Outlook(seen=seen, turn_rate=rate)

@@ -1,4 +1,9 @@
-"""The baselines' predictions of one sample, for each task."""
+"""The baselines' predictions of one sample, for each task.
+
+Motion is rasterised as labels are, so that a perfect outlook scores 100: at every moment in the ego frame of that
+moment, and warped to the present. So the expected boxes are put into the ego frames that the ego expects for itself,
+and go through the labels' own rasteriser and warps.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +11,17 @@ import math
 
 import numpy as np
 
+from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.baselines.collisions import DANGER_DISTANCE, accidents_ahead
-from deepaccident_devkit.baselines.drawing import label_times, motion_of
-from deepaccident_devkit.baselines.motion_models import MotionModel
-from deepaccident_devkit.baselines.oracle import SeenActors, seen_actors
-from deepaccident_devkit.baselines.outlook import outlook
+from deepaccident_devkit.baselines.outlook import MotionModel, outlook
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
-from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OWN_ACTOR_ID
-from deepaccident_devkit.v2x import Agents, Link
+from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, motion_labels_from_boxes
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.v2x import Agents, Link, future_egomotion
+from deepaccident_devkit.v2x.seen import SeenActors, seen_actors
 
 _ENOUGH_POINTS = 10.0
 """LiDAR points that add to a score half of what any number of them can add."""
@@ -42,11 +47,61 @@ def predict_motion(
         config: of the labels; None for the released ones. Its `agents` and `filter_invisible` have no effect.
 
     Raises:
-        DeepAccidentError: as of `oracle.seen_actors`; no such model.
+        DeepAccidentError: as of `v2x.seen.seen_actors`; no such model.
     """
     chosen = config or MotionLabelConfig()
     ahead = outlook(dataset, sample, agents=agents, model=model, link=link)
     return motion_of(ahead.seen, ahead.poses(label_times(chosen)), dataset.ego_from(sample, LIDAR), chosen)
+
+
+def label_times(config: MotionLabelConfig) -> FloatArray:
+    """(T,) seconds from the present of the frames that labels show."""
+    return np.arange(config.label_frames, dtype=np.float64) * (config.step * FRAME_PERIOD)
+
+
+def motion_of(seen: SeenActors, poses: FloatArray, ego_from_lidar: SE3, config: MotionLabelConfig) -> MotionOutput:
+    """One prediction as instance maps.
+
+    Args:
+        seen: N actors; boxes in the present frame `ego`.
+        poses: (T, N, 3) where they are at `label_times`: x forward, y left (metres), yaw (radians), in the present
+            ego frame.
+        ego_from_lidar: of the sample: the released labels move the ego's own box by it.
+        config: of the labels that are to be foretold.
+    """
+    present_from_ego = _ego_poses(poses, has_own=seen.has_own)
+    frames = [
+        _frame_boxes(seen, pose, (present @ ego_from_lidar).inverse(), ego_from_lidar)
+        for pose, present in zip(poses, present_from_ego, strict=True)
+    ]
+    past = [SE3.identity()] * (config.receptive_field - 1)
+    motion = future_egomotion([*past, *present_from_ego, present_from_ego[-1]])
+    labels = motion_labels_from_boxes(frames, motion, config, is_vehicle=seen.has_own).to_present()
+    return MotionOutput(grid=config.grid, instances=labels.instance[None])
+
+
+def _ego_poses(poses: FloatArray, *, has_own: bool) -> list[SE3]:
+    """Where the ego frame is at each moment, as it moves with the ego's box, which is the first; the pole stands."""
+    if not has_own:
+        return [SE3.identity()] * len(poses)
+    present_from_box = [SE3.from_yaw(yaw, (x, y, 0.0)) for x, y, yaw in poses[:, 0].tolist()]
+    box_from_ego = present_from_box[0].inverse()
+    return [pose @ box_from_ego for pose in present_from_box]
+
+
+def _frame_boxes(seen: SeenActors, pose: FloatArray, lidar_from_present: SE3, ego_from_lidar: SE3) -> FrameBoxes:
+    """The boxes that would be annotated at a moment, all of them seen."""
+    boxes = seen.boxes
+    center = np.column_stack([pose[:, :2], boxes.center[:, 2]])
+    return FrameBoxes(
+        center=lidar_from_present.apply(center),
+        size=boxes.size,
+        yaw=pose[:, 2] + lidar_from_present.yaw,
+        actor_id=boxes.actor_id,
+        category=boxes.category,
+        visible=np.ones(len(boxes), dtype=bool),
+        ego_from_lidar=ego_from_lidar.matrix,
+    )
 
 
 def predict_accidents(
@@ -96,13 +151,9 @@ def predict_detections(
         link: what happens to the partners' data.
 
     Raises:
-        DeepAccidentError: as of `oracle.seen_actors`.
+        DeepAccidentError: as of `v2x.seen.seen_actors`.
     """
-    return detections_of(seen_actors(dataset, sample, agents=agents, link=link, frame="world"))
-
-
-def detections_of(seen: SeenActors) -> DetectedBoxes:
-    """The detections of `predict_detections`, in the frame in which actors are seen."""
+    seen = seen_actors(dataset, sample, agents=agents, link=link, frame="world")
     watchers = np.unpackbits(seen.seen_by[:, None], axis=1).sum(axis=1)
     points = seen.boxes.num_lidar_pts
     scores = (watchers + points / (points + _ENOUGH_POINTS)) / (len(AGENTS) + 1)

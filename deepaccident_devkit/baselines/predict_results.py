@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.baselines.motion_models import MotionModel
+from deepaccident_devkit.baselines.outlook import MotionModel
 from deepaccident_devkit.baselines.predict import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ResultsError

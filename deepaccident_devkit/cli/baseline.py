@@ -1,14 +1,12 @@
-"""`deepaccident baseline`: results of the baselines, and the study of V2X with them."""
+"""`deepaccident baseline predict`: results files of the baselines."""
 
 from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results
-from deepaccident_devkit.baselines.figures import save_study
+from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, predict_results
 from deepaccident_devkit.baselines.predict_results import is_predicted, samples_by_scenario
-from deepaccident_devkit.baselines.study_parts import StudyInParts
-from deepaccident_devkit.cli.evaluate_options import purpose_parameter, resamples_parameter, scope_parameter
+from deepaccident_devkit.cli.evaluate_options import purpose_parameter, scope_parameter
 from deepaccident_devkit.cli.options import (
     LINK_OPTIONS,
     WordChoice,
@@ -21,29 +19,16 @@ from deepaccident_devkit.cli.options import (
     refuse_unused,
     release_parameters,
     say_part_done,
-    write_report,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
 from deepaccident_devkit.parallel import Part, Shard, mine
-from deepaccident_devkit.taxonomy import AGENTS
 
 _ALONE = "single"
 _RELEASED_HORIZON = Baseline().horizon
-_SPLIT = click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
-_OUT = click.option("--out", required=True, type=click.Path(), metavar="DIR", help="Folder to write the files into.")
-_MODEL = click.option(
-    "--model",
-    type=WordChoice(MOTION_MODELS),
-    default="constant_velocity",
-    show_default=True,
-    help="How the baseline moves each actor into the future.",
-)
 
 
 @click.group()
@@ -54,7 +39,7 @@ def baseline() -> None:
 @baseline.command()
 @release_parameters
 @part_parameters
-@_SPLIT
+@click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
 @click.option(
     "--task",
     "tasks",
@@ -65,14 +50,20 @@ def baseline() -> None:
     help="Task to write results for; you can repeat this option.",
 )
 @cooperating_parameter("Agents that share what they see", _ALONE)
-@_MODEL
+@click.option(
+    "--model",
+    type=WordChoice(MOTION_MODELS),
+    default="constant_velocity",
+    show_default=True,
+    help="How the baseline moves each actor into the future.",
+)
 @link_parameters
 @click.option(
     "--horizon", default=_RELEASED_HORIZON, show_default=True, help="How many seconds to predict, in steps of 0.5."
 )
 @purpose_parameter
 @scope_parameter
-@_OUT
+@click.option("--out", required=True, type=click.Path(), metavar="DIR", help="Folder to write the files into.")
 def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out: str, **options: Any) -> None:
     """Write results files of a baseline for one split of the release in DATAROOT.
 
@@ -105,57 +96,3 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     if isinstance(part, Shard):
         own = mine(part, samples_by_scenario(tokens))
         say_part_done(part, f"{sum(map(len, own)):,} samples of {len(own):,} scenarios, {', '.join(wanted)}")
-
-
-@baseline.command()
-@release_parameters
-@part_parameters
-@_SPLIT
-@_MODEL
-@click.option(
-    "--ego",
-    "egos",
-    multiple=True,
-    type=WordChoice(AGENTS),
-    help="Agent that predicts; you can repeat this option.  [default: ego_vehicle]",
-)
-@scope_parameter
-@click.option(
-    "--protocol",
-    type=WordChoice(PROTOCOLS),
-    default="paper",
-    show_default=True,
-    help="Protocol for accidents in maps. Explicit accidents always use the protocol boxes.",
-)
-@click.option(
-    "--seed",
-    "seeds",
-    multiple=True,
-    type=int,
-    help="Seed of the pose noise; you can repeat this option.  [default: 0, 1, 2]",
-)
-@resamples_parameter
-@click.option("--quick", is_flag=True, help="Try fewer horizons, and fewer values of noise and latency.")
-@_OUT
-def v2x(split: str, egos: tuple[str, ...], seeds: tuple[int, ...], resamples: int, out: str, **options: Any) -> None:
-    """Compare how well seven sets of agents predict the accidents of the release in DATAROOT.
-
-    Print the tables, and write one CSV file and one picture per table. If the command is interrupted, the same command
-    continues.
-    """
-    part: Part = options.pop("part")
-    how = {name: options.pop(name) for name in ("model", "scope", "protocol", "quick")}
-    usual = StudyConfig()
-    how |= {"egos": egos or usual.egos, "seeds": seeds or usual.seeds, "resampling": Resampling(resamples=resamples)}
-    config = StudyConfig(**how)
-    folder = writable_folder(out)
-    work = StudyInParts(DeepAccident(**options), folder, split, config)
-    samples = work.count(part, **engine_of(options), progress=True)
-    if isinstance(part, Shard):
-        say_part_done(part, f"{samples:,} samples")
-        return
-    study = work.result()
-    written = [*write_report(study, folder, "v2x_study.json"), *save_study(study, folder)]
-    work.remove()
-    click.echo(study.to_text())
-    click.echo(f"written: {len(written)} files in {folder}")

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 from tqdm import tqdm
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.baselines import demo_table, predict_results
+from deepaccident_devkit.baselines import Baseline, predict_results
 from deepaccident_devkit.cli.demo_page import (
     MODEL_PICTURE,
     PAGE,
@@ -28,7 +29,8 @@ from deepaccident_devkit.cli.options import use_threads_sparingly
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
-from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.metrics.headlines import headlines
+from deepaccident_devkit.evaluation.results import ResultsTask, read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import place_in, remove_leftovers, write_bytes
@@ -38,6 +40,7 @@ from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_repo
 from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import columns_text
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import FrameRecord, ScenarioRecord
@@ -69,12 +72,21 @@ _SECONDS_BEFORE: Final = 1.0
 _LABELS: Final = MotionLabelConfig(future_frames=2)
 """The released labels, but they end at the impact."""
 _SELECTION: Final = SampleSelection(split="train", scope="all")
+_BEFORE: Final = SampleSelection(split="train", agents=("ego_vehicle",), horizon=4.0)
+"""The samples of the table: ego's in the last four seconds before the crash."""
+_AGENTS: Final = {"single": "single vehicle", "all": "five agents"}
+_NUMBERS: Final[Mapping[ResultsTask, tuple[str, Mapping[str, str]]]] = {
+    "motion": ("paper", {"IoU (%)": "iou 100x100", "VPQ (%)": "vpq 100x100"}),
+    "accident": ("boxes", {"APA": "apa", "precision": "precision", "recall": "recall"}),
+    "detection": ("paper", {"mAP (%)": "mAP"}),
+}
+"""Task → the protocol, and the heading of each number of the table with its name in the result."""
 _STEPS: Final = {
     "recording": 32.0,
     "indexing": 1.0,
     "pictures": 5.0,
     "model": 5.0,
-    "table": 2.0,
+    "table": 3.0,
     "evaluation": 4.0,
     "replay": 4.0,
 }
@@ -106,13 +118,13 @@ def demo(out: Path, workers: int | None) -> None:
         with _step(bar, "model"):
             model = draw_model(release, out)
         with _step(bar, "table"):
-            rows, table = demo_table(release)
+            table = demo_table(release)
         with _step(bar, "evaluation"):
             _evaluate(release, out)
         with _step(bar, "replay"):
             render_replay(release, None, out / REPLAY)
-    write_bytes(out / PAGE, demo_page(rows, steps, model=model).encode())
-    click.echo(f"{table}\n\nNext steps:")
+    write_bytes(out / PAGE, demo_page(table, steps, model=model).encode())
+    click.echo(f"{columns_text(table)}\n\nNext steps:")
     for number, step in enumerate(steps, 1):
         click.echo(f"{number}. {step.sentence}\n   {step.command}")
     click.echo(f"\nOpen this page in a browser, it shows all that was made: {out / PAGE}")
@@ -206,6 +218,23 @@ def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
         write_bytes(scenario, SCENARIO.encode())
     config = replace(_RELEASE, spec=scenario)
     make_release(root, config, workers=workers or 2, progress=lambda share: bar.update(share * _STEPS["recording"]))
+
+
+def demo_table(release: DeepAccident) -> list[list[str]]:
+    """How well ego alone and five agents foresee the crash: a heading, and a line of text for each of the two."""
+    tokens = _BEFORE.tokens(release)
+    rows = [["", *(heading for _, numbers in _NUMBERS.values() for heading in numbers)]]
+    for agents, name in _AGENTS.items():
+        baseline, row = Baseline(agents=agents, horizon=_BEFORE.horizon), [name]
+        with TemporaryDirectory() as folder:
+            for task, (protocol, numbers) in _NUMBERS.items():
+                path = predict_results(release, task, tokens, Path(folder) / task, baseline, workers=1)
+                setup = EvaluationSetup(task=task, protocol=protocol, horizon=_BEFORE.horizon)
+                run = evaluate_results(release, path, setup, _BEFORE, workers=1)
+                found = {each.name: each for each in headlines(task, run.result)}
+                row += [found[number].text().removesuffix(" %") for number in numbers.values()]
+        rows.append(row)
+    return rows
 
 
 def _evaluate(release: DeepAccident, out: Path) -> None:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from deepaccident_devkit.baselines.hidden_collider import HiddenCollider, table_rows
 from deepaccident_devkit.render.markup import Markup, document, joined, table, tag
 
 PAGE: Final = "index.html"
@@ -49,8 +48,8 @@ _POLICY: Final = "default-src 'none'; img-src 'self' file:; frame-src 'self' fil
 """A browser loads only what lies beside the page, on a disk or a server; only the pages in frames run anything."""
 _TABLE: Final = """\
 How well one car and five agents together predict the crash. The predictor is a baseline: each actor that is seen \
-keeps its speed. IoU and VPQ measure the predicted maps, APA the predicted accidents. "warning" is the time before \
-the impact from which on every moment has the right alarm."""
+keeps its speed. The numbers are of every half second of the last four before the impact, and look four seconds \
+ahead. IoU and VPQ measure the predicted maps, APA, precision and recall the predicted accidents, mAP the boxes seen."""
 _REPLAY: Final = "Press Play, or drag the slider: all five cameras, the scene from above, and who sees whom."
 _REPORT: Final = """\
 The predictions of each agent alone, for both scenarios: what it foresees, what it misses, how often its alarm is \
@@ -70,15 +69,15 @@ class NextStep:
     command: str
 
 
-def demo_page(rows: Sequence[HiddenCollider], steps: Sequence[NextStep], *, model: bool) -> str:
+def demo_page(rows: Sequence[Sequence[str]], steps: Sequence[NextStep], *, model: bool) -> str:
     """The complete page; it refers to the other files of its folder by their names.
 
     Args:
-        rows: of `demo_table`.
+        rows: of `demo.demo_table`.
         steps: what to try next.
         model: whether there is a picture of a model's predictions.
     """
-    heading, *lines = zip(*table_rows(rows), strict=True)  # a column for each set of agents: it fits a narrow window
+    heading, *lines = zip(*rows, strict=True)  # a column for each set of agents: it fits a narrow window
     parts = [
         *((*words, _image(name, *words)) for name, words in (PICTURES | (MODEL_PICTURE if model else {})).items()),
         ("What one car and five agents foresee", _TABLE, table(heading, lines)),

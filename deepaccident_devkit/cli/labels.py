@@ -1,72 +1,35 @@
-"""`deepaccident labels`: the motion labels of a split, written into a folder; and one cell of them explained."""
+"""`deepaccident labels`: the motion labels of a split, written into a folder."""
 
-import json
-import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.groups import VerbGroup
 from deepaccident_devkit.cli.options import (
-    Verb,
     WordChoice,
     agent_names,
     agents_parameter,
     engine_of,
     part_parameters,
-    reader_parameters,
     refuse_unused,
     release_parameters,
     say_part_done,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.label_folder import Manifest, folder_path
 from deepaccident_devkit.motion.protocols import slip_names
 from deepaccident_devkit.motion.sample_lists import Purpose
-from deepaccident_devkit.motion.warps.warping import WarpMode
 from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.v2x import AGENT_SETS
 
 _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "only_vehicle")
-_CONFIG_PARAMETERS = (
-    click.option(
-        "--preset",
-        type=WordChoice(PRESETS),
-        default="deepaccident",
-        show_default=True,
-        help="Grid, orientation and protocol of the labels.",
-    ),
-    click.option("--protocol", type=WordChoice(LABEL_PROTOCOLS), help="Rules of the labels.  [default: of the preset]"),
-    click.option(
-        "--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Switch one quirk of the protocol on or off."
-    ),
-    click.option(
-        "--orientation", type=WordChoice(ORIENTATIONS), help="Order of rows and columns.  [default: of the preset]"
-    ),
-    click.option(
-        "--seen-by",
-        type=WordChoice(AGENT_SETS),
-        help="Only actors that these agents see.  [default: all actors]",
-    ),
-    click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians."),
-)
 
 
-def _config_parameters(verb: Verb) -> Verb:
-    """Give a verb the options that `_config` reads."""
-    for option in reversed(_CONFIG_PARAMETERS):
-        verb = option(verb)
-    return verb
-
-
-@click.group(cls=VerbGroup)
+@click.command()
 @release_parameters
 @part_parameters
 @click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (.txt).")
@@ -85,7 +48,26 @@ def _config_parameters(verb: Verb) -> Verb:
     show_default=True,
     help="every: all samples (10 Hz). all: two samples per second. train, evaluate: those of training and evaluation.",
 )
-@_config_parameters
+@click.option(
+    "--preset",
+    type=WordChoice(PRESETS),
+    default="deepaccident",
+    show_default=True,
+    help="Grid, orientation and protocol of the labels.",
+)
+@click.option("--protocol", type=WordChoice(LABEL_PROTOCOLS), help="Rules of the labels.  [default: of the preset]")
+@click.option(
+    "--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Switch one quirk of the protocol on or off."
+)
+@click.option(
+    "--orientation", type=WordChoice(ORIENTATIONS), help="Order of rows and columns.  [default: of the preset]"
+)
+@click.option(
+    "--seen-by",
+    type=WordChoice(AGENT_SETS),
+    help="Only actors that these agents see.  [default: all actors]",
+)
+@click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians.")
 @click.option(
     "--names",
     type=WordChoice(get_args(BatchNames)),
@@ -127,72 +109,8 @@ def labels(
         click.echo(told)
 
 
-def _cell(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, int, int]:
-    """Parse `T,ROW,COL`."""
-    match = re.fullmatch(r"(\d+),\s*(\d+),\s*(\d+)", value.strip())
-    if match is None:
-        raise click.BadParameter(f"expected T,ROW,COL such as 0,100,112, found {value!r}", context, parameter)
-    return int(match[1]), int(match[2]), int(match[3])
-
-
-@labels.command(short_help="Print how one cell of a sample's labels came to its values.")
-@reader_parameters
-@click.argument("sample")
-@click.option(
-    "--cell",
-    required=True,
-    callback=_cell,
-    metavar="T,ROW,COL",
-    help="Label frame (0 is the present), row and column, as in the arrays; all count from 0.",
-)
-@_config_parameters
-@click.option(
-    "--own-frames",
-    is_flag=True,
-    help="The cell is of the unwarped labels, in which each frame is in its own ego frame.",
-)
-@click.option(
-    "--centerness",
-    type=WordChoice(get_args(WarpMode)),
-    default="nearest",
-    show_default=True,
-    help="How to sample centerness: nearest as in training, bilinear as in evaluation.",
-)
-@click.option(
-    "--results",
-    "results_file",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Motion results, to see what a prediction put at the cell.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
-def explain(
-    sample: str,
-    cell: tuple[int, int, int],
-    own_frames: bool,
-    centerness: WarpMode,
-    results_file: Path | None,
-    as_json: bool,
-    **options: Any,
-) -> None:
-    """Print who painted one cell of the motion labels of SAMPLE, from which box, and through which warp and quirks.
-
-    The labels are at the present, as models learn and predict them. SAMPLE is a token of the release in DATAROOT.
-    """
-    if own_frames:
-        refuse_unused("with --own-frames: nothing is warped", "centerness")
-    config = _config(options)
-    results = None if results_file is None else read_results(results_file)
-    if results is not None and results.task != "motion":
-        raise NotAvailableError(f"{results.path}: holds {results.task} results; --results takes those of motion")
-    made = DeepAccident(**options).motion_labels(sample, config)
-    prediction = None if results is None else results.prediction(sample)
-    told = (made if own_frames else made.to_present(centerness)).explain(*cell, prediction=prediction)
-    click.echo(json.dumps(told.to_dict(), indent=1) if as_json else told.text)
-
-
 def _config(options: dict[str, Any]) -> MotionLabelConfig:
-    """Take the options of `_config_parameters` out of a verb's."""
+    """Take the options that say what labels show out of the verb's."""
     preset, protocol, switches, orientation, seen_by, only_vehicle = (options.pop(name) for name in _CONFIG_OPTIONS)
     named = {"protocol": protocol, "orientation": orientation, "agents": seen_by, "only_vehicle": only_vehicle or None}
     changes: dict[str, Any] = {name: value for name, value in named.items() if value is not None}

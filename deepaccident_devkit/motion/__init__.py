@@ -4,7 +4,7 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 
 | step | from → to | where |
 |---|---|---|
-| what a sample shows | tables → `FrameBoxes`, ego motion | `sample_boxes` (and `sample_lists`: which samples) |
+| what a sample shows | tables → `FrameBoxes`, ego motion | `sample_labels` (and `sample_lists`: which samples) |
 | who is rasterised, and where | boxes → `FramePolygons` | `drawing.box_polygons` |
 | which cells those are | polygons → cells | `drawing.polygon_fill` |
 | ids, centres, flow | cells → centres here and at the next frame | `drawing.from_boxes` |
@@ -14,7 +14,6 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 | a prediction | arrays → `MotionHeads` | `postprocessing.heads` |
 | instances of a frame | heads → centres, and cells by centre | `postprocessing.grouping` |
 | the same id in all frames | instances → `LinkedInstances` | `postprocessing.linking`, `postprocessing.predict` |
-| why a cell is as it is | labels, boxes → `CellExplanation` | `explaining`, in the words of `cells` |
 | boxes along the paths | linked instances → their redrawn maps | `postprocessing.redrawing` |
 
 A `MotionLabelConfig` (`config`) says what is rasterised, a `LabelProtocol` how (`protocols`: every quirk of the
@@ -30,26 +29,9 @@ from deepaccident_devkit.motion.bev_segmentation import (
     bev_segmentation,
     segmentation_of,
 )
-from deepaccident_devkit.motion.cells.explanation import CellExplanation
-from deepaccident_devkit.motion.cells.parts import (
-    OWN_BOX_ID,
-    CellBox,
-    CellChange,
-    CellPeak,
-    CellPrediction,
-    CellQuirk,
-    CellSource,
-    CellValues,
-)
 from deepaccident_devkit.motion.config import PRESETS, MotionLabelConfig
-from deepaccident_devkit.motion.drawing.from_boxes import (
-    FrameBoxes,
-    FramePolygons,
-    labels_from_polygons,
-    motion_labels_from_boxes,
-)
-from deepaccident_devkit.motion.explaining.cells import explain_cell_from_boxes
-from deepaccident_devkit.motion.explaining.samples import explain_cell
+from deepaccident_devkit.motion.drawing.box_polygons import OWN_BOX_ID, FrameBoxes, FramePolygons
+from deepaccident_devkit.motion.drawing.from_boxes import labels_from_polygons, motion_labels_from_boxes
 from deepaccident_devkit.motion.label_files import LabelFiles, LabelsWritten, write_label_files
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
@@ -74,14 +56,6 @@ __all__ = [
     "PRESETS",
     "Augmentation",
     "BevSegmentation",
-    "CellBox",
-    "CellChange",
-    "CellExplanation",
-    "CellPeak",
-    "CellPrediction",
-    "CellQuirk",
-    "CellSource",
-    "CellValues",
     "FrameBoxes",
     "FramePolygons",
     "InstancePath",
@@ -97,8 +71,6 @@ __all__ = [
     "bev_segmentation",
     "config_from_names",
     "evaluation_samples",
-    "explain_cell",
-    "explain_cell_from_boxes",
     "labels_from_polygons",
     "motion_labels",
     "motion_labels_from_boxes",

@@ -5,26 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.motion.batch_names import MAPS, BatchNames, from_batch, to_batch
-from deepaccident_devkit.motion.cells.explanation import CellExplanation
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.warps.to_present import maps_to_present
 from deepaccident_devkit.motion.warps.warping import WarpMode
 from deepaccident_devkit.text import Pictured
-
-
-class LabelOrigin(Protocol):
-    """What labels were made from; `explaining.samples.SampleOrigin` is one."""
-
-    def explain(self, labels: MotionLabels, t: int, row: int, col: int, *, prediction: object) -> CellExplanation:
-        """Explain a cell of the labels, as `MotionLabels.explain`."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,8 +41,6 @@ class MotionLabels(FrozenArrays, Pictured):
         id_map: actor id → id in `instance`; the ego's own box is −101, and untracked actors that are each their own
             instance are not in it.
         at_present: whether all frames were warped to the present ego frame; if not, each is in its own.
-        origin: the release and sample that `explain` asks; None for labels that were not made from a release, or were
-            read from a file or pickled.
     """
 
     config: MotionLabelConfig
@@ -64,7 +53,6 @@ class MotionLabels(FrozenArrays, Pictured):
     valid: BoolArray
     id_map: Mapping[int, int]
     at_present: bool = False
-    origin: LabelOrigin | None = None
 
     def __post_init__(self) -> None:
         """Freeze arrays and map; the small arrays are copied, since callers may change theirs."""
@@ -74,9 +62,9 @@ class MotionLabels(FrozenArrays, Pictured):
         object.__setattr__(self, "id_map", MappingProxyType(dict(self.id_map)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a dict in place of its view, which cannot be pickled, and not the release."""
+        """Pickle a dict in place of its view, which cannot be pickled."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return _remade, (values | {"id_map": dict(self.id_map), "origin": None},)
+        return _remade, (values | {"id_map": dict(self.id_map)},)
 
     def __repr__(self) -> str:
         """Frames, cells, actors, protocol and coordinate frame."""
@@ -116,30 +104,6 @@ class MotionLabels(FrozenArrays, Pictured):
         maps = {name: getattr(self, name) for name in MAPS}
         warped: dict[str, Any] = maps_to_present(maps, self.label_egomotion, ~self.label_valid, self.config, centerness)
         return replace(self, **warped, at_present=True)
-
-    def explain(self, t: int, row: int, col: int, *, prediction: object = None) -> CellExplanation:
-        """How a cell came to its values: who painted it, from which box, through which warp and quirks.
-
-        It reads the boxes of the sample again and looks for those that cover the cell. Takes some 0.1 s, since it makes
-        the labels once more for each switch of the protocol.
-
-        Args:
-            t: label frame, as in the arrays; 0 is the present.
-            row: of the cell, in the labels' orientation.
-            col: its column.
-            prediction: what a model put there: a `MotionOutput`, `MotionHeads`, `LinkedInstances`, or an array
-                (T, H, W) of instance ids in the labels' orientation. It lies in the present ego frame.
-
-        Raises:
-            NotAvailableError: the labels do not know their release; `motion.explain_cell` takes it as an argument.
-            GeometryError: there is no such cell, or the prediction has another shape.
-        """
-        if self.origin is None:
-            raise NotAvailableError(
-                "labels: they do not know their release (read from a file, pickled, or made from boxes alone); call "
-                "motion.explain_cell(labels, t, row, col, dataset=da, sample=token)"
-            )
-        return self.origin.explain(self, t, row, col, prediction=prediction)
 
     @property
     def instance_center(self) -> AnyArray:

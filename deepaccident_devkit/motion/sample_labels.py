@@ -1,17 +1,30 @@
-"""Motion labels of a sample of a release."""
+"""Motion labels of a sample of a release, from its boxes at each label frame and the ego's motion in the tables.
+
+The columns are read as they are, all frames at once: records and `Boxes` would take as long as rasterising.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from typing import Final
 
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.geometry import six_vectors
+from deepaccident_devkit.geometry.se3 import inverses, stored_transforms
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
+from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes
 from deepaccident_devkit.motion.drawing.from_boxes import motion_labels_from_boxes
-from deepaccident_devkit.motion.explaining.samples import SampleOrigin
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.sample_boxes import sample_boxes
-from deepaccident_devkit.tables.opened import token_of
+from deepaccident_devkit.motion.warps.chains import egomotion
+from deepaccident_devkit.tables import visible_mask
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.v2x import cooperating_agents
+
+_VISIBILITY_COLUMNS: Final = ("translation", "category", "num_lidar_pts", "camera_visible")
 
 
 def motion_labels(
@@ -42,9 +55,102 @@ def motion_labels(
         NotAvailableError: the sample has no label, or an agent whose sight counts is not in this (partial) release.
         ChoiceError: no such agent or configuration of agents.
     """
-    chosen = label_config(config)
-    source = sample_boxes(dataset, sample, chosen)
-    labels = motion_labels_from_boxes(
-        source.frames, source.egomotion, chosen, valid=source.valid, is_vehicle=source.is_vehicle, id_map=id_map
+    config = label_config(config)
+    row, samples = dataset.getind("sample", sample), dataset.columns("sample")
+    if not samples["labelled"][row]:
+        token = dataset.sample[row]["token"]
+        raise NotAvailableError(f"{token} has no label (the test split has none)")
+    length = dataset.columns("scenario")["num_frames"].item(samples["scenario_row"].item(row))
+    first_row = dataset.columns("agent")["first_sample_row"].item(samples["agent_row"].item(row))
+    present = row - first_row
+    index: IntArray = present + np.array([*config.offsets, config.offsets[-1] + config.step])
+    there = (index >= 0) & (index < length)
+    past = config.receptive_field - 1
+    known = index[past:-1][there[past:-1]]
+    frames = iter(_frames(dataset, sample, first_row, known, config))
+    return motion_labels_from_boxes(
+        [next(frames) if one else None for one in there[past:-1]],
+        egomotion(_world_from_ego(dataset, first_row + index, there), there, config.rules),
+        config,
+        valid=there[:-1],
+        is_vehicle=AGENTS[samples["agent"].item(row)] != INFRASTRUCTURE,
+        id_map=id_map,
     )
-    return replace(labels, origin=SampleOrigin(dataset, token_of(sample)))
+
+
+def _world_from_ego(dataset: Dataset, rows: IntArray, there: BoolArray) -> FloatArray:
+    """(len(rows), 4, 4) poses of samples; the identity for rows that are not `there`."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[there] = stored_transforms(dataset.columns("ego_pose")["matrix"][rows[there]])
+    return poses
+
+
+def _frames(
+    dataset: Dataset, sample: RowArgument, first_row: int, index: IntArray, config: MotionLabelConfig
+) -> list[FrameBoxes]:
+    """The boxes of the sample's agent, whose samples begin at `first_row`, at the frames `index`, from 0."""
+    boxes, rows = dataset.columns("annotation"), first_row + index
+    slices = _annotations(dataset, rows)
+    actors = [boxes["actor_id"][one] for one in slices]
+    visible = [np.ones(len(actor), dtype=bool) for actor in actors]
+    if config.filter_invisible:
+        mask = np.isin(_pairs(actors, slices), _seen(dataset, sample, index, config))
+        visible = np.split(mask, np.cumsum([len(actor) for actor in actors])[:-1])
+    lidars = rows * len(CHANNELS) + CHANNELS.index(LIDAR)
+    ego_from_lidar = stored_transforms(dataset.columns("sample_data")["matrix"][lidars])
+    if config.rules.pose == "yaw":
+        world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
+        world_from_level = six_vectors.from_matrices(world_from_ego) * (1, 1, 1, 0, 0, 1)
+        ego_from_lidar = inverses(six_vectors.to_matrices(world_from_level)) @ world_from_ego @ ego_from_lidar
+    return [
+        FrameBoxes(
+            center=boxes["translation"][one],
+            size=boxes["size"][one],
+            yaw=boxes["yaw"][one],
+            actor_id=actor,
+            category=boxes["category"][one],
+            visible=is_visible,
+            ego_from_lidar=pose,
+        )
+        for one, actor, is_visible, pose in zip(slices, actors, visible, ego_from_lidar, strict=True)
+    ]
+
+
+def _seen(dataset: Dataset, sample: RowArgument, index: IntArray, config: MotionLabelConfig) -> IntArray:
+    """The `_pairs` of actors and frames at which an agent whose sight counts sees them.
+
+    See docs/released_code.md, Visibility and attributes.
+    """
+    boxes, scenario = dataset.columns("annotation"), dataset.get("sample", sample)["scenario_token"]
+    pairs = []
+    for agent in cooperating_agents(dataset, sample, config.agents):
+        first_row = dataset.columns("agent")["first_sample_row"].item(dataset.getind("agent", f"{scenario}/{agent}"))
+        slices = _annotations(dataset, first_row + index)
+        actors = [boxes["actor_id"][one] for one in slices]
+        center, category, points, camera = (
+            np.concatenate([boxes[name][one] for one in slices]) for name in _VISIBILITY_COLUMNS
+        )
+        actor = np.concatenate(actors)
+        by_points = visible_mask(center[:, :2], category, points, camera, infrastructure=agent == INFRASTRUCTURE)
+        mask = camera if config.rules.sight == "camera" else by_points & (actor != UNTRACKED_ID)
+        pairs.append(_pairs(actors, slices)[mask & (actor != OWN_ACTOR_ID)])
+    return np.concatenate(pairs)
+
+
+def _annotations(dataset: Dataset, rows: IntArray) -> list[slice]:
+    """Where the boxes of samples are in the annotation table; empty without a label."""
+    samples = dataset.columns("sample")
+    first = np.maximum(samples["first_annotation_row"][rows], 0).tolist()
+    count = samples["num_annotations"][rows].tolist()
+    return [slice(start, start + length) for start, length in zip(first, count, strict=True)]
+
+
+def _pairs(actors: list[AnyArray], slices: list[slice]) -> IntArray:
+    """One number for each row of `actors`, frame by frame: it stands for the pair of actor and frame.
+
+    An untracked row is an actor of its own; `slices` has the rows in the annotation table.
+    """
+    actor, row = np.concatenate(actors), np.concatenate([np.arange(one.start, one.stop) for one in slices])
+    number = np.repeat(np.arange(len(actors)), [len(actor) for actor in actors])
+    pairs: IntArray = np.where(actor == UNTRACKED_ID, OWN_ACTOR_ID - 1 - row, actor) * len(actors) + number
+    return pairs

@@ -36,7 +36,6 @@ def place_chips(
     *,
     colors: Sequence[str] | None = None,
     avoid: ArrayLike | None = None,
-    fontsize: float = SMALLEST_TEXT,
 ) -> None:
     """Write words near places, dark on white chips, where nothing of importance is covered.
 
@@ -49,7 +48,6 @@ def place_chips(
         chips: words and their places (x, y) in data coordinates.
         colors: of the chips' edges, one for each; grey by default.
         avoid: as in `keep_free`.
-        fontsize: points.
     """
     placer = _placer(ax)
     if avoid is not None:
@@ -60,7 +58,7 @@ def place_chips(
             "facecolor": CASING_COLOR,
             "edgecolor": edge,
             "linewidth": 0.7,
-            "boxstyle": f"square,pad={_PAD / fontsize}",
+            "boxstyle": f"square,pad={_PAD / SMALLEST_TEXT}",
         }
         placer.chips.append(
             ax.annotate(
@@ -71,7 +69,7 @@ def place_chips(
                 ha="center",
                 va="center",
                 color=OWN_COLOR,
-                fontsize=fontsize,
+                fontsize=SMALLEST_TEXT,
                 bbox=paper,
                 zorder=6,
                 clip_on=True,

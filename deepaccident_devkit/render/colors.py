@@ -66,16 +66,6 @@ SERIES_COLORS = ("#1a3344", "#4b667c", "#8399ac", "#b5c3cf")
 SPLIT_COLORS: Mapping[str, str] = dict(
     zip((*SPLITS, "unknown"), ("#284052", "#627a8e", "#9badbe", "#d3d8dc"), strict=True)
 )
-CONFIGURATION_COLORS: Mapping[str, str] = {
-    "single": AGENT_COLORS[AGENTS[0]],
-    "+behind": AGENT_COLORS[AGENTS[1]],
-    "+other": AGENT_COLORS[AGENTS[2]],
-    "+infrastructure": AGENT_COLORS[AGENTS[4]],
-    "+behind+other": "#d3d8dc",
-    "vehicles": "#4b667c",
-    "all": "#111c24",
-}
-"""The paper's seven sets of agents: the hue of the one agent that is added, shades for several."""
 ESTIMATE_COLOR = "#3d627d"
 """A number with an interval."""
 WARNING_COLOR = "#6b4a10"

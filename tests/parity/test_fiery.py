@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels
-from deepaccident_devkit.motion.drawing.from_boxes import FramePolygons, labels_from_polygons
+from deepaccident_devkit.motion import FramePolygons, MotionLabelConfig, MotionLabels, labels_from_polygons
 
 FLIPS = 1
 

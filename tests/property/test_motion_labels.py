@@ -9,8 +9,7 @@ from strategies import ANGLES, grids, numbers
 
 from deepaccident_devkit.geometry import SE3, BevGrid, six_vectors
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig
-from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, FrameBoxes, MotionLabelConfig, motion_labels_from_boxes
 from deepaccident_devkit.motion.orientations import cells_in, to_orientation, vectors_in
 
 CELL = 0.5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import Baseline, StudyConfig
+from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.options import WordChoice, agent_names, names_or_configuration
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, TableError, TokenError, VersionError
@@ -78,7 +78,6 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
         lambda word: warped(word).dtype,
     ),
     ("Constant_Turn_Rate", "constant_turn_rate", "constant_turn", ChoiceError, lambda word: Baseline(model=word)),
-    ("Constant_Velocity", "constant_velocity", "constant", ChoiceError, lambda word: StudyConfig(model=word)),
     ("Infrastructure", "infrastructure", "infra", ChoiceError, lambda word: agent_names((word,))),
     ("VEHICLES", "vehicles", "vehicle", ChoiceError, lambda word: names_or_configuration((word,))),
 ]

@@ -28,11 +28,12 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.cells.parts import OWN_BOX_ID
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
+OWN_BOX_ID: Final = -101
+"""Key of the ego's own box in `MotionLabels.id_map`, as the released code has it."""
 _DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)
 """The agent's box in the released code if it finds no row of the agent itself; it has the size of a Lincoln car."""
 _CORNERS: Final = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]], dtype=np.float32) / 2
@@ -150,17 +151,6 @@ def box_polygons(
     for index, start, end in zip(there, [0, *ends], ends, strict=False):
         result[index] = FramePolygons(corners=corners[start:end], key=key[start:end])
     return result
-
-
-def drawn_rows(frames: Sequence[FrameBoxes | None], config: MotionLabelConfig) -> list[BoolArray | None]:
-    """Which rows of each frame `box_polygons` takes, own rows (−100) aside; None where there is no recording."""
-    known = [frame for frame in frames if frame is not None]
-    if not known:
-        return [None] * len(frames)
-    boxes = _Joined.of(known)
-    drawn = _drawn(boxes, next(number for number, frame in enumerate(frames) if frame is not None), config)
-    parts = iter(np.split(drawn, np.cumsum([len(frame.actor_id) for frame in known])[:-1]))
-    return [None if frame is None else next(parts) for frame in frames]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -28,7 +28,6 @@ from deepaccident_devkit.motion.warps.chains import frames_from_next
 from deepaccident_devkit.motion.warps.warping import sampling_matrix
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
-__all__ = ["FrameBoxes", "FramePolygons", "labels_from_polygons", "motion_labels_from_boxes", "raster_corners"]
 _FAR: Final = 2**24
 """In cells: corners farther away are moved to this distance, which is far outside the grid."""
 _MOST_IDS: Final = 2**24
@@ -147,7 +146,7 @@ def _footprints(polygons: Sequence[FramePolygons | None], ids: IntArray, config:
     there = [(number, frame) for number, frame in enumerate(polygons) if frame is not None]
     corners = np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *(frame.corners for _, frame in there)])
     frame = np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64)
-    vertices = raster_corners(corners, config)
+    vertices = _raster_corners(corners, config)
     return Footprints(vertices, frame, ids, topmost(vertices, native.shape, frame, len(polygons)))
 
 
@@ -168,7 +167,7 @@ def _covered(footprints: Footprints, config: MotionLabelConfig) -> CoveredCells:
     )
 
 
-def raster_corners(corners: AnyArray, config: MotionLabelConfig) -> IntArray:
+def _raster_corners(corners: AnyArray, config: MotionLabelConfig) -> IntArray:
     """Native column and row (n, 4, 2) at which corners (n, 4, 2), x and y (left), metres, are rasterised."""
     rules = config.rules
     given = corners if rules.pose == "yaw" else corners.astype(np.float32, copy=False)

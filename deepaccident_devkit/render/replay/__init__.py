@@ -10,9 +10,9 @@ from deepaccident_devkit.render.replay.replay import (
     replay_part,
     script_json,
     served_replay,
+    tried_replay,
 )
 from deepaccident_devkit.render.replay.sensors import cloud_text
-from deepaccident_devkit.render.replay.tried import tried_replay
 
 __all__ = [
     "CONTROLS",

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
 from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.render.colors import (
     CATEGORY_MARKERS,
@@ -121,6 +121,22 @@ def render_replay(
     title = f"Accident replay: {recording.scenario['name']}"
     write_bytes(target, replay_page(title, data).encode())
     return target
+
+
+def tried_replay(dataset: Dataset, scenario: str, path: Path, *, prediction: Foreseen | None = None) -> str | None:
+    """Write a scenario's replay; None, or why there is none: a file cannot be read, or the prediction not be shown.
+
+    Args:
+        dataset: the release.
+        scenario: token.
+        path: the file to write.
+        prediction: as of `render_replay`.
+    """
+    try:
+        render_replay(dataset, scenario, path, prediction=prediction)
+    except (NotAvailableError, SensorFileError) as error:
+        return str(error)
+    return None
 
 
 def served_replay(

@@ -5,8 +5,8 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.baselines.drawing import label_times, motion_of
-from deepaccident_devkit.baselines.oracle import SeenActors, seen_actors
+from deepaccident_devkit.baselines import SeenActors, seen_actors
+from deepaccident_devkit.baselines.predict import label_times, motion_of
 from deepaccident_devkit.evaluation import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels

@@ -1,8 +1,10 @@
+from importlib import import_module
+
 import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import oracle, seen_actors, turn_rates
+from deepaccident_devkit.baselines import SeenActors, seen_actors, turn_rates
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
@@ -82,16 +84,16 @@ def test_turn_rates_are_those_since_the_earliest_sight(
     """Two turn by 0.04 rad a frame, across ±π; one was hidden until 0.3 s ago, a third one until now."""
     asked = []
 
-    def seen(_dataset: object, token: str, **_options: object) -> oracle.SeenActors:
+    def seen(_dataset: object, token: str, **_options: object) -> SeenActors:
         frame = int(token.rsplit("/", 1)[1])
         asked.append(frame - FRAME)
         yaw = 0.04 * (frame - FRAME) * np.array([1.0, -1.0, 1.0]) + [3.1, -3.1, 0.0]
         ids = [7, 8, 9] if frame == FRAME else [7, 8] if frame >= FRAME - 3 else [7]
         boxes = Boxes.from_arrays(np.zeros((3, 3)), np.ones((3, 3)), yaw, actor_id=[7, 8, 9])
         rows = np.arange(len(ids))
-        return oracle.SeenActors(boxes=boxes.select(rows), seen_by=np.zeros(len(ids), np.uint8), own_actor_id=None)
+        return SeenActors(boxes=boxes.select(rows), seen_by=np.zeros(len(ids), np.uint8), own_actor_id=None)
 
-    monkeypatch.setattr(oracle, "seen_actors", seen)
+    monkeypatch.setattr(import_module("deepaccident_devkit.baselines.outlook"), "seen_actors", seen)
     np.testing.assert_allclose(turn_rates(da_hidden, sample(da_hidden)), [0.4, -0.4, 0.0], atol=1e-9)
     assert asked == [0, -5, -4, -3, -2, -1]
 

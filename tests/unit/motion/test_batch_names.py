@@ -5,9 +5,8 @@ from numpy.testing import assert_array_equal
 from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.handedness import flip_six_vector
-from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels
+from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, MotionLabels, motion_labels_from_boxes
 from deepaccident_devkit.motion.batch_names import HEADS, MAPS, config_from_names
-from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
 
 NAMES = ("fiery", "beverse", "deepaccident")
 

@@ -6,9 +6,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, OWN_BOX_ID, Augmentation, MotionLabelConfig
+from deepaccident_devkit.motion import (
+    LABEL_PROTOCOLS,
+    OWN_BOX_ID,
+    Augmentation,
+    FrameBoxes,
+    MotionLabelConfig,
+    motion_labels_from_boxes,
+)
 from deepaccident_devkit.motion.drawing.box_polygons import box_polygons
-from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
 from deepaccident_devkit.motion.orientations import to_orientation
 
 STILL = np.zeros((7, 6))

@@ -1,1 +1,0 @@
-"""What is known of one cell of motion labels, as records and sentences: `parts`, and `explanation` of them all."""
