@@ -13,8 +13,7 @@ from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3, handedness
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
-from deepaccident_devkit.release._content import read_content
-from deepaccident_devkit.release._words import LARGEST, in_range
+from deepaccident_devkit.release._content import LARGEST, in_range, read_content
 from deepaccident_devkit.release.pickles import load_arrays, pickled
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import CAMERAS

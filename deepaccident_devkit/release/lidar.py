@@ -10,7 +10,7 @@ from deepaccident_devkit.arrays import AnyArray, checked
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.handedness import flip_points
-from deepaccident_devkit.release._words import in_range
+from deepaccident_devkit.release._content import in_range
 from deepaccident_devkit.release.npz import read_npz, write_npz
 from deepaccident_devkit.release.store import ReleasePath
 

@@ -9,8 +9,7 @@ from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import MetaError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import shortened
-from deepaccident_devkit.release._content import read_lines
-from deepaccident_devkit.release._words import LARGEST, in_range, integer_of, number_of
+from deepaccident_devkit.release._content import LARGEST, in_range, integer_of, number_of, read_lines
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
 
