@@ -229,6 +229,7 @@ class _Values:
         if kind is dict:
             if not all(type(key) is str and key.isprintable() for key in value):
                 raise pickle.UnpicklingError("a key that is no text, or cannot be printed, is not allowed")
+            self._take(sum(map(len, value)))
             return {key: self.made(item, depth + 1) for key, item in value.items()}
         if kind is list or kind is tuple:
             return kind([self.made(item, depth + 1) for item in value])

@@ -373,6 +373,10 @@ BOMBS = {
         ),
         "values that are far larger than their pickle",
     ),
+    "dict of a long key again and again": (
+        in_dict(b"}q\x00" + LONG_TEXT + b"Ns", *[b"h\x00"] * 4_900),
+        "values that are far larger than their pickle",
+    ),
     "shape of text": (
         in_dict(EMPTY_ARRAY + b"(K\x01X" + int4(800_000) + b"x" * 800_000 + F8 + b"\x89C\x00tb"),
         "not a readable calibration",
