@@ -13,13 +13,14 @@ from deepaccident_devkit.errors import MissingFileError, ReleaseError
 from deepaccident_devkit.reading import FileKind, fault_text, read_bytes
 from deepaccident_devkit.release.store import ReleasePath
 
+REMEDY: Final = "restore the file from its archive"
 _NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 LARGEST: Final = 1e9
 """Metres, m/s, pixels, …: a larger number is damage and counts as infinite; it would overflow where it is squared."""
 _INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
 
 
-def read_content(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str) -> bytes:
+def read_content(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY) -> bytes:
     """A file's bytes.
 
     Raises:
@@ -35,7 +36,7 @@ def read_content(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], r
         raise fault(f"{path}: {fault_text(error)}; {remedy}") from error
 
 
-def read_lines(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str) -> list[str]:
+def read_lines(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY) -> list[str]:
     """The lines of a UTF-8 file, without line ends.
 
     Raises as `read_content` does, and `fault` if the file is no text.
