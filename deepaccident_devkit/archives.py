@@ -74,7 +74,7 @@ def read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, kind: FileKind
         raise zipfile.BadZipFile("a member is encrypted or compressed by an unknown method")
     try:
         with archive.open(entry) as file:
-            content = file.read(entry.file_size)  # without a number all that it unpacks to would be in memory
+            content = file.read(entry.file_size + 1)  # not all that it unpacks to
     except EOFError:
         raise zipfile.BadZipFile("a member ends early") from None
     if len(content) != entry.file_size:
