@@ -9,22 +9,20 @@ import tokenize
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import BinaryIO, Final
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.reading import FileKind, RefusedFileError, check_size, open_file, shortened
 
-_LOCAL, _END, _LARGE_END, _LOCATOR = b"PK\x03\x04", b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
-"""How a member, the end of an archive, the end of a large one, and what leads to that, begin."""
-_LOCAL_LENGTH, _END_LENGTH, _LARGE_END_LENGTH, _LOCATOR_LENGTH = 30, 22, 56, 20
+_END, _LARGE_END, _LOCATOR = b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
+"""How the end of an archive, the end of a large one, and what leads to that, begin."""
+_END_LENGTH, _LARGE_END_LENGTH, _LOCATOR_LENGTH = 22, 56, 20
 _LONGEST_END: Final = _LARGE_END_LENGTH + _LOCATOR_LENGTH + _END_LENGTH + (1 << 16) - 1
 """Bytes at the end of a file among which its archive's end is: the last of it is a comment."""
 _MOST_DIRECTORY: Final = 4 << 20
 """Bytes of the directory of a results file or a bundle."""
-_UTF8: Final = 1 << 11
-"""Of a member's flags: its name is not in code page 437."""
 _HEADER_READERS: Final = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}
 DAMAGED_ARCHIVE: Final = (
     OSError,
@@ -63,28 +61,24 @@ def open_zip(source: Path | bytes) -> zipfile.ZipFile:
 
 
 def read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, kind: FileKind) -> bytes:
-    """The content of an archive's member, of which every byte agrees with its stored sizes and its checksum.
+    """The content of an archive's member, which agrees with its stored size and its checksum.
 
     Raises:
         OSError: it would be larger than its kind may be, or the file cannot be read.
         zipfile.BadZipFile: it is encrypted, compressed by another method than deflation, or does not agree.
+        zlib.error: it cannot be unpacked.
     """
     for size in (entry.file_size, entry.compress_size):
         check_size(size, kind, shortened(entry.filename))
     if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise zipfile.BadZipFile("a member is encrypted or compressed by an unknown method")
-    content = _stored(archive, entry)
-    if entry.compress_type == zipfile.ZIP_DEFLATED:
-        decoder = zlib.decompressobj(-zlib.MAX_WBITS)
-        content = decoder.decompress(content, entry.file_size + 1)
-        if not decoder.eof:
-            content += decoder.decompress(decoder.unconsumed_tail, 1)
-        if not decoder.eof or decoder.unused_data:
-            raise zipfile.BadZipFile("a member's compressed bytes do not end where its stored size says")
+    try:
+        with archive.open(entry) as file:
+            content = file.read(entry.file_size + 1)  # not all that it unpacks to
+    except EOFError:
+        raise zipfile.BadZipFile("a member ends early") from None
     if len(content) != entry.file_size:
         raise zipfile.BadZipFile(f"a member has {len(content):,} bytes, its stored size is {entry.file_size:,}")
-    if zlib.crc32(content) != entry.CRC:
-        raise zipfile.BadZipFile("a member's checksum does not agree with its bytes")
     return content
 
 
@@ -139,25 +133,6 @@ def check_end(file: BinaryIO, most: int) -> None:
         directory = _number(tail, record + 40, 8)
     if directory > most:
         raise RefusedFileError(errno.EFBIG, f"the archive's directory has {directory:,} bytes, more than {most:,}")
-
-
-def _stored(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """The bytes of a member as they are in the file."""
-    shared: Any = archive
-    file = shared.fp
-    with shared._lock:  # noqa: SLF001 - which zipfile's own readers hold while they move in the file
-        file.seek(entry.header_offset)
-        head = file.read(_LOCAL_LENGTH)
-        if not head.startswith(_LOCAL) or len(head) < _LOCAL_LENGTH:
-            raise zipfile.BadZipFile("a member's head is damaged")
-        name = file.read(_number(head, 26, 2))
-        file.seek(_number(head, 28, 2), os.SEEK_CUR)
-        content: bytes = file.read(entry.compress_size)
-    if len(content) < entry.compress_size:
-        raise zipfile.BadZipFile("a member ends early")
-    if name != entry.orig_filename.encode("utf-8" if entry.flag_bits & _UTF8 else "cp437"):
-        raise zipfile.BadZipFile("a member's head has another name than the directory")
-    return content
 
 
 def _number(content: bytes, place: int, length: int) -> int:

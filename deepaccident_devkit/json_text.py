@@ -6,8 +6,8 @@ records are made of what `parsed_json` gives. It is imported when the first reco
 """
 
 import json
-import math
 import re
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any, Final, TypeVar
 
@@ -31,14 +31,10 @@ _SURROGATE: Final = re.compile("[\ud800-\udfff]")
 _WRITTEN_SURROGATE: Final = re.compile(r"\\u[dD][89a-fA-F]")
 
 
-class _Repeated(dict[str, Any]):
-    """An object in which `name` stands twice."""
+class _Fault(str):
+    """What is wrong, in the place of the value."""
 
-    name: str
-
-
-class _Constant(float):
-    """NaN or an infinity that was written as a word."""
+    __slots__ = ()
 
 
 def parsed_json(content: bytes, *, constants: bool = False) -> Any:
@@ -53,25 +49,31 @@ def parsed_json(content: bytes, *, constants: bool = False) -> Any:
     Raises:
         ValueError: it is no JSON, or against these rules; half a sentence, which names the place of the fault.
     """
-    faults: list[object] = []
+    faults: list[_Fault] = []
 
-    def made(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    def noted(what: str) -> _Fault:
+        faults.append(_Fault(what))
+        return faults[-1]
+
+    def made(pairs: list[tuple[str, Any]]) -> object:
         result = dict(pairs)
-        return result if len(result) == len(pairs) else noted(_repeated(pairs))
+        if len(result) == len(pairs):
+            return result
+        ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
+        return noted(f"{shortened(name)}: stands there twice")
 
-    def noted(fault: Any) -> Any:
-        faults.append(fault)
-        return fault
+    def refused(word: str) -> object:
+        found = f"found {word.removeprefix('-')}; write null for an optional value that is not known"
+        return noted(f"expected a finite number, {found}")
 
     if content.startswith(_GZIP):
         raise ValueError("is compressed with gzip; unpack it")
     if content.startswith(_PICKLE):
         raise ValueError("is a pickle; write JSON")
     _check_levels(content)
-    told = None if constants else lambda word: noted(_Constant(word))
     try:
         text = content.decode("utf-8")
-        value = json.loads(text, object_pairs_hook=made, parse_constant=told)
+        value = json.loads(text, object_pairs_hook=made, parse_constant=None if constants else refused)
     except ValueError as error:  # the words of Python's own errors change with its version
         where = (
             f"line {error.lineno}, column {error.colno}"
@@ -80,8 +82,8 @@ def parsed_json(content: bytes, *, constants: bool = False) -> Any:
         )
         raise ValueError(f"is no JSON ({where})") from error
     fault = next(_faults(value, ""), None) if faults or _WRITTEN_SURROGATE.search(text) else None
-    if faults or fault:
-        raise ValueError(fault or "holds a name twice in one object")
+    if fault:
+        raise ValueError(fault)
     return value
 
 
@@ -120,29 +122,17 @@ def _check_levels(content: bytes) -> None:
         level, inside = levels[-1] if len(levels) else level, in_text[-1]
 
 
-def _repeated(pairs: list[tuple[str, Any]]) -> _Repeated:
-    result, seen = _Repeated(pairs), set[str]()
-    for name, _ in pairs:
-        if name in seen:
-            result.name = name
-        seen.add(name)
-    return result
-
-
 def _faults(value: object, place: str) -> Iterator[str]:
     """What is wrong in a value, in the order of the text; `place` ends in a colon and a blank."""
-    if isinstance(value, _Repeated):
-        yield f"{place}{shortened(value.name)}: stands there twice"
-    if isinstance(value, _Constant):
-        word = "NaN" if math.isnan(value) else "Infinity"
-        yield f"{place}expected a finite number, found {word}; write null for an optional value that is not known"
-    if isinstance(value, str) and _SURROGATE.search(value):
+    if isinstance(value, _Fault):
+        yield f"{place}{value}"
+    elif isinstance(value, str) and _SURROGATE.search(value):
         yield f"{place}expected characters, found half of one: {shortened(value)!a}"
-    if isinstance(value, dict):
+    elif isinstance(value, dict):
         for name, each in value.items():
             if _SURROGATE.search(name):
                 yield f"{place}expected a name of characters, found half of one: {shortened(name)!a}"
             yield from _faults(each, f"{place}{shortened(name)}: ")
-    if isinstance(value, list):
+    elif isinstance(value, list):
         for number, each in enumerate(value):
             yield from _faults(each, f"{place}entry {number}: ")

@@ -376,8 +376,8 @@ def video(
 ) -> None:
     """Write one scenario of the release in DATAROOT as a video.
 
-    Without SCENARIO the command takes the first accident, or if there is none, the first scenario. An MP4 file plays in
-    browsers if the extra `video` is installed; in a checkout: pip install '.[video]'.
+    Without SCENARIO the command takes the first accident, or if there is none, the first scenario. MP4 needs the extra
+    `video`; in a checkout: pip install '.[video]'.
     """
     release = {option: options.pop(option) for option in _RELEASE}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed

@@ -1,247 +1,252 @@
-"""A restricted unpickler: dicts of numeric numpy arrays, and nothing that a pickle could run.
+"""The one gate for pickles: it makes plain values, asks a table for all names, and runs nothing of the file.
 
-A pickle is a program. This one may name only what numpy's own array pickles name (numpy 1 and 2, protocols 0 to 5),
-and under those names it gets the devkit's stand-ins: they note what the array is made of, import nothing, and keep
-no attribute that a pickle tries to set. The arrays are made from those notes afterwards. Before all this,
-`check_pickle` refuses what would take more time and memory than its bytes explain.
+A pickle is a program for a machine with a stack and a memo. The machine here knows the opcodes of plain values, arrays
+and tensors in protocols 0 to 5, and refuses all others, such as those of classes, extensions and buffers. It imports
+nothing and sets no attribute; it calls only functions of its caller's table, with values that it has made itself.
+
+It takes time and memory in proportion to the pickle's bytes: no opcode gets more bytes than there are, the memo is a
+dict, and what may be a key has a cheap hash. One value may be in many places, or in itself: who walks through the
+values needs limits.
 """
 
-import io
+import codecs
 import pickle
-import re
-from collections.abc import Sequence
-from typing import Any, ClassVar, Final, Literal, NoReturn
+import struct
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, NoReturn, TypeAlias
 
-import numpy as np
+from deepaccident_devkit.reading import shortened
 
-from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.reading import fault_text, shortened
-from deepaccident_devkit.release._pickle_scan import check_pickle
-
-_PLAIN_NUMBER = re.compile(r"[<>=|]?[fiub][1-9][0-9]?", re.ASCII)
-"""The only dtypes allowed: numpy itself would evaluate other strings."""
-_NUMBER_STATE: Final = (None, None, None, -1, -1, 0)
-"""What numpy's pickles of a number's dtype say after version and byte order: no fields, no size of its own."""
-_LONGEST_SENTENCE: Final = 200
-_ROOM: Final = 1 << 20
-"""Bytes that arrays may have beyond those of the pickle: a pickle may hold an array twice and store it once."""
-_FAULTS = (
-    pickle.UnpicklingError,
-    AttributeError,
-    EOFError,
-    IndexError,
-    KeyError,
-    MemoryError,
-    OverflowError,
-    RecursionError,
-    TypeError,
-    ValueError,
-    Warning,  # where warnings are errors
-)
-"""The errors that damaged or hostile bytes can raise."""
+_LONGEST_NUMBER: Final = 32
+"""Characters of a number written as text: reading it takes time in proportion to the square of them."""
+_MOST_ARGUMENTS: Final = 64
+"""Of a call, which copies them; a path has one for each part."""
 
 
-def load_arrays(content: bytes) -> Any:
-    """Unpickle a dict of numeric numpy arrays; other plain values stay what they are.
+class Machine:
+    """Reads the pickle that begins at the byte `start`. Bytes in it are slices of the content, since most are large.
 
-    Raises:
-        pickle.UnpicklingError: the bytes are no pickle, or one that names, nests or repeats what such a dict does not
-            need (`check_pickle`); nothing of it has run.
+    Attributes:
+        value: what it holds.
+        end: the byte after it.
+        slices: of all bytes in it, in their order.
     """
-    try:
-        check_pickle(content)
-        # As one frame it is read at once, and no frame of its own can move the reader to a byte that was not checked.
-        framed = b"".join((pickle.FRAME, len(content).to_bytes(8, "little"), content))
-        # latin1 is how arrays pickled by Python 2 are read
-        loaded = _RestrictedUnpickler(io.BytesIO(framed), encoding="latin1").load()
-        return _Values(len(content) + _ROOM).made(loaded)
-    except _FAULTS as error:
-        raise pickle.UnpicklingError(_sentence(error)) from error
+
+    def __init__(
+        self,
+        content: bytes,
+        names: Mapping[str, object],
+        most: int,
+        *,
+        start: int = 0,
+        refer: Callable[[Any], object] | None = None,
+    ) -> None:
+        """Read it.
+
+        Args:
+            content: the bytes in which it is.
+            names: module and name, with a blank between them → what stands for it. What its call returns gets the
+                pickle's state by `__setstate__`, if it has that.
+            most: opcodes that it may have.
+            start: its first byte.
+            refer: what makes a value from a persistent id; None allows none.
+
+        Raises:
+            pickle.UnpicklingError: what is not allowed, and at which byte.
+            AttributeError, LookupError, OverflowError, TypeError, ValueError: a value is not what it should be.
+        """
+        self.value: Any = None
+        self.end = self._opcode_at = start
+        self.slices: list[slice] = []
+        self.stack: list[Any] = []
+        self.memo: dict[int, Any] = {}
+        self._content, self._names, self._refer = content, names, refer
+        self._below_marks: list[list[Any]] = []
+        for _ in range(most):
+            self._opcode_at = self.end
+            code = self.take(1)
+            if code not in _STEPS:
+                self.refuse(f"{_opcode_name(code)} is not allowed")
+            try:
+                _STEPS[code](self)
+            except IndexError:
+                self.refuse("an opcode without the values that it takes is not allowed")
+            if code == pickle.STOP:
+                return
+        self.refuse(f"more than {most:,} opcodes are not allowed")
+
+    def refuse(self, fault: str) -> NoReturn:
+        raise pickle.UnpicklingError(f"at byte {self._opcode_at:,}: {fault}")
+
+    def take(self, size: int) -> bytes:
+        """The next bytes, which must be there."""
+        start, self.end = self.end, self.end + size
+        if self.end > len(self._content):
+            self.refuse("the pickle ends too early")
+        return self._content[start : self.end]
+
+    def number(self, width: int) -> int:
+        return int.from_bytes(self.take(width), "little")
+
+    def counted(self, width: int) -> bytes:
+        """Bytes whose number is in the next ones."""
+        return self.take(self.number(width))
+
+    def noted(self, width: int) -> slice:
+        size = len(self.counted(width))
+        self.slices.append(slice(self.end - size, self.end))
+        return self.slices[-1]
+
+    def line(self) -> bytes:
+        last = self._content.find(b"\n", self.end)
+        return self.take(1 + (last if last >= 0 else len(self._content)) - self.end)[:-1]
+
+    def digits(self) -> str:
+        line = self.line()
+        if len(line) > _LONGEST_NUMBER:
+            self.refuse(f"a number of {len(line):,} characters is not allowed")
+        return line.decode("ascii")
+
+    def frame(self) -> None:
+        """All is read without frames; the size of one is only compared."""
+        if self.number(8) > len(self._content) - self.end:
+            self.refuse("the pickle ends too early")
+
+    def mark(self) -> None:
+        self._below_marks.append(self.stack)
+        self.stack = []
+
+    def items(self, count: int | None = None) -> list[Any]:
+        """Take so many values, or those down to the mark."""
+        if count is None:
+            items, self.stack = self.stack, self._below_marks.pop()
+            return items
+        return [self.stack.pop() for _ in range(count)][::-1]
+
+    def extend(self, items: list[Any]) -> None:
+        list.extend(self.stack[-1], items)
+
+    def fill(self, items: list[Any]) -> None:
+        dict.update(self.stack[-1], dict_of(zip(items[::2], items[1::2], strict=True)))
+
+    def filled(self) -> None:
+        items = self.items()
+        self.stack.append({})
+        self.fill(items)
+
+    def put(self, place: int) -> None:
+        self.memo[place] = self.stack[-1]
+
+    def get(self, place: int) -> Any:
+        if place not in self.memo:
+            self.refuse("taking from an empty place in the memo is not allowed")
+        return self.memo[place]
+
+    def known(self, name: str) -> object:
+        if name not in self._names:
+            self.refuse(f"the pickle asks for {shortened(name.replace(' ', '.'))}, which is not allowed")
+        return self._names[name]
+
+    def referred(self) -> object:
+        if self._refer is None:
+            self.refuse("a persistent id is not allowed")
+        return self._refer(self.stack.pop())
+
+    def called(self) -> object:
+        """The result of what the table has for a name; nothing else that can be on the stack is callable."""
+        function, arguments = self.items(2)
+        if len(arguments) > _MOST_ARGUMENTS:
+            self.refuse(f"a call with {len(arguments):,} values is not allowed")
+        return function(*arguments)
+
+    def build(self) -> None:
+        state = self.stack.pop()
+        if hasattr(self.stack[-1], "__setstate__"):  # of other values' attributes nothing is read
+            self.stack[-1].__setstate__(state)
+
+    def stop(self) -> None:
+        self.value = self.stack.pop()
 
 
-def _sentence(error: Exception) -> str:
-    """What an error says; a pickle's own text may be long, and may be no text for a screen."""
-    text = shortened(fault_text(error), _LONGEST_SENTENCE)
-    return text if text.isprintable() else ascii(text)[1:-1]
+def dict_of(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
+    """A dict by texts and whole numbers: a tuple's hash can take all time, and many long numbers can have the same."""
+    items = list(pairs)
+    if not all(type(key) is str or (type(key) is int and abs(key) < 1 << 63) for key, _ in items):
+        raise pickle.UnpicklingError("a key that is no text and no whole number of 64 bits is not allowed")
+    return dict(items)
 
 
-class _Values:
-    """Makes the values from the notes, up to so many bytes: notes may be there many times."""
+def _opcode_name(code: bytes) -> str:
+    import pickletools  # for faults alone
 
-    __slots__ = ("_room",)
-
-    def __init__(self, room: int) -> None:
-        self._room = room
-
-    def made(self, value: Any) -> Any:
-        kind = type(value)
-        if kind is _ArrayNotes or kind is _Latin1Notes:
-            self._room -= len(value)
-            if self._room < 0:
-                raise pickle.UnpicklingError("arrays that are far larger than their pickle are not allowed")
-            return value.made()
-        if kind is dict:
-            if not all(map(str.isprintable, value)):
-                raise pickle.UnpicklingError("a key that cannot be printed is not allowed")
-            return {key: self.made(item) for key, item in value.items()}
-        if kind is list or kind is tuple:
-            return kind(map(self.made, value))
-        if isinstance(value, _Inert | _DtypeNotes):
-            raise pickle.UnpicklingError("a part of numpy in place of a value is not allowed")
-        return value
+    known = {info.code: info.name for info in pickletools.opcodes}.get(code.decode("latin1"))
+    return f"the opcode {known}" if known else f"the byte {code[0]:#04x}, which is no opcode,"
 
 
-class _Inert:
-    """A stand-in that takes no attributes, so that a pickle's BUILD cannot change it."""
-
-    __slots__ = ()
-
-    def __setattr__(self, name: str, value: object) -> NoReturn:
-        raise pickle.UnpicklingError("setting an attribute is not allowed")
+def _whole(text: str) -> int:
+    return text == "01" if text in ("00", "01") else int(text.removesuffix("L"))
 
 
-class _Latin1Notes:
-    """Bytes, noted as the text that has them in latin1."""
-
-    __slots__ = ("_text",)
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-
-    def __setstate__(self, state: object) -> NoReturn:
-        raise pickle.UnpicklingError("bytes that change are not allowed")
-
-    def __len__(self) -> int:
-        return len(self._text)
-
-    def made(self) -> bytes:
-        return self._text.encode("latin1")
+_Step: TypeAlias = Callable[[Machine], object]
 
 
-class _DtypeNotes:
-    """What a pickle says of a `numpy.dtype`: plain numbers only, no objects, no records."""
+def _pushes(value: _Step) -> _Step:
+    def step(machine: Machine) -> None:
+        pushed = value(machine)  # which may change the stack
+        machine.stack.append(pushed)
 
-    __slots__ = ("dtype",)
-
-    def __init__(self, code: object) -> None:
-        if not isinstance(code, str) or not _PLAIN_NUMBER.fullmatch(code):
-            found = repr(code) if isinstance(code, str) else "what is no text"
-            raise pickle.UnpicklingError(f"an array of {found} is not allowed")
-        self.dtype: np.dtype[Any] = np.dtype(code)
-
-    def __setstate__(self, state: Sequence[Any]) -> None:
-        """Take the byte order from the state that numpy writes."""
-        if state[1] not in ("<", ">", "=", "|") or state != (3, state[1], *_NUMBER_STATE):
-            raise pickle.UnpicklingError("an array of numbers with parts, or in no known byte order, is not allowed")
-        self.dtype = self.dtype.newbyteorder(state[1])
+    return step
 
 
-class _ArrayNotes:
-    """What a pickle says of a `numpy.ndarray`."""
-
-    __slots__ = ("_content", "_dtype", "_order", "_shape")
-
-    def __init__(self) -> None:
-        self._content: bytes | bytearray | _Latin1Notes | None = None
-
-    def __setstate__(self, state: Sequence[Any]) -> None:
-        """Take down version, shape, dtype, Fortran order and content, as numpy writes them."""
-        version, shape, dtype, fortran, content = state
-        if isinstance(content, str):  # of Python 2
-            content = _Latin1Notes(content)
-        plain = isinstance(dtype, _DtypeNotes) and isinstance(content, bytes | bytearray | _Latin1Notes)
-        if not plain or version != 1:
-            raise pickle.UnpicklingError("not the pickle of a plain numpy array")
-        self._shape, self._dtype, self._content = shape, dtype.dtype, content
-        self._order: Literal["C", "F"] = "F" if fortran else "C"
-
-    def __len__(self) -> int:
-        if self._content is None:
-            raise pickle.UnpicklingError("an array without its numbers is not allowed")
-        return len(self._content)
-
-    def made(self) -> AnyArray:
-        content = self._content.made() if isinstance(self._content, _Latin1Notes) else self._content
-        flat: AnyArray = np.frombuffer(content or b"", dtype=self._dtype)
-        array = flat.reshape(self._shape, order=self._order)
-        if array.shape != self._shape:  # reshape itself would fill in a negative length
-            raise pickle.UnpicklingError("an array whose shape is not what its bytes have is not allowed")
-        return array.astype(self._dtype.newbyteorder("="))
-
-
-class _NdarrayType(_Inert):
-    """Stands for the class `numpy.ndarray`; cannot be called."""
-
-    __slots__ = ()
-
-
-_NDARRAY = _NdarrayType()
-
-
-class _Dtype(_Inert):
-    """Stands for `numpy.dtype`."""
-
-    __slots__ = ()
-
-    def __call__(self, code: object, *_flags: object) -> _DtypeNotes:
-        return _DtypeNotes(code)
-
-
-class _Reconstruct(_Inert):
-    """Stands for `numpy.core.multiarray._reconstruct`: the empty array that the pickle then fills."""
-
-    __slots__ = ()
-
-    def __call__(self, subtype: object, _shape: object, _code: object) -> _ArrayNotes:
-        if subtype is not _NDARRAY:
-            raise pickle.UnpicklingError("not the pickle of a plain numpy array")
-        return _ArrayNotes()
-
-
-class _FromBuffer(_Inert):
-    """Stands for `numpy.core.numeric._frombuffer`, by which protocol 5 writes arrays."""
-
-    __slots__ = ()
-
-    def __call__(self, content: Any, dtype: object, shape: Sequence[int], order: str = "C") -> _ArrayNotes:
-        if order not in ("C", "F"):
-            raise pickle.UnpicklingError("an array of another order than C or F is not allowed")
-        notes = _ArrayNotes()
-        notes.__setstate__((1, shape, dtype, order == "F", content))
-        return notes
-
-
-class _Latin1(_Inert):
-    """Stands for `_codecs.encode`, by which protocols 0 to 2 write bytes."""
-
-    __slots__ = ()
-
-    def __call__(self, text: object, encoding: object = "latin1") -> _Latin1Notes:
-        if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
-            raise pickle.UnpicklingError("_codecs.encode is allowed for latin1 text only")
-        return _Latin1Notes(text)
-
-
-def _stand_ins() -> dict[tuple[str, str], _Inert]:
-    names: dict[tuple[str, str], _Inert] = {
-        ("numpy", "ndarray"): _NDARRAY,
-        ("numpy", "dtype"): _Dtype(),
-        ("_codecs", "encode"): _Latin1(),
-    }
-    for core in ("numpy.core", "numpy._core"):  # numpy 1, numpy 2
-        names[f"{core}.multiarray", "_reconstruct"] = _Reconstruct()
-        names[f"{core}.numeric", "_frombuffer"] = _FromBuffer()
-    return names
-
-
-class _RestrictedUnpickler(pickle.Unpickler):
-    """Resolves names to the stand-ins alone; imports nothing."""
-
-    allowed: ClassVar[dict[tuple[str, str], _Inert]] = _stand_ins()
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return the stand-in, or refuse."""
-        try:
-            return self.allowed[module, name]
-        except KeyError:
-            raise pickle.UnpicklingError(f"the pickle asks for {module}.{name}, which is not allowed") from None
+_STEPS: Final[Mapping[bytes, _Step]] = {
+    pickle.PROTO: lambda machine: machine.take(1),
+    pickle.FRAME: Machine.frame,
+    pickle.STOP: Machine.stop,
+    pickle.MARK: Machine.mark,
+    pickle.PUT: lambda machine: machine.put(int(machine.digits())),
+    pickle.BINPUT: lambda machine: machine.put(machine.number(1)),
+    pickle.LONG_BINPUT: lambda machine: machine.put(machine.number(4)),
+    pickle.MEMOIZE: lambda machine: machine.put(len(machine.memo)),
+    pickle.GET: _pushes(lambda machine: machine.get(int(machine.digits()))),
+    pickle.BINGET: _pushes(lambda machine: machine.get(machine.number(1))),
+    pickle.LONG_BINGET: _pushes(lambda machine: machine.get(machine.number(4))),
+    pickle.NONE: _pushes(lambda _: None),
+    pickle.NEWTRUE: _pushes(lambda _: True),
+    pickle.NEWFALSE: _pushes(lambda _: False),
+    pickle.INT: _pushes(lambda machine: _whole(machine.digits())),
+    pickle.LONG: _pushes(lambda machine: _whole(machine.digits())),
+    pickle.FLOAT: _pushes(lambda machine: float(machine.digits())),
+    pickle.BININT1: _pushes(lambda machine: machine.number(1)),
+    pickle.BININT2: _pushes(lambda machine: machine.number(2)),
+    pickle.BININT: _pushes(lambda machine: int.from_bytes(machine.take(4), "little", signed=True)),
+    pickle.LONG1: _pushes(lambda machine: int.from_bytes(machine.counted(1), "little", signed=True)),
+    pickle.BINFLOAT: _pushes(lambda machine: struct.unpack(">d", machine.take(8))[0]),
+    # text: of Python 2 (read as latin1), and of Python 3
+    pickle.STRING: _pushes(lambda machine: codecs.escape_decode(machine.line()[1:-1])[0].decode("latin1")),
+    pickle.SHORT_BINSTRING: _pushes(lambda machine: machine.counted(1).decode("latin1")),
+    pickle.BINSTRING: _pushes(lambda machine: machine.counted(4).decode("latin1")),
+    pickle.UNICODE: _pushes(lambda machine: machine.line().decode("raw-unicode-escape")),
+    pickle.SHORT_BINUNICODE: _pushes(lambda machine: machine.counted(1).decode("utf-8", "surrogatepass")),
+    pickle.BINUNICODE: _pushes(lambda machine: machine.counted(4).decode("utf-8", "surrogatepass")),
+    pickle.SHORT_BINBYTES: _pushes(lambda machine: machine.noted(1)),
+    pickle.BINBYTES: _pushes(lambda machine: machine.noted(4)),
+    pickle.BYTEARRAY8: _pushes(lambda machine: machine.noted(8)),
+    pickle.EMPTY_TUPLE: _pushes(lambda _: ()),
+    pickle.TUPLE1: _pushes(lambda machine: tuple(machine.items(1))),
+    pickle.TUPLE2: _pushes(lambda machine: tuple(machine.items(2))),
+    pickle.TUPLE3: _pushes(lambda machine: tuple(machine.items(3))),
+    pickle.TUPLE: _pushes(lambda machine: tuple(machine.items())),
+    pickle.EMPTY_LIST: _pushes(lambda _: []),
+    pickle.LIST: _pushes(Machine.items),
+    pickle.APPEND: lambda machine: machine.extend(machine.items(1)),
+    pickle.APPENDS: lambda machine: machine.extend(machine.items()),
+    pickle.EMPTY_DICT: _pushes(lambda _: {}),
+    pickle.DICT: Machine.filled,
+    pickle.SETITEM: lambda machine: machine.fill(machine.items(2)),
+    pickle.SETITEMS: lambda machine: machine.fill(machine.items()),
+    pickle.GLOBAL: _pushes(lambda machine: machine.known(f"{machine.line().decode()} {machine.line().decode()}")),
+    pickle.STACK_GLOBAL: _pushes(lambda machine: machine.known(" ".join(machine.items(2)))),
+    pickle.BINPERSID: _pushes(Machine.referred),
+    pickle.REDUCE: _pushes(Machine.called),
+    pickle.BUILD: Machine.build,
+}

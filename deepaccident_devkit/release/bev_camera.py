@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from deepaccident_devkit.arrays import ByteArray, ShortRepr, readonly
 from deepaccident_devkit.errors import SensorFileError
+from deepaccident_devkit.release._content import REMEDY
 from deepaccident_devkit.release.npz import FAST, read_npz, write_npz
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
@@ -58,8 +59,7 @@ def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
     data = read_npz(path, "bev")
     if data.shape != (*BEV_SHAPE, 3) or data.dtype != np.uint8:
         raise SensorFileError(
-            f"{path}: expected shape {(*BEV_SHAPE, 3)} of uint8, found {data.shape} of {data.dtype}; "
-            "restore the file from its archive"
+            f"{path}: expected shape {(*BEV_SHAPE, 3)} of uint8, found {data.shape} of {data.dtype}; {REMEDY}"
         )
     if raw:
         return data

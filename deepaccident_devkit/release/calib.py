@@ -13,10 +13,8 @@ from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3, handedness
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
-from deepaccident_devkit.release._content import read_content
-from deepaccident_devkit.release._unpickle import load_arrays
-from deepaccident_devkit.release._words import LARGEST, in_range
-from deepaccident_devkit.release.pickles import pickled
+from deepaccident_devkit.release._content import LARGEST, REMEDY, in_range, read_content
+from deepaccident_devkit.release.pickles import load_arrays, pickled
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import CAMERAS
 
@@ -30,7 +28,6 @@ KEYS: dict[str, tuple[int, int]] = {
 """Every key of a calib file and the shape of its array."""
 _POSE_KEYS = (*_EGO_KEYS, *_CAMERA_KEYS)
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
-_REMEDY = "restore the file from its archive"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -143,26 +140,26 @@ def read_unchecked_calib(path: ReleasePath) -> dict[str, AnyArray]:
 
     Raises as `read_calib` does, but not for NaN and transforms that are not rigid.
     """
-    content = read_content(path, "calib", CalibError, _REMEDY)
+    content = read_content(path, "calib", CalibError)
     try:
         loaded = load_arrays(content)
     except pickle.UnpicklingError as error:
         detail = str(error) if content else "the file is empty"
-        raise CalibError(f"{path}: not a readable calibration ({detail}); {_REMEDY}") from error
+        raise CalibError(f"{path}: not a readable calibration ({detail}); {REMEDY}") from error
     return _checked_raw(path, loaded)
 
 
 def _checked_raw(path: ReleasePath, loaded: Any) -> dict[str, AnyArray]:
     if not isinstance(loaded, dict):
-        raise CalibError(f"{path}: expected a dict of arrays, found {type(loaded).__name__}; {_REMEDY}")
+        raise CalibError(f"{path}: expected a dict of arrays, found {type(loaded).__name__}; {REMEDY}")
     missing = [key for key in KEYS if key not in loaded]
     if missing:
-        raise CalibError(f"{path}: lacks {', '.join(missing)}; {_REMEDY}")
+        raise CalibError(f"{path}: lacks {', '.join(missing)}; {REMEDY}")
     for key, shape in KEYS.items():
         array = loaded[key]
         if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind not in "fiu":
             found = f"{array.shape} of {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
-            raise CalibError(f"{path}: {key}: expected numbers of shape {shape}, found {found}; {_REMEDY}")
+            raise CalibError(f"{path}: {key}: expected numbers of shape {shape}, found {found}; {REMEDY}")
     return loaded
 
 
@@ -179,7 +176,7 @@ def _converted(paths: Sequence[ReleasePath], files: Sequence[Mapping[str, AnyArr
     for index in np.flatnonzero(~(rigid & finite)).tolist():
         fault = _first_value_fault(poses[index], intrinsics[index])
         if fault:
-            raise CalibError(f"{paths[index]}: {fault}; {_REMEDY}")
+            raise CalibError(f"{paths[index]}: {fault}; {REMEDY}")
     ego = handedness.flip_pose(poses[:, :2])
     return Calibs(
         ego_from_lidar=ego[:, 0],

@@ -147,7 +147,7 @@ def _digest(paths: Collection[ReleasePath], kind: FileKind, base: ReleasePath) -
         return None
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for path in paths:
-        content = read_content(path, kind, ReleaseError, "restore the file from its archive")
+        content = read_content(path, kind, ReleaseError)
         digest.update(f"{_below(path, base)} {len(content)}\n".encode())
         digest.update(content)
     return digest.hexdigest()

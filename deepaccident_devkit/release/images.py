@@ -14,7 +14,7 @@ from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import MOST_TOLD, check_size, fault_text, open_file, shortened
-from deepaccident_devkit.release._content import read_content
+from deepaccident_devkit.release._content import REMEDY, read_content
 from deepaccident_devkit.release.store import ReleasePath, real_path
 
 JPEG_QUALITY = 90
@@ -23,7 +23,6 @@ _DAMAGED = (OSError, SyntaxError, ValueError, struct.error, EOFError, MemoryErro
 _FORMATS = ("JPEG", "PNG")
 """Others have decoders that start programs."""
 _BYTES_A_PIXEL = 3
-_REMEDY = "restore the file from its archive"
 
 
 def read_image(
@@ -52,7 +51,7 @@ def read_image(
 
 def read_image_bytes(path: ReleasePath) -> bytes:
     """An image file's bytes; raises MissingFileError, and SensorFileError if it is no file or too large."""
-    return read_content(path, "image", SensorFileError, _REMEDY)
+    return read_content(path, "image", SensorFileError)
 
 
 def decode_image(
@@ -128,4 +127,4 @@ def _opened(path: ReleasePath, content: bytes | None, formats: tuple[str, ...]) 
     except (*_DAMAGED, *bombs) as error:
         known = not isinstance(error, UnidentifiedImageError)
         detail = fault_text(error) if known else f"expected {' or '.join(formats)}"
-        raise SensorFileError(f"{path}: not a readable image ({shortened(detail, MOST_TOLD)}); {_REMEDY}") from error
+        raise SensorFileError(f"{path}: not a readable image ({shortened(detail, MOST_TOLD)}); {REMEDY}") from error

@@ -18,8 +18,7 @@ from deepaccident_devkit.errors import LabelError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes, handedness, quaternions
 from deepaccident_devkit.reading import LIMITS_VARIABLE, limit_of, shortened
-from deepaccident_devkit.release._content import read_content
-from deepaccident_devkit.release._words import LARGEST, in_range, integer_of, number_of
+from deepaccident_devkit.release._content import LARGEST, in_range, integer_of, number_of, read_content
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import CATEGORIES
 

@@ -10,7 +10,7 @@ from deepaccident_devkit.arrays import AnyArray, checked
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.handedness import flip_points
-from deepaccident_devkit.release._words import in_range
+from deepaccident_devkit.release._content import REMEDY, in_range
 from deepaccident_devkit.release.npz import read_npz, write_npz
 from deepaccident_devkit.release.store import ReleasePath
 
@@ -36,8 +36,7 @@ def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | Any
     data = read_npz(path, "lidar")
     if data.ndim != 2 or data.shape[1] != 4 or data.dtype.kind != "f":
         raise SensorFileError(
-            f"{path}: expected points (N, 4) of floats, found shape {data.shape} of {data.dtype}; "
-            "restore the file from its archive"
+            f"{path}: expected points (N, 4) of floats, found shape {data.shape} of {data.dtype}; {REMEDY}"
         )
     if raw:
         return data

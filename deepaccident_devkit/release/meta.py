@@ -9,13 +9,11 @@ from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import MetaError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import shortened
-from deepaccident_devkit.release._content import read_lines
-from deepaccident_devkit.release._words import LARGEST, in_range, integer_of, number_of
+from deepaccident_devkit.release._content import LARGEST, REMEDY, in_range, integer_of, number_of, read_lines
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
 
 _FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"
-_REMEDY = "restore the file from its archive"
 _SHORT_NAMES = {name: short for short, name in META_AGENTS.items()}
 
 
@@ -91,12 +89,12 @@ def read_meta(path: ReleasePath, *, raw: bool = False) -> Meta | tuple[str, ...]
         MetaError: the first line has not nine words or a word where a number belongs, or another line's ids are
             no numbers.
     """
-    lines = read_lines(path, "meta", MetaError, _REMEDY)
+    lines = read_lines(path, "meta", MetaError)
     if raw:
         return tuple(lines)
     filled = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
     if not filled:
-        raise MetaError(f"{path}:1: expected '{_FIRST_LINE}', found an empty file; {_REMEDY}")
+        raise MetaError(f"{path}:1: expected '{_FIRST_LINE}', found an empty file; {REMEDY}")
     entries = _entries(path, filled[1:])
     return _parse(path, filled[0], entries)
 
@@ -130,7 +128,7 @@ def _entries(path: ReleasePath, lines: Sequence[tuple[int, str]]) -> dict[str, t
     for number, line in lines:
         key, colon, value = line.partition(":")
         if not colon:
-            raise MetaError(f"{path}:{number}: expected '<key>: <value>', found {shortened(line)!r}; {_REMEDY}")
+            raise MetaError(f"{path}:{number}: expected '<key>: <value>', found {shortened(line)!r}; {REMEDY}")
         entries[key.strip()] = (number, value.strip())
     return entries
 
@@ -140,7 +138,7 @@ def _parse(path: ReleasePath, first: tuple[int, str], entries: dict[str, tuple[i
     words = line.split()
     if len(words) != 9:
         raise MetaError(
-            f"{path}:{number}: expected 9 words '{_FIRST_LINE}', found {len(words)}: {shortened(line)!r}; {_REMEDY}"
+            f"{path}:{number}: expected 9 words '{_FIRST_LINE}', found {len(words)}: {shortened(line)!r}; {REMEDY}"
         )
     where = f"{path}:{number}"
     weather, time_of_day = _weather_and_time(words[0])
@@ -192,7 +190,7 @@ def _colliding_agents(
     names = value.split()
     if len(names) != 2 or not set(names) <= set(META_AGENTS):
         known = ", ".join(META_AGENTS)
-        raise MetaError(f"{path}:{number}: expected two of {known}, found {shortened(value)!r}; {_REMEDY}")
+        raise MetaError(f"{path}:{number}: expected two of {known}, found {shortened(value)!r}; {REMEDY}")
     return META_AGENTS[names[0]], META_AGENTS[names[1]]
 
 
@@ -202,7 +200,7 @@ def _agent_ids(path: ReleasePath, entries: dict[str, tuple[int, str]]) -> tuple[
     number, value = entries["agents id"]
     ids = [_integer(f"{path}:{number}", "agent's id", word) for word in value.split()]
     if len(ids) != 4:
-        raise MetaError(f"{path}:{number}: expected four agents' ids, found {shortened(value)!r}; {_REMEDY}")
+        raise MetaError(f"{path}:{number}: expected four agents' ids, found {shortened(value)!r}; {REMEDY}")
     return ids[0], ids[1], ids[2], ids[3]
 
 
@@ -214,7 +212,7 @@ def _text(entries: dict[str, tuple[int, str]], key: str) -> str | None:
 def _integer(where: str, what: str, word: str) -> int:
     value = integer_of(word)
     if value is None:
-        raise MetaError(f"{where}: {what}: expected an integer, found {shortened(word)!r}; {_REMEDY}")
+        raise MetaError(f"{where}: {what}: expected an integer, found {shortened(word)!r}; {REMEDY}")
     return value
 
 
@@ -222,5 +220,5 @@ def _finite(where: str, what: str, word: str) -> float:
     value = number_of(word)
     if value is None or not in_range(value):
         found = f"found {shortened(word)!r} (at most {LARGEST:.0e} counts)"
-        raise MetaError(f"{where}: {what}: expected a finite number, {found}; {_REMEDY}")
+        raise MetaError(f"{where}: {what}: expected a finite number, {found}; {REMEDY}")
     return value

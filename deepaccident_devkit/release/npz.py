@@ -11,7 +11,7 @@ from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import MOST_TOLD, FileKind, fault_text, shortened
-from deepaccident_devkit.release._content import read_content
+from deepaccident_devkit.release._content import REMEDY, read_content
 from deepaccident_devkit.release.store import ReleasePath
 
 KEY = "data"
@@ -20,7 +20,6 @@ _BARE_ARRAY = b"\x93NUMPY"
 """How a `.npy` file begins."""
 FAST = 1
 """Level of compression: a BEV array of 4.3 MB takes 10 ms; zlib's default level takes 20 to 30, for a quarter of it."""
-_REMEDY = "restore the file from its archive"
 
 
 def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
@@ -31,7 +30,7 @@ def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
         SensorFileError: it is no file, empty, truncated, too large for its kind, disagrees with its sizes or checksum,
             holds several arrays and none of them `data`, or objects.
     """
-    content = read_content(path, kind, SensorFileError, _REMEDY)
+    content = read_content(path, kind, SensorFileError)
     try:
         with open_zip(content) as archive:
             return array_of(read_member(archive, _array_member(path, archive), kind), kind)
@@ -40,7 +39,7 @@ def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
             raise
         detail = "expected an npz archive, found a bare array" if content.startswith(_BARE_ARRAY) else ""
         detail = detail or f"not a readable npz archive ({shortened(fault_text(error), MOST_TOLD)})"
-        raise SensorFileError(f"{path}: {detail}; {_REMEDY}") from error
+        raise SensorFileError(f"{path}: {detail}; {REMEDY}") from error
 
 
 def write_npz(path: Path, array: AnyArray, *, level: int = FAST) -> None:
@@ -58,5 +57,5 @@ def _array_member(path: ReleasePath, archive: zipfile.ZipFile) -> zipfile.ZipInf
     named = [entry for entry in entries if entry.filename == f"{KEY}{_ENDING}"] or entries
     if len(named) != 1:
         found = ", ".join(entry.filename.removesuffix(_ENDING) for entry in entries) or "no array"
-        raise SensorFileError(f"{path}: expected an array named '{KEY}', found {shortened(found)}; {_REMEDY}")
+        raise SensorFileError(f"{path}: expected an array named '{KEY}', found {shortened(found)}; {REMEDY}")
     return named[0]

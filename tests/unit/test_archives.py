@@ -86,7 +86,6 @@ HOSTILE = {
     "a stored size that is too large": lambda: patched(npz(), 24, 10**6),
     "a stored size of gigabytes": lambda: patched(npz(), 24, 0xFFFFFFF0),
     "compressed bytes that end early": lambda: patched(npz(), 20, 30),
-    "compressed bytes that go on": lambda: patched(npz(), 20, len(npz()) - 60),
     "another checksum": lambda: patched(npz(), 16, 7),
     "another byte": lambda: flipped(npz(way=zipfile.ZIP_STORED), 180),
     "an unknown compression": lambda: patched(npz(), 10, 14, 2),
@@ -112,6 +111,12 @@ def test_a_hostile_archive_is_refused_in_little_memory(name: str) -> None:
     assert tracemalloc.get_traced_memory()[1] < MOST_MEMORY
     tracemalloc.stop()
     assert len(str(raised.value)) < 500
+
+
+@pytest.mark.parametrize("content", [patched(zipped(b""), 16, 7), patched(npz(), 24, 0)])
+def test_a_member_without_bytes_has_a_checksum_as_well(content: bytes) -> None:
+    with open_zip(content) as archive, pytest.raises(zipfile.BadZipFile, match="CRC"):
+        read_member(archive, archive.infolist()[0], "lidar")
 
 
 def test_threads_may_read_one_archive(tmp_path: Path) -> None:

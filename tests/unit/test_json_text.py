@@ -47,6 +47,7 @@ def test_levels_are_counted(far: int) -> None:
         (b"\x80\x04", "is a pickle"),
         (b'"\xff"', r"is no JSON \(not in UTF-8, or a number of thousands of digits\)"),
         (b'{"a": [{"b": 1, "b": 2}]}', "a: entry 0: b: stands there twice"),
+        (b'{"a": {"b": NaN, "b": 1}, "a": 2}', "^a: stands there twice$"),
         (b'{"a": NaN}', "a: expected a finite number, found NaN"),
         (b"[-Infinity]", "entry 0: expected a finite number, found Infinity"),
         (b'["\\ud800"]', r"entry 0: expected characters, found half of one: '\\ud800'"),

@@ -11,7 +11,7 @@ from typing import BinaryIO, Final
 
 import numpy as np
 
-from deepaccident_devkit.archives import check_end
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, check_end
 from deepaccident_devkit.errors import DatarootError
 from deepaccident_devkit.reading import LIMITS_VARIABLE, MOST_TOLD, RefusedFileError, fault_text, limit_of, shortened
 from deepaccident_devkit.release.store.members import Listing, Member
@@ -26,10 +26,6 @@ _SIGNATURE: Final = b"PK\x03\x04"
 _ENCRYPTED: Final = 1
 _METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _REMEDY: Final = "fetch the archive again"
-_DAMAGED: Final = (
-    OSError, zipfile.BadZipFile, struct.error, ValueError, NotImplementedError, EOFError, MemoryError, OverflowError
-)  # fmt: skip
-"""What reading a damaged archive's directory can raise."""
 
 
 def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
@@ -52,7 +48,7 @@ def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
     except RefusedFileError as error:  # by the gate, or by a URL
         sound = f"; if the archive is sound, set {LIMITS_VARIABLE}=archive=4G" if error.errno == errno.EFBIG else ""
         raise DatarootError(f"{shown}: {fault_text(error)}{sound}") from error
-    except _DAMAGED as error:
+    except DAMAGED_ARCHIVE as error:
         told = shortened(fault_text(error), MOST_TOLD)
         raise DatarootError(f"{shown}: not a readable zip archive ({told}); {_REMEDY}") from error
     leading = PurePosixPath(archive).with_suffix("").parts

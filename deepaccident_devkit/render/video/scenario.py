@@ -47,8 +47,8 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     Args:
         dataset: the release.
         scenario: token or record.
-        path: the file to write, by its suffix: `.mp4` (which browsers play if the extra `video` is installed), `.gif`
-            or `.webp`. An earlier file is replaced when the new one is complete.
+        path: the file to write, by its suffix: `.mp4` (with the extra `video`), `.gif` or `.webp`. An earlier file is
+            replaced when the new one is complete.
         what: a view by name, a function (dataset, frame record, figure) that renders one, or several side by side.
         agents: who is shown, or None for all that are there. Views of one agent (`sample`, `bev`, cameras, …) show the
             first one named, or the first one there; their boxes and points from above are of all of `agents`.
@@ -70,7 +70,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         ChoiceError: no such view, layer, agent, frame or kind of file, or the file cannot have this size or rate.
         NotAvailableError: an agent is not in this release, the sample has no label, or nobody collides and the view
             is `accident`.
-        MissingExtraError: nothing here can write MP4.
+        MissingExtraError: the file is an `.mp4`, and the extra `video` is not installed.
         WorkerError: a worker was killed, or cannot do the work.
     """
     target, (width, height) = path_of(path), size

@@ -1,8 +1,7 @@
-"""Writing pictures into a video file: MP4 by the extra `video` or by OpenCV, GIF and WebP by pillow."""
+"""Writing pictures into a video file: MP4 by PyAV (the extra `video`), GIF and WebP by pillow."""
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
@@ -16,7 +15,6 @@ from deepaccident_devkit.files import replacing
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_INSTALL: Final = "in a checkout, pip install '.[video]'"
 _CRF: Final = "20"
 """Quality of H.264: 0 loses nothing, 51 is the worst."""
 _WEBP_QUALITY: Final = 70
@@ -24,11 +22,10 @@ _COLORS: Final = 255
 """Colours of a GIF; one more is kept for pixels that do not change."""
 _LOOKED_AT: Final = 2_000_000
 """About so many pixels of all pictures are used to choose the palette."""
-_log = logging.getLogger(__name__)
 
 
 def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
-    """Check before anything is rendered that the file can be written; raises ChoiceError."""
+    """Check before anything is rendered that the file can be written; raises ChoiceError and MissingExtraError."""
     if path.suffix.lower() not in SUFFIXES:
         raise ChoiceError(f"path: expected a file that ends in {', '.join(SUFFIXES)}, found {str(path)!r}")
     if path.is_dir():
@@ -40,8 +37,15 @@ def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
         raise ChoiceError(f"fps: expected frames a second, above 0 and at most 100, found {fps!r}")
     if min(size) < 16:
         raise ChoiceError(f"size: expected width and height of at least 16 pixels, found {size}")
-    if path.suffix.lower() == ".mp4" and any(side % 2 for side in size):
-        raise ChoiceError(f"size: expected an even width and height, which MP4 needs, found {size}")
+    if path.suffix.lower() == ".mp4":
+        if any(side % 2 for side in size):
+            raise ChoiceError(f"size: expected an even width and height, which MP4 needs, found {size}")
+        try:
+            import av  # noqa: F401 - whether it is installed
+        except ImportError:
+            raise MissingExtraError(
+                f"{path}: MP4 needs PyAV: in a checkout, pip install '.[video]'; or choose .gif or .webp"
+            ) from None
 
 
 def write_video(path: Path, pictures: Iterable[ByteArray], *, fps: float) -> None:
@@ -51,25 +55,12 @@ def write_video(path: Path, pictures: Iterable[ByteArray], *, fps: float) -> Non
         path: of one of `SUFFIXES`; a file that is there is replaced.
         pictures: (H, W, 3) uint8, RGB, all of one size, H and W even for MP4; at least one.
         fps: pictures a second.
-
-    Raises:
-        MissingExtraError: neither the extra `video` nor OpenCV can write MP4 here.
     """
     with replacing(path) as temporary:
         SUFFIXES[path.suffix.lower()](temporary, pictures, fps)
 
 
 def _write_mp4(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
-    try:
-        import av  # noqa: F401 - whether it is installed
-    except ImportError:
-        _log.warning("writing MPEG-4 Part 2, which browsers do not play; for H.264: %s", _INSTALL)
-        _write_by_opencv(path, pictures, fps)
-    else:
-        _write_h264(path, pictures, fps)
-
-
-def _write_h264(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
     """H.264 in yuv420p with its index in front: browsers play it, and begin before it is complete."""
     import av
 
@@ -86,28 +77,6 @@ def _write_h264(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         if stream is not None:
             container.mux(stream.encode(None))
-
-
-def _write_by_opencv(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
-    import cv2
-
-    named = path.with_name(f"{path.name}.mp4")  # OpenCV takes the container from the suffix
-    writer = None
-    try:
-        for picture in pictures:
-            if writer is None:
-                height, width = picture.shape[:2]
-                writer = cv2.VideoWriter(os.fspath(named), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
-                if not writer.isOpened():
-                    raise MissingExtraError(
-                        f"{path}: this OpenCV cannot write MP4; {_INSTALL}, or choose .gif or .webp"
-                    )
-            writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-        if writer is not None:
-            writer.release()
-        named.replace(path)
-    finally:
-        named.unlink(missing_ok=True)
 
 
 def _write_gif(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_equal
 
-from deepaccident_devkit.release._unpickle import load_arrays
-from deepaccident_devkit.release.pickles import pickled, pickled_items, write_joined
+from deepaccident_devkit.release.pickles import load_arrays, pickled, pickled_items, write_joined
 
 NUMBERS = {"turned": np.arange(6.0).reshape(2, 3).T, "none": np.zeros((0, 7)), "one": np.array(3), "n": -5, "x": 2.5}
 WORDS = {"names": np.array(["car", "truck"]), "word": "Straße", "list": [1, None, True, 2**40]}

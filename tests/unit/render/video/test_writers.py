@@ -1,6 +1,5 @@
 """Video files: what players make of them."""
 
-import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,7 @@ from PIL import Image
 from video_views import colors, decoded
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ChoiceError, MissingExtraError
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.video.writers import write_video
@@ -59,23 +58,14 @@ def test_animations_go_on_for_ever_at_the_rate_asked_for(
     assert (image.info["duration"], image.info["loop"]) == (duration, 0)
 
 
-def test_without_av_opencv_writes_mp4_and_says_who_does_not_play_it(
-    video: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("name", ["v.mp4", "v.MP4"])
+def test_without_av_mp4_is_refused_before_anything_is_drawn(
+    video: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
 ) -> None:
-    import cv2
-
     monkeypatch.setitem(sys.modules, "av", None)
-    with caplog.at_level(logging.WARNING):
-        path = video("v.mp4", what=colors)
-    assert "browsers do not play; for H.264: in a checkout, pip install '.[video]'" in caplog.text
-    assert [each.name for each in path.parent.iterdir()] == ["v.mp4"]
-    capture = cv2.VideoCapture(str(path))
-    pictures = []
-    while (read := capture.read())[0]:
-        pictures.append(read[1][..., ::-1])
-    assert len(pictures) == 6
-    np.testing.assert_allclose(pictures[5][45, 40], (255, 0, 0), atol=25)
-    np.testing.assert_allclose(pictures[5][45, 120], (0, 0, 255), atol=25)
+    with pytest.raises(MissingExtraError, match=r"MP4 needs PyAV: .*\[video\]'; or choose \.gif or \.webp$"):
+        video(name, what=lambda *_: pytest.fail("drawn"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_is_no_video(da: DeepAccident, accident: str, tmp_path: Path) -> None:
