@@ -6,10 +6,11 @@ import copy
 import gc
 import hashlib
 import os
-from collections.abc import Collection, Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import NotAvailableError, ResultsError, TokenError
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
+Read = TypeVar("Read")
 
 
 class EntryContents:
@@ -76,20 +78,19 @@ class MotionContents:
 
     def prediction(self, token: str) -> MotionOutput:
         """The prediction of a sample; raises ResultsError."""
-        shard = self._manifest.shards[self._manifest.shard_of[token]]
-        with told_of(self._path), at(shard.file):
-            archive = self._shards.archive(shard)
-            with at(token):
-                return stored_output(archive, token, self.form)
+        return self._read(token, stored_output)
 
     def trajectories(self, token: str) -> dict[int, FloatArray]:
         """Those stored with a sample, or else those of its maps; raises ResultsError."""
+        stored = self._read(token, stored_paths)
+        return paths_of(self.prediction(token), self.form.labels) if stored is None else stored
+
+    def _read(self, token: str, read: Callable[[zipfile.ZipFile, str, MotionForm], Read]) -> Read:
         shard = self._manifest.shards[self._manifest.shard_of[token]]
         with told_of(self._path), at(shard.file):
             archive = self._shards.archive(shard)
             with at(token):
-                stored = stored_paths(archive, token, self.form)
-        return paths_of(self.prediction(token), self.form.labels) if stored is None else stored
+                return read(archive, token, self.form)
 
     def check(self, samples: Collection[str] | None, **how: Any) -> None:
         """Read every array, or those of the shards that begin with one of these samples, as `run_batch` is told.
@@ -104,8 +105,6 @@ class MotionContents:
 
 Contents = EntryContents | MotionContents
 """The content of a file; callers ask only for tokens that it has."""
-
-
 kept: Final[dict[tuple[Path, str], Contents]] = {}
 """Path and fingerprint → contents of the files that this process parsed last."""
 _MOST_KEPT: Final = 4
