@@ -6,7 +6,6 @@ import copy
 import gc
 import hashlib
 import os
-import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -85,7 +84,7 @@ class MotionContents:
         stored = self._read(token, stored_paths)
         return paths_of(self.prediction(token), self.form.labels) if stored is None else stored
 
-    def _read(self, token: str, read: Callable[[zipfile.ZipFile, str, MotionForm], Read]) -> Read:
+    def _read(self, token: str, read: Callable[..., Read]) -> Read:
         shard = self._manifest.shards[self._manifest.shard_of[token]]
         with told_of(self._path), at(shard.file):
             archive = self._shards.archive(shard)
