@@ -1,8 +1,8 @@
 """The devkit's own exceptions: every error that a caller can mend derives from `DeepAccidentError`.
 
-Each kind is also the built-in kind that a caller would expect (`ValueError`, `KeyError`, …) and is built from one
-sentence that names the file, the line and the remedy. One argument only: an exception with more does not survive
-the pickling on its way out of a worker process.
+There are three kinds: `ArgumentError`, `FileError` and `UnavailableError`. Each error is also the built-in kind that a
+caller would expect (`ValueError`, `KeyError`, …) and is built from one sentence that names the file, the line and the
+remedy. One argument only: an exception with more does not survive the pickling on its way out of a worker process.
 
 What strangers wrote stands in these sentences too. So a sentence has a most length, and nothing in it moves a
 terminal's cursor, rings or turns the direction of letters.
@@ -37,7 +37,19 @@ class DeepAccidentError(Exception):
         return str(self.args[0]) if self.args else ""
 
 
-class ReleaseError(DeepAccidentError, ValueError):
+class ArgumentError(DeepAccidentError):
+    """Your argument cannot be used: change the call."""
+
+
+class FileError(DeepAccidentError):
+    """This file or folder cannot be read, used or written: mend it, or give another."""
+
+
+class UnavailableError(DeepAccidentError):
+    """Something that the call needs is not there, or does not run, here."""
+
+
+class ReleaseError(FileError, ValueError):
     """Something in the release on disk does not keep to its format."""
 
 
@@ -79,23 +91,27 @@ class BrokenReleaseError(ReleaseError):
     _is_list = True
 
 
-class IndexStoreError(DeepAccidentError, OSError):
+class IndexStoreError(FileError, OSError):
     """The index cannot be written or read at its place."""
 
 
-class LabelFilesError(DeepAccidentError, OSError):
+class LabelFilesError(FileError, OSError):
     """A folder of written motion labels is missing, damaged or something else."""
 
 
-class ExportError(DeepAccidentError, OSError):
+class ExportError(FileError, OSError):
     """A folder of an export cannot be made, written to or read, or it holds something else."""
 
 
-class OutputFolderError(DeepAccidentError, OSError):
+class OutputFolderError(FileError, OSError):
     """A link, or a path, would lead what is written or removed out of the folder that it belongs to."""
 
 
-class LookupFailedError(DeepAccidentError, KeyError):
+class ResultsError(FileError, ValueError):
+    """A results file, or a bundle of an evaluation, cannot be used as it is."""
+
+
+class LookupFailedError(ArgumentError, KeyError):
     """A table, token, field or channel that does not exist was asked for."""
 
 
@@ -111,51 +127,47 @@ class FieldError(LookupFailedError):
     """The table has no such field."""
 
 
-class MissingNameError(DeepAccidentError, AttributeError):
+class MissingNameError(ArgumentError, AttributeError):
     """An object has no attribute of this name; the nuScenes devkit's has."""
 
 
-class KeywordError(DeepAccidentError, TypeError):
+class KeywordError(ArgumentError, TypeError):
     """A function has no argument of this name; the nuScenes devkit's has."""
 
 
-class ChoiceError(DeepAccidentError, ValueError):
+class ChoiceError(ArgumentError, ValueError):
     """An argument is not one of the values it can take (a frame, a channel, a layout, …)."""
 
 
-class NotAvailableError(DeepAccidentError, LookupError):
-    """The call needs something that this release does not have (labels, an agent, split files)."""
-
-
-class GeometryError(DeepAccidentError, ValueError):
+class GeometryError(ArgumentError, ValueError):
     """An array is no valid transform, box or point set."""
 
 
-class ConfigError(DeepAccidentError, ValueError):
+class ConfigError(ArgumentError, ValueError):
     """A configuration cannot be carried out."""
 
 
-class EvaluationError(DeepAccidentError, ValueError):
+class EvaluationError(ArgumentError, ValueError):
     """Predictions cannot be evaluated together: a sample twice, other settings, samples that are missing."""
 
 
-class ResultsError(DeepAccidentError, ValueError):
-    """A results file, or a bundle of an evaluation, cannot be used as it is."""
+class NotAvailableError(UnavailableError, LookupError):
+    """The call needs something that this release does not have (labels, an agent, split files)."""
 
 
-class WorkerError(DeepAccidentError, RuntimeError):
+class WorkerError(UnavailableError, RuntimeError):
     """A worker was killed or cannot do the work, or no scheduler answers."""
 
 
-class SomeFailedError(DeepAccidentError, RuntimeError):
+class SomeFailedError(UnavailableError, RuntimeError):
     """Some items of bulk work failed, and the others are done; the message lists every one that failed."""
 
     _is_list = True
 
 
-class UnfinishedError(DeepAccidentError, RuntimeError):
+class UnfinishedError(UnavailableError, RuntimeError):
     """Shards of bulk work cannot be merged, since some are not done."""
 
 
-class MissingExtraError(DeepAccidentError, ImportError):
+class MissingExtraError(UnavailableError, ImportError):
     """An optional dependency is needed and not installed."""

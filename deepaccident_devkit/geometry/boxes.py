@@ -276,24 +276,6 @@ class Boxes(FrozenArrays, Pictured):
         self._check_ground(other)
         return gaps(self._footprints(), other._footprints())
 
-    def center_distance(self, other: Boxes, *, in_3d: bool = False) -> FloatArray:
-        """The distance from the centres of these N boxes to those of M others: (N, M) metres.
-
-        Args:
-            other: boxes of the same coordinate frame.
-            in_3d: whether to use the difference in height too; if not, distances are those on the ground, like those
-                of the nuScenes devkit's function of this name.
-
-        Raises:
-            GeometryError: the frames differ or, for distances on the ground, are a camera's.
-        """
-        if in_3d:
-            self._check_frame(other)
-        else:
-            self._check_ground(other)
-        axes = 3 if in_3d else 2
-        return as_floats(np.linalg.norm(self.center[:, None, :axes] - other.center[:, :axes], axis=-1))
-
     def _picked(self, which: slice | AnyArray) -> Boxes:
         """The boxes of a slice, a mask or an array of rows; raises numpy's IndexError."""
         return trusted_boxes(self.frame, {name: getattr(self, name)[which] for name in COLUMNS}, self.sample)
@@ -309,15 +291,12 @@ class Boxes(FrozenArrays, Pictured):
         half = self.size[:, 2] / 2
         return self.center[:, 2] - half, self.center[:, 2] + half
 
-    def _check_frame(self, other: Boxes) -> None:
+    def _check_ground(self, other: Boxes) -> None:
         checked_boxes("other", other)
         if other.frame != self.frame:
             raise GeometryError(
                 f"boxes of frame {self.frame!r} cannot be compared with those of {other.frame!r}; transform them first"
             )
-
-    def _check_ground(self, other: Boxes) -> None:
-        self._check_frame(other)
         if self.frame in CAMERAS:
             raise GeometryError(
                 f"boxes of {self.frame} have no ground plane, z points forward there; transform them to ego or lidar"

@@ -37,11 +37,6 @@ def flip_yaw(yaw: ArrayLike) -> FloatArray:
     return -as_floats(yaw)
 
 
-def flip_rotation(rotation: ArrayLike) -> FloatArray:
-    """Rotation matrices (…, 3, 3) in the other handedness: S·R·S."""
-    return as_floats(as_floats(rotation) * np.outer(_S, _S))
-
-
 def flip_pose(pose: ArrayLike) -> FloatArray:
     """Transforms (…, 4, 4) between two frames in the other handedness: S4·T·S4."""
     return as_floats(as_floats(pose) * np.outer(_S4, _S4))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from deepaccident_devkit.arrays import (
     BoolArray,
     FloatArray,
     FrozenArrays,
-    IntArray,
     checked,
     checked_number,
     readonly,
@@ -147,27 +145,6 @@ class LidarPointCloud(FrozenArrays, Pictured):
         place = checked("sensor", (0.0, 0.0, 0.0) if sensor is None else sensor, (3,))
         return self.select(np.hypot(*(self.xyz[:, :2] - place[:2]).T) >= distance)
 
-    def voxel_downsample(self, size: float) -> LidarPointCloud:
-        """One point for each cube of `size` metres: the first one in it, unchanged; the points keep their order.
-
-        Cubes are counted from the frame's origin; each includes its lower faces.
-
-        Raises:
-            GeometryError: the size is not above 0, or so small that the cubes cannot be counted; or a point is not
-                finite.
-        """
-        edge = checked_number("size", size, "metres above 0")
-        if not 0 < edge < math.inf:
-            raise GeometryError(f"size: expected metres above 0, found {size}")
-        if not np.isfinite(self.xyz).all():
-            raise GeometryError(
-                "the cloud holds NaN or infinity, which lie in no voxel; select the finite points first"
-            )
-        if len(self) == 0:
-            return self
-        first: IntArray = np.unique(_voxel_keys(self.xyz, edge), return_index=True)[1]
-        return self.select(np.sort(first))
-
     def save(self, path: str | Path) -> None:
         """Write the cloud to an `.npz` file (its attributes that are not None), completely or not at all.
 
@@ -225,17 +202,3 @@ def _within(name: str, values: FloatArray, limits: Range) -> BoolArray:
         raise GeometryError(f"{name}: expected a start and an end not before it, found {limits}")
     within: BoolArray = (values >= low) & (values < high)
     return within
-
-
-def _voxel_keys(xyz: FloatArray, size: float) -> IntArray:
-    """An integer (N,) for each point, equal for points in one voxel."""
-    voxels = np.floor(xyz / size)
-    lowest = voxels.min(axis=0)
-    along_x, along_y, along_z = (int(length) for length in (voxels.max(axis=0) - lowest + 1).tolist())
-    if along_x * along_y * along_z >= 2**62:
-        raise GeometryError(
-            f"size: {along_x} × {along_y} × {along_z} voxels of {size} m are too many; give a larger size"
-        )
-    x, y, z = (voxels - lowest).astype(np.int64).T
-    keys: IntArray = (x * along_y + y) * along_z + z
-    return keys

@@ -7,7 +7,15 @@ from collections.abc import Callable
 import pytest
 
 from deepaccident_devkit import errors
-from deepaccident_devkit.errors import MOST_SAID, BrokenReleaseError, DeepAccidentError, SomeFailedError
+from deepaccident_devkit.errors import (
+    MOST_SAID,
+    ArgumentError,
+    BrokenReleaseError,
+    DeepAccidentError,
+    FileError,
+    SomeFailedError,
+    UnavailableError,
+)
 
 KINDS = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, DeepAccidentError)]
 HOSTILE = "a.txt: \x1b[2J\x07\r\x9b\x7f\u202eevil\u2066\ud800\udcff, expected a number"
@@ -34,6 +42,11 @@ def test_a_message_is_bounded_and_moves_no_cursor(kind: type[DeepAccidentError])
         assert len(long) <= MOST_SAID
         assert (long[:16], long[-11:]) == ("file.json: found", " restore it")
     assert str(kind()) == ""
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_every_error_is_of_one_of_three_kinds(kind: type[DeepAccidentError]) -> None:
+    assert [issubclass(kind, one) for one in (ArgumentError, FileError, UnavailableError)].count(True) == 1
 
 
 @pytest.mark.parametrize("dumps", [pickle.dumps, dumped_by_dask])

@@ -3,9 +3,9 @@
 schema/results/README.md describes them; `ResultsWriter` writes, `read_results` reads.
 """
 
-from deepaccident_devkit.evaluation.results.header import FORMAT, FORMAT_VERSION, RESULTS_NAMES, MotionForm, ResultsTask
+from deepaccident_devkit.evaluation.results.header import RESULTS_NAMES, MotionForm
 from deepaccident_devkit.evaluation.results.reader import Prediction, Results, read_results
-from deepaccident_devkit.evaluation.results.schemas import RESULT_SCHEMAS
+from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, RESULT_SCHEMAS, ResultsTask
 from deepaccident_devkit.evaluation.results.writer import ResultsWriter
 
 __all__ = [

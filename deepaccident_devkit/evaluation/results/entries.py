@@ -1,7 +1,6 @@
-"""Accidents and detected boxes as results files have them: entries read, and written a sample a line.
+"""Accidents and detected boxes of many samples: read as columns over all entries, and written a sample a line.
 
-Accidents: {"positions", "time", "score", "ids"}, positions in the sample's present ego frame. Boxes: nuScenes' fields,
-in the world frame; nuScenes' `size` is width, length, height; ours is length, width, height.
+nuScenes' `size` is width, length, height; ours is length, width, height.
 """
 
 from __future__ import annotations
@@ -9,66 +8,97 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
+import msgspec
 import numpy as np
 
+from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, checked_prediction
-from deepaccident_devkit.evaluation.results.columns import (
-    ANY_NUMBER,
-    FROM_ZERO,
-    LARGEST,
-    Columns,
-    Entries,
-    Entry,
-    ReadColumns,
-    check_entries,
-    choices,
-    numbers,
-    whole_numbers,
-    with_value,
-)
-from deepaccident_devkit.evaluation.results.faults import ContentError, shown
-from deepaccident_devkit.evaluation.results.header import Header
+from deepaccident_devkit.evaluation.results.faults import ContentError, at, decoded, parsed_json
+from deepaccident_devkit.evaluation.results.header import check_token
+from deepaccident_devkit.evaluation.results.records import AccidentEntry, BoxEntry
 from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.taxonomy import CATEGORIES, UNTRACKED_ID
 
-_ACCIDENT_REQUIRED: Final = ("positions", "time", "score")
-_ACCIDENT_OPTIONAL: Final = ("ids",)
+Columns = dict[str, AnyArray]
+Entry = TypeVar("Entry", bound=msgspec.Struct)
+_LENGTH_FIRST: Final = [1, 0, 2]
+"""From width, length, height to length, width, height, and back."""
+_UNIT_TOLERANCE: Final = 1e-3
+"""How far from 1 a quaternion's norm may be; `Boxes` brings it there."""
+_UNKNOWN: Final = (math.nan, math.nan)
 
 
-def accident_columns(entries: Sequence[Entry], owners: Sequence[str]) -> Columns:
-    """The columns of N accidents; raises ContentError.
+@dataclass(frozen=True, slots=True, eq=False)
+class Entries:
+    """All entries of a results file.
 
-    Args:
-        entries: as a file has them.
-        owners: tokens of their samples, which accidents do not name.
+    Attributes:
+        number: token → number of the sample, in the file's order; S of them.
+        first: (S + 1,) row of each sample's first entry, and the number of entries, N.
+        columns: field → (N, …).
+    """
+
+    number: Mapping[str, int]
+    first: IntArray
+    columns: Columns
+
+    @classmethod
+    def read(cls, results: Mapping[str, Sequence[Any]], columns: Callable[[Mapping[str, Any]], Columns]) -> Entries:
+        """The entries by token; raises ContentError that names the token, the entry (from 0), and the field."""
+        with at("results"):
+            for token in results:
+                check_token(token)
+        first = np.concatenate([[0], np.cumsum([len(given) for given in results.values()])])
+        return cls({token: number for number, token in enumerate(results)}, first, columns(results))
+
+    def of(self, token: str) -> Columns:
+        """The columns of a sample's entries; KeyError for a sample that is not here."""
+        number = self.number[token]
+        rows = slice(self.first[number], self.first[number + 1])
+        return {name: column[rows] for name, column in self.columns.items()}
+
+
+def read_entries(content: bytes, record: type[Entry]) -> list[Entry]:
+    """A sample's entries; raises ContentError that names the number of the entry and the field."""
+    try:
+        return decoded(content, list[record])  # type: ignore[valid-type]  # msgspec wants it so at run time
+    except ContentError:
+        parsed_json(content)  # it says of NaN where it stands
+        raise
+
+
+def entry_place(token: str, number: int | None = None) -> str:
+    """How errors name a sample's entries, or one of them."""
+    return f"results of {shortened(token)!r}" + ("" if number is None else f": [{number}]")
+
+
+def accident_columns(results: Mapping[str, Sequence[AccidentEntry]]) -> Columns:
+    """The columns of N accidents.
 
     Returns:
         positions (N, 2, 2) metres, time (N,) seconds, score (N,), ids (N, 2), identified (N,) bool.
     """
-    del owners
-    check_entries(entries, _ACCIDENT_REQUIRED, _ACCIDENT_OPTIONAL)
-    points = f"two points [[x, y], [x, y]] of finite numbers up to {LARGEST:,.0f}, metres"
-    rows, named = with_value(entries, "ids")
-    ids, identified = np.zeros((len(entries), 2), dtype=np.int64), np.zeros(len(entries), dtype=bool)
-    ids[rows] = whole_numbers(named, "ids", (2,), "two whole numbers, or null where they are not known")
-    identified[rows] = True
+    accidents = list(chain.from_iterable(results.values()))
     return {
-        "positions": numbers(entries, "positions", (2, 2), points),
-        "time": numbers(entries, "time", (), f"a finite number of seconds from 0 to {LARGEST:,.0f}", FROM_ZERO),
-        "score": numbers(entries, "score", (), "a finite number", ANY_NUMBER),
-        "ids": ids,
-        "identified": identified,
+        "positions": _floats([(*one, *other) for one, other in (each.positions for each in accidents)], 2, 2),
+        "time": np.array([each.time for each in accidents], dtype=np.float64),
+        "score": np.array([each.score for each in accidents], dtype=np.float64),
+        "ids": np.array([each.ids or (0, 0) for each in accidents], dtype=np.int64).reshape(-1, 2),
+        "identified": np.array([bool(each.ids) for each in accidents], dtype=bool),
     }
 
 
 def accidents_at(entries: Entries, token: str) -> list[Accident]:
     """The accidents of a sample; KeyError for one that is not here."""
-    columns: dict[str, Any] = entries.of(token)
+    columns = entries.of(token)
     identified, ids = columns["identified"].tolist(), columns["ids"].tolist()
     return [
         Accident(
@@ -94,53 +124,40 @@ def accident_entries(accidents: Iterable[Accident]) -> list[dict[str, Any]]:
     ]
 
 
-_BOX_REQUIRED: Final = ("sample_token", "translation", "size", "rotation", "detection_name", "detection_score")
-IGNORED: Final = ("attribute_name", "ego_translation", "num_pts")
-"""A further field of the nuScenes devkit; this dataset has no attributes."""
-_BOX_OPTIONAL: Final = ("velocity", *IGNORED)
-_LENGTH_FIRST: Final = [1, 0, 2]
-"""From width, length, height to length, width, height, and back."""
-_UNIT_TOLERANCE: Final = 1e-3
-"""How far from 1 a quaternion's norm may be; `Boxes` brings it there."""
-
-
-def detection_columns(entries: Sequence[Entry], owners: Sequence[str]) -> Columns:
-    """The columns of N boxes; raises ContentError.
-
-    Args:
-        entries: as a file has them.
-        owners: tokens of the samples that they stand under.
+def detection_columns(results: Mapping[str, Sequence[BoxEntry]]) -> Columns:
+    """The columns of N boxes.
 
     Returns:
         `center` (N, 3) metres and rotation (N, 4) unit quaternions w, x, y, z in the world, size (N, 3) length, width,
         height, velocity (N, 3) m/s, NaN where unknown, category (N,), score (N,).
+
+    Raises:
+        ContentError: a box names another sample, or its quaternion has another length than 1.
     """
-    check_entries(entries, _BOX_REQUIRED, _BOX_OPTIONAL)
-    tokens = [entry["sample_token"] for entry in entries]
-    if tokens != list(owners):
-        raise ContentError(f"sample_token: expected {owners[0]}, under which it stands, found {shown(tokens[0])}")
-    rotation = numbers(entries, "rotation", (4,), "a unit quaternion [w, x, y, z]")
+    for token, given in results.items():
+        others = [number for number, box in enumerate(given) if box.sample_token != token]
+        if others:
+            place, found = entry_place(token, others[0]), shortened(given[others[0]].sample_token)
+            raise ContentError(f"{place}.sample_token: expected {token}, under which it stands, found {found!r}")
+    boxes = list(chain.from_iterable(results.values()))
+    rotation = _floats([box.rotation for box in boxes], 4)
     with np.errstate(over="ignore"):
         length = np.linalg.norm(rotation, axis=1)
-    if (np.abs(length - 1) > _UNIT_TOLERANCE).any():
-        found = f"{shown(rotation[0].tolist())}, {length[0]:.3g} long"
-        raise ContentError(f"rotation: expected a unit quaternion [w, x, y, z], found {found}")
-    rows, moving = with_value(entries, "velocity")
-    velocity = np.full((len(entries), 3), np.nan)
-    known = numbers(
-        moving, "velocity", (2,), f"[vx, vy] of finite numbers up to {LARGEST:,.0f}, m/s, or null where it is not known"
-    )
-    velocity[rows] = np.column_stack([known, np.zeros(len(rows))])
-    size = numbers(
-        entries, "size", (3,), f"[width, length, height] of finite numbers from 0 to {LARGEST:,.0f}, metres", FROM_ZERO
-    )
+    wrong = np.flatnonzero(np.abs(length - 1) > _UNIT_TOLERANCE)
+    if len(wrong):
+        row = int(wrong[0])
+        places = [entry_place(token, number) for token, given in results.items() for number in range(len(given))]
+        found = f"{list(boxes[row].rotation)}, {length[row]:.3g} long"
+        raise ContentError(f"{places[row]}.rotation: expected a unit quaternion [w, x, y, z], found {found}")
+    velocity = _floats([box.velocity or _UNKNOWN for box in boxes], 2)
+    code = {name: number for number, name in enumerate(CATEGORIES)}
     return {
-        "center": numbers(entries, "translation", (3,), f"[x, y, z] of finite numbers up to {LARGEST:,.0f}, metres"),
-        "size": size[:, _LENGTH_FIRST],
+        "center": _floats([box.translation for box in boxes], 3),
+        "size": _floats([box.size for box in boxes], 3)[:, _LENGTH_FIRST],
         "rotation": rotation,
-        "velocity": velocity,
-        "category": choices(entries, "detection_name", CATEGORIES),
-        "score": numbers(entries, "detection_score", (), "a finite number", ANY_NUMBER),
+        "velocity": np.column_stack([velocity, np.where(np.isnan(velocity[:, :1]), np.nan, 0.0)]),
+        "category": np.array([code[box.detection_name] for box in boxes], dtype=np.int8),
+        "score": np.array([box.detection_score for box in boxes], dtype=np.float64),
     }
 
 
@@ -188,21 +205,20 @@ def detection_entries(token: str, detected: DetectedBoxes) -> list[dict[str, Any
 class EntryWriter:
     """Writes the file of accident or detection results from its header to its last sample."""
 
-    def __init__(self, path: Path, header: Header) -> None:
+    def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
         """Begin a new file."""
-        self._entries, self._columns = _ENTRIES[header.task]
+        self._kind = ENTRIES[header["task"]]
         self._count = 0
         self._file = path.open("w", encoding="utf-8", newline="\n")
-        for name, value in header.as_dict().items():
+        for name, value in header.items():
             self._file.write(f"{',' if self._file.tell() else '{'}\n{json.dumps(name)}: {json.dumps(value)}")
         self._file.write(',\n"results": {')
 
     def add(self, token: str, prediction: object) -> None:
         """Write the entries of a sample; raises ResultsError or ContentError, and nothing of it is written then."""
-        entries = self._entries(token, prediction)
-        self._columns(entries, [token] * len(entries))
-        line = f"{json.dumps(token)}: {json.dumps(entries, allow_nan=False)}"
-        self._file.write(f"{',' if self._count else ''}\n{line}")
+        entries = json.dumps(self._kind.entries(token, prediction))
+        read_entries(entries.encode(), self._kind.record)
+        self._file.write(f"{',' if self._count else ''}\n{json.dumps(token)}: {entries}")
         self._count += 1
 
     def finish(self) -> None:
@@ -215,6 +231,12 @@ class EntryWriter:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _floats(values: Sequence[Iterable[float]], *shape: int) -> FloatArray:
+    """(N, *shape) float64 of N flat tuples."""
+    flat = np.fromiter(chain.from_iterable(values), np.float64, len(values) * math.prod(shape))
+    return flat.reshape(len(values), *shape)
 
 
 def _accidents(token: str, prediction: object) -> list[dict[str, Any]]:
@@ -243,8 +265,25 @@ def _boxes(token: str, prediction: object) -> list[dict[str, Any]]:
     return detection_entries(token, prediction)
 
 
-_ENTRIES: Final[Mapping[str, tuple[Callable[[str, object], list[dict[str, Any]]], ReadColumns]]] = {
-    "accident": (_accidents, accident_columns),
-    "detection": (_boxes, detection_columns),
+@dataclass(frozen=True, slots=True)
+class EntryKind:
+    """What a task's entries are.
+
+    Attributes:
+        record: of an entry.
+        columns: makes the columns of the records by token.
+        prediction: of a sample, from the columns.
+        entries: of a sample's token and prediction, as a file has them.
+    """
+
+    record: type[msgspec.Struct]
+    columns: Callable[[Mapping[str, Any]], Columns]
+    prediction: Callable[[Entries, str], list[Accident] | DetectedBoxes]
+    entries: Callable[[str, object], list[dict[str, Any]]]
+
+
+ENTRIES: Final[Mapping[str, EntryKind]] = {
+    "accident": EntryKind(AccidentEntry, accident_columns, accidents_at, _accidents),
+    "detection": EntryKind(BoxEntry, detection_columns, boxes_at, _boxes),
 }
-"""Task → the functions that make entries of a prediction, and that check them when they are read."""
+"""By task."""

@@ -6,11 +6,13 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from deepaccident_devkit import json_text
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.reading import fault_text
+
+Kind = TypeVar("Kind")
 
 _SHOWN: Final = 80
 """Characters of a wrong value that an error shows."""
@@ -56,3 +58,18 @@ def parsed_json(content: bytes) -> Any:
         return json_text.parsed_json(content)
     except ValueError as error:
         raise ContentError(str(error)) from error
+
+
+def decoded(content: bytes | memoryview, kind: type[Kind]) -> Kind:
+    """The record that JSON text describes; raises ContentError that names the place of a fault.
+
+    A name that stands twice in an object is not noticed.
+    """
+    import msgspec
+
+    try:
+        return msgspec.json.decode(content, type=kind)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        said, _, place = str(error).partition(" - at `$")
+        place = place.strip(".`")
+        raise ContentError(f"{place}: " * bool(place) + said[:1].lower() + said[1:]) from error

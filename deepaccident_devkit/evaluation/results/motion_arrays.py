@@ -9,11 +9,11 @@ import io
 import math
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import IO, Final
+from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.archives import DAMAGED_ARCHIVE, read_member
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, read_member
 from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
@@ -29,6 +29,8 @@ _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 _WIDEST: Final = 8
 """Bytes of a number."""
 _LONGEST_HEADER: Final = 1 << 16
+_NPY: Final = b"\x93NUMPY\x01\x00"
+"""How an array's member begins."""
 
 
 def member_name(token: str, name: str) -> str:
@@ -71,33 +73,18 @@ def take_array(archive: zipfile.ZipFile, token: str, name: str, shape: Sequence[
             raise ContentError(f"expected shape {_shape_text(shape)}, which has at most {most:,} bytes, found {found}")
         try:
             content = read_member(archive, entry, "results")
-            return _array(io.BytesIO(content), len(content), shape, kinds)
-        except ContentError:
-            raise
+            array = array_of(content, "results")
         except DAMAGED_ARCHIVE as error:
             raise ContentError(f"cannot be read ({error}); the file is damaged, copy it again") from error
-
-
-def _array(file: IO[bytes], size: int, shape: Sequence[Length], kinds: str) -> AnyArray:
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):
-        raise ContentError(f"expected npy format 1.0, as numpy.save writes numbers, found {version}")
-    found, by_columns, dtype = np.lib.format.read_array_header_1_0(file)
-    if dtype.hasobject:
-        raise ContentError("holds Python objects, a pickle; store numbers")
-    if dtype.kind not in kinds:
-        expected = " or ".join(_KINDS[kind] for kind in kinds)
-        raise ContentError(f"expected {expected}, found {dtype}")
-    if len(found) != len(shape) or any(have not in _range(want) for want, have in zip(shape, found, strict=True)):
-        raise ContentError(f"expected shape {_shape_text(shape)}, found {found}")
-    length = math.prod(found) * dtype.itemsize
-    if size - file.tell() != length:
-        raise ContentError(f"expected {length} bytes of numbers, found {size - file.tell()}")
-    content = file.read(length)
-    if len(content) != length:
-        raise ContentError(f"expected {length} bytes of numbers, found only {len(content)}")
-    flat: AnyArray = np.frombuffer(content, dtype)
-    return flat.reshape(found[::-1]).T if by_columns else flat.reshape(found)
+        if not content.startswith(_NPY):
+            raise ContentError("expected npy format 1.0, as numpy.save writes numbers")
+        if array.dtype.kind not in kinds:
+            raise ContentError(f"expected {' or '.join(_KINDS[kind] for kind in kinds)}, found {array.dtype}")
+        if len(array.shape) != len(shape) or any(
+            n not in _range(want) for want, n in zip(shape, array.shape, strict=True)
+        ):
+            raise ContentError(f"expected shape {_shape_text(shape)}, found {array.shape}")
+        return array
 
 
 _KINDS: Final = {"u": "unsigned whole numbers", "i": "whole numbers", "f": "floats"}

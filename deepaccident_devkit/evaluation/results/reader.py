@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import copy
-import functools
 import gc
 import hashlib
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import NotAvailableError, ResultsError, TokenError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results.columns import Entries, ReadColumns, read_entries
-from deepaccident_devkit.evaluation.results.entries import accident_columns, accidents_at, boxes_at, detection_columns
-from deepaccident_devkit.evaluation.results.faults import at, parsed_json, told_of
-from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, Header, MotionForm, ResultsTask, read_header
+from deepaccident_devkit.evaluation.results.documents import read_document
+from deepaccident_devkit.evaluation.results.entries import ENTRIES, Entries
+from deepaccident_devkit.evaluation.results.faults import at, told_of
+from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, MotionForm
 from deepaccident_devkit.evaluation.results.motion_arrays import paths_of, stored_output, stored_paths
+from deepaccident_devkit.evaluation.results.records import MotionFile, ResultsTask
 from deepaccident_devkit.evaluation.results.shards import OpenShards, ShardCheck, check_shard, read_manifest
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, run_batch
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
+Read = TypeVar("Read")
 
 
 class EntryContents:
@@ -37,11 +38,11 @@ class EntryContents:
 
     form: MotionForm | None = None
 
-    def __init__(self, header: Header, results: object) -> None:
-        """Check all entries; raises ContentError."""
-        columns, self._at = _ENTRIES[header.task]
-        self.header = header
-        self._entries = read_entries(results, columns)
+    def __init__(self, task: ResultsTask, meta: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+        """Check what records cannot say; raises ContentError."""
+        self.task, self.meta = task, meta
+        self._kind = ENTRIES[task]
+        self._entries = Entries.read(results, self._kind.columns)
 
     @property
     def tokens(self) -> Collection[str]:
@@ -50,7 +51,7 @@ class EntryContents:
 
     def prediction(self, token: str) -> Prediction:
         """The entries of a sample."""
-        return self._at(self._entries, token)
+        return self._kind.prediction(self._entries, token)
 
     def check(self, _samples: Collection[str] | None, **_how: Any) -> None:
         """Nothing to do: all was checked when it was read."""
@@ -59,10 +60,12 @@ class EntryContents:
 class MotionContents:
     """Motion, in the shards of a folder."""
 
-    def __init__(self, path: Path, header: Header, document: Mapping[str, Any]) -> None:
+    task: ResultsTask = "motion"
+
+    def __init__(self, path: Path, meta: Mapping[str, Any], document: MotionFile) -> None:
         """Check the manifest; raises ContentError."""
         self._path, self._root = path, path.parent
-        self.header = header
+        self.meta = meta
         self._manifest = read_manifest(document, self._root)
         self.form: MotionForm = self._manifest.form
         self._shards = OpenShards(self._root)
@@ -74,20 +77,19 @@ class MotionContents:
 
     def prediction(self, token: str) -> MotionOutput:
         """The prediction of a sample; raises ResultsError."""
-        shard = self._manifest.shards[self._manifest.shard_of[token]]
-        with told_of(self._path), at(shard.file):
-            archive = self._shards.archive(shard)
-            with at(token):
-                return stored_output(archive, token, self.form)
+        return self._read(token, stored_output)
 
     def trajectories(self, token: str) -> dict[int, FloatArray]:
         """Those stored with a sample, or else those of its maps; raises ResultsError."""
+        stored = self._read(token, stored_paths)
+        return paths_of(self.prediction(token), self.form.labels) if stored is None else stored
+
+    def _read(self, token: str, read: Callable[..., Read]) -> Read:
         shard = self._manifest.shards[self._manifest.shard_of[token]]
         with told_of(self._path), at(shard.file):
             archive = self._shards.archive(shard)
             with at(token):
-                stored = stored_paths(archive, token, self.form)
-        return paths_of(self.prediction(token), self.form.labels) if stored is None else stored
+                return read(archive, token, self.form)
 
     def check(self, samples: Collection[str] | None, **how: Any) -> None:
         """Read every array, or those of the shards that begin with one of these samples, as `run_batch` is told.
@@ -102,25 +104,47 @@ class MotionContents:
 
 Contents = EntryContents | MotionContents
 """The content of a file; callers ask only for tokens that it has."""
+kept: Final[dict[tuple[Path, str], Contents]] = {}
+"""Path and fingerprint → contents of the files that this process parsed last."""
+_MOST_KEPT: Final = 4
 
 
-@functools.lru_cache(maxsize=4)
-def contents_of(path: Path, fingerprint: str) -> Contents:
-    """The contents of a file of known bytes; a process parses it once, however many copies of `Results` it gets.
+def contents_of(path: Path, fingerprint: str = "") -> tuple[Contents, str]:
+    """The contents of a file; a process parses it once, however many copies of `Results` it gets.
+
+    Args:
+        path: of the file.
+        fingerprint: of the bytes that it must have, which are not read again if they were parsed; empty for any.
+
+    Returns:
+        The contents, and the fingerprint of the file's bytes.
 
     Raises:
         ResultsError: it cannot be read, is not as its format says, or has other bytes now.
     """
+    contents = kept.get((path, fingerprint))
+    if contents is not None:
+        return contents, fingerprint
     with told_of(path):
         content = read_bytes(path, "results")
-    if content_fingerprint(content) != fingerprint:
+    found = content_fingerprint(content)
+    if fingerprint not in ("", found):
         raise ResultsError(f"{path}: was changed after it was opened; open it again")
-    with told_of(path), _collector_paused():
-        document = parsed_json(content)
-        header = read_header(document, path)
-        if header.task == "motion":
-            return MotionContents(path, header, document)
-        return EntryContents(header, document["results"])
+    contents = kept.get((path, found))
+    if contents is None:
+        with told_of(path), _collector_paused():
+            contents = _parsed(content, path)
+        while len(kept) >= _MOST_KEPT:
+            kept.pop(next(iter(kept)), None)
+        kept[path, found] = contents
+    return contents, found
+
+
+def _parsed(content: bytes, path: Path) -> Contents:
+    document, meta = read_document(content, path)
+    if isinstance(document, MotionFile):
+        return MotionContents(path, meta, document)
+    return EntryContents(document.task, meta, document.results)
 
 
 @contextmanager
@@ -138,12 +162,6 @@ def _collector_paused() -> Iterator[None]:
 def content_fingerprint(content: bytes) -> str:
     """The hash of a file's bytes, 32 hexadecimal digits."""
     return hashlib.blake2b(content, digest_size=16).hexdigest()
-
-
-_ENTRIES: Final[Mapping[str, tuple[ReadColumns, Callable[[Entries, str], Prediction]]]] = {
-    "accident": (accident_columns, accidents_at),
-    "detection": (detection_columns, boxes_at),
-}
 
 
 class Results:
@@ -186,7 +204,7 @@ class Results:
     @property
     def meta(self) -> dict[str, Any]:
         """The notes of the file's author; a copy."""
-        return copy.deepcopy(dict(self._contents.header.meta))
+        return copy.deepcopy(dict(self._contents.meta))
 
     @property
     def form(self) -> MotionForm | None:
@@ -254,7 +272,7 @@ class Results:
 
     @property
     def _contents(self) -> Contents:
-        return contents_of(self._file, self.fingerprint)
+        return contents_of(self._file, self.fingerprint)[0]
 
     def _with(self, token: str) -> Contents:
         contents = self._contents
@@ -274,9 +292,8 @@ def read_results(path: str | os.PathLike[str]) -> Results:
             wrong entry by its token and field.
     """
     file = _file_of(path_of(path, error=ResultsError).absolute())
-    with told_of(file):
-        fingerprint = content_fingerprint(read_bytes(file, "results"))
-    task = contents_of(file, fingerprint).header.task
+    contents, fingerprint = contents_of(file)
+    task = contents.task
     if task == "motion" and file.name != RESULTS_FILE:
         raise ResultsError(f"{file}: is the manifest of motion results; call it {RESULTS_FILE}, as others look for it")
     return Results(file.parent if task == "motion" else file, task, fingerprint)

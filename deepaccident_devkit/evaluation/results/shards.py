@@ -14,19 +14,14 @@ from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, Final
 
+import msgspec
+
 from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
-from deepaccident_devkit.evaluation.results.faults import ContentError, at, shown, told_of
-from deepaccident_devkit.evaluation.results.header import (
-    RESULTS_FILE,
-    Header,
-    MotionForm,
-    Stored,
-    check_fields,
-    check_token,
-)
+from deepaccident_devkit.evaluation.results.faults import ContentError, at, told_of
+from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, MotionForm, check_token
 from deepaccident_devkit.evaluation.results.motion_arrays import (
     PATHS,
     check_sample,
@@ -36,31 +31,9 @@ from deepaccident_devkit.evaluation.results.motion_arrays import (
     members,
     put_array,
 )
+from deepaccident_devkit.evaluation.results.records import MotionFile, Shard, Stored
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.reading import check_size, file_checksum, irregular_text
-
-SHARD_FIELDS: Final = ("file", "tokens", "bytes", "checksum")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Shard:
-    """An archive of some samples.
-
-    Attributes:
-        file: its path in the folder of the results, with `/`.
-        tokens: of its samples, in order.
-        bytes: its size.
-        checksum: BLAKE2b of its bytes, 16 bytes as hexadecimal digits (`reading.file_checksum`).
-    """
-
-    file: str
-    tokens: tuple[str, ...]
-    bytes: int
-    checksum: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """The shard as JSON holds it."""
-        return {"file": self.file, "tokens": list(self.tokens), "bytes": self.bytes, "checksum": self.checksum}
+from deepaccident_devkit.reading import check_size, file_checksum, irregular_text, shortened
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,60 +51,28 @@ class Manifest:
     shard_of: Mapping[str, int]
 
 
-def read_manifest(document: Mapping[str, Any], root: Path) -> Manifest:
+def read_manifest(document: MotionFile, root: Path) -> Manifest:
     """The manifest of the results in a folder, with a check that its shards exist and have their sizes.
 
     Raises:
         ContentError: names the field, or the shard.
     """
     with at("form"):
-        form = _form(document["form"])
-    told = document["shards"]
-    if not isinstance(told, list) or not told:
-        raise ContentError(f"shards: expected a list of at least one, found {shown(told)}")
-    shards: list[Shard] = []
+        form = MotionForm.from_record(document.form)
     shard_of: dict[str, int] = {}
     files: set[str] = set()
-    for number, each in enumerate(told):
-        with at(f"shards: entry {number}"):
-            shard = _shard(each)
+    for number, shard in enumerate(document.shards):
+        with at(f"shards[{number}]"):
             _check_file(shard, root, files)
         files.add(shard.file)
         for token in shard.tokens:
+            with at(f"shards[{number}].tokens"):
+                check_token(token)
             if token in shard_of:
-                others = "twice" if shard_of[token] == number else f"also in {shards[shard_of[token]].file}"
+                others = "twice" if shard_of[token] == number else f"also in {document.shards[shard_of[token]].file}"
                 raise ContentError(f"{shard.file}: {token}: stands there {others}; store a sample once")
             shard_of[token] = number
-        shards.append(shard)
-    return Manifest(form, tuple(shards), MappingProxyType(shard_of))
-
-
-def _form(told: object) -> MotionForm:
-    if not isinstance(told, dict):
-        raise ContentError(f"expected an object, found {shown(told)}")
-    check_fields(told, MotionForm.FIELDS)
-    try:
-        return MotionForm.from_dict(told)
-    except ResultsError as error:
-        raise ContentError(str(error)) from error
-
-
-def _shard(told: object) -> Shard:
-    if not isinstance(told, dict):
-        raise ContentError(f"expected an object, found {shown(told)}")
-    check_fields(told, SHARD_FIELDS)
-    file, tokens, size, checksum = (told[name] for name in SHARD_FIELDS)
-    if not isinstance(file, str) or not file.isprintable() or "\\" in file or not _is_inside(PurePosixPath(file)):
-        raise ContentError(f"file: expected a path inside the folder of the results, found {shown(file)}")
-    if not isinstance(tokens, list) or not tokens:
-        raise ContentError(f"tokens: expected a list of at least one token, found {shown(tokens)}")
-    with at("tokens"):
-        names = tuple(check_token(token) for token in tokens)
-    if type(size) is not int or size < 0:
-        raise ContentError(f"bytes: expected the file's size, a whole number, found {shown(size)}")
-    if not isinstance(checksum, str):
-        raise ContentError(f"checksum: expected a text, found {shown(checksum)}")
-    return Shard(file=file, tokens=names, bytes=size, checksum=checksum)
+    return Manifest(form, tuple(document.shards), MappingProxyType(shard_of))
 
 
 def _is_inside(path: PurePosixPath) -> bool:
@@ -140,6 +81,8 @@ def _is_inside(path: PurePosixPath) -> bool:
 
 def _check_file(shard: Shard, root: Path, others: AbstractSet[str]) -> None:
     """Whether a shard's file is there, as long as it should be, in the folder, and not another shard's too."""
+    if not shard.file.isprintable() or "\\" in shard.file or not _is_inside(PurePosixPath(shard.file)):
+        raise ContentError(f"file: expected a path inside the folder of the results, found {shortened(shard.file)!r}")
     path = root / shard.file
     if shard.file in others:
         raise ContentError(f"file: {shard.file} is another entry's too; list each file once")
@@ -238,7 +181,14 @@ class ShardWriter:
     """Writes the folder of motion results, the manifest last."""
 
     def __init__(
-        self, folder: Path, header: Header, *, grid: BevGrid | None, step: float, labels: str | None, store: Stored
+        self,
+        folder: Path,
+        header: Mapping[str, Any],
+        *,
+        grid: BevGrid | None,
+        step: float,
+        labels: str | None,
+        store: Stored,
     ) -> None:
         """Write into an empty folder; the other arguments are those of ResultsWriter."""
         self._folder, self._header = folder, header
@@ -274,9 +224,9 @@ class ShardWriter:
         if self._grid is None or not self._shards:
             raise ResultsError("no prediction was added; results of no sample cannot be read")
         told = {
-            **self._header.as_dict(),
+            **self._header,
             "form": self._form(self._grid, self._predictions, self._frames).as_dict(),
-            "shards": [shard.as_dict() for shard in self._shards],
+            "shards": msgspec.to_builtins(self._shards),
         }
         (self._folder / RESULTS_FILE).write_bytes(f"{json.dumps(told, indent=1)}\n".encode())
 

@@ -14,14 +14,8 @@ from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results.entries import EntryWriter
 from deepaccident_devkit.evaluation.results.faults import ContentError
-from deepaccident_devkit.evaluation.results.header import (
-    Header,
-    MotionForm,
-    ResultsTask,
-    Stored,
-    check_token,
-    json_meta,
-)
+from deepaccident_devkit.evaluation.results.header import MotionForm, check_token, json_meta
+from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, ResultsTask, Stored
 from deepaccident_devkit.evaluation.results.shards import ShardWriter
 from deepaccident_devkit.files import path_of, replacing, replacing_folder
 from deepaccident_devkit.geometry import BevGrid
@@ -82,11 +76,12 @@ class ResultsWriter:
         self.task = choice("task", task, get_args(ResultsTask))
         self.path = path_of(path).absolute()
         try:
-            self._header = Header(task=self.task, meta=json_meta({} if meta is None else meta))
+            told = json_meta({} if meta is None else meta)
         except ContentError as error:
             raise ResultsError(str(error)) from error
-        self._motion: dict[str, Any] = {"grid": grid, "step": step, "labels": labels, "store": store}
-        MotionForm(stored=store, grid=grid or BevGrid(), predictions=1, frames=1, step=step, labels=labels)
+        self._header = {"format": FORMAT, "version": FORMAT_VERSION, "task": self.task, "meta": told}
+        form = MotionForm(stored=store, grid=grid or BevGrid(), predictions=1, frames=1, step=step, labels=labels)
+        self._motion: dict[str, Any] = {"grid": grid, "step": form.step, "labels": form.labels, "store": form.stored}
         self._check_free()
         self._tokens: set[str] = set()
         self._stack = ExitStack()

@@ -6,6 +6,7 @@ Both formats have the boxes in the right-handed world, with width, length, heigh
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections import Counter
@@ -17,10 +18,15 @@ import numpy as np
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes
-from deepaccident_devkit.evaluation.results.columns import read_entries
-from deepaccident_devkit.evaluation.results.entries import boxes_at, detection_columns
-from deepaccident_devkit.evaluation.results.faults import ContentError, shown
-from deepaccident_devkit.evaluation.results.header import FORMAT
+from deepaccident_devkit.evaluation.results.entries import (
+    Entries,
+    boxes_at,
+    detection_columns,
+    entry_place,
+    read_entries,
+)
+from deepaccident_devkit.evaluation.results.faults import ContentError, at, shown
+from deepaccident_devkit.evaluation.results.records import FORMAT, BoxEntry
 from deepaccident_devkit.export.keyframes import KEY_STEP
 from deepaccident_devkit.export.nuscenes.names import token
 from deepaccident_devkit.files import path_of
@@ -33,6 +39,7 @@ if TYPE_CHECKING:
 
 OTHER_CLASSES: Final = ("bus", "trailer", "construction_vehicle", "barrier", "traffic_cone")
 """nuScenes' detection classes that this dataset does not have."""
+_IGNORED: Final = ("attribute_name", "ego_translation", "num_pts")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,8 +89,14 @@ def _read(document: object, ours: Mapping[str, str]) -> NuScenesDetections:
     meta, results = document.get("meta", {}), document.get("results")
     if not isinstance(meta, dict):
         raise ContentError(f"meta: expected an object, found {shown(meta)}")
+    if not isinstance(results, dict) or not results:
+        raise ContentError(f"results: expected an object, sample token to list of boxes, found {shown(results)}")
     left_out = _take_our_classes(results)
-    entries = read_entries(results, detection_columns)
+    records = {}
+    for theirs, given in results.items():
+        with at(entry_place(theirs)):
+            records[theirs] = read_entries(json.dumps(given).encode(), BoxEntry)
+    entries = Entries.read(records, detection_columns)
     boxes = {}
     for theirs in entries.number:
         if theirs not in ours:
@@ -95,17 +108,19 @@ def _read(document: object, ours: Mapping[str, str]) -> NuScenesDetections:
     return NuScenesDetections(boxes=boxes, left_out=dict(sorted(counts.items())), meta=meta)
 
 
-def _take_our_classes(results: object) -> dict[str, dict[int, str]]:
+def _take_our_classes(results: dict[str, Any]) -> dict[str, dict[int, str]]:
     """Give boxes our classes, those of other classes any, and null for a velocity of NaN; what is wrong stays.
 
     Returns:
         Token → number of each box that is to be left out, and its class.
     """
     left_out: dict[str, dict[int, str]] = {}
-    for theirs, given in results.items() if isinstance(results, dict) else ():
+    for theirs, given in results.items():
         for number, entry in enumerate(given if isinstance(given, list) else ()):
             if not isinstance(entry, dict):
                 continue
+            for ignored in _IGNORED:  # NaN may stand there
+                entry.pop(ignored, None)
             name, velocity = entry.get("detection_name"), entry.get("velocity")
             if name in OTHER_CLASSES:
                 left_out.setdefault(theirs, {})[number] = name

@@ -17,7 +17,6 @@ from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.results.entries import detection_entries
 from deepaccident_devkit.export.nuscenes.detections import OTHER_CLASSES, results_from_nuscenes
 from deepaccident_devkit.export.nuscenes.names import token
-from deepaccident_devkit.taxonomy import CATEGORIES
 
 OURS = {"car": "car", "truck": "truck", "bicycle": "cyclist", "motorcycle": "motorcycle", "pedestrian": "pedestrian"}
 
@@ -88,6 +87,7 @@ def test_fields_mean_what_they_mean_in_nuscenes(da_motion: DeepAccident, tmp_pat
     names = [*OURS, "van", "cyclist", *OTHER_CLASSES, "bus"]
     given = [entry(name, detection_score=number / 16) for number, name in enumerate(names)]
     given[1]["velocity"] = [float("nan"), float("nan")]
+    given[1]["ego_translation"] = [float("nan")] * 3
     file = written(tmp_path / "nuscenes.json", {other: given, sample: []})
     found = results_from_nuscenes(da_motion, file)
     assert list(found.boxes) == [other, sample]
@@ -112,16 +112,16 @@ REMEDY = r"; give nuScenes detections, .* of the nuScenes export of "
     [
         ("", "is no JSON"),
         ("[]", r"expected a JSON object, found \[\]"),
-        ('{"meta": {}}', "results: expected an object, sample token to list of entries, found null"),
+        ('{"meta": {}}', "results: expected an object, sample token to list of boxes, found null"),
         ('{"meta": 3, "results": {}}', "meta: expected an object, found 3"),
-        ('{"results": {}}', "results: holds no sample"),
+        ('{"results": {}}', r"results: expected an object, .*, found {}"),
         ('{"format": "DeepAccident results"}', "is in DeepAccident's own format, which `deepaccident evaluate` takes"),
         (
             '{"results": {"fd84": []}}',
             "results: fd84: is no sample",
         ),
-        ('{"results": {"fd84": {}}}', "expected a list of entries"),
-        ('{"results": {"fd84": [3]}}', "entry 0: expected an object, found 3"),
+        ('{"results": {"fd84": {}}}', "results of 'fd84': expected `array`"),
+        ('{"results": {"fd84": [3]}}', r"results of 'fd84': \[0\]: expected `object`"),
     ],
 )
 def test_what_is_no_file_of_this_export(da_motion: DeepAccident, tmp_path: Path, content: str, told: str) -> None:
@@ -134,20 +134,20 @@ def test_what_is_no_file_of_this_export(da_motion: DeepAccident, tmp_path: Path,
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"translation": [0.0, float("nan"), 0.0]}, r"translation: expected \[x, y, z\] of finite numbers"),
-        ({"rotation": [2.0, 0.0, 0.0, 0.0]}, "rotation: expected a unit quaternion"),
-        ({"detection_name": "tram"}, f'detection_name: expected one of {", ".join(CATEGORIES)}, found "tram"'),
-        ({"detection_name": ["car"]}, r"detection_name: expected one of .*, found \[\"car\"\]"),
-        ({"velocity": "fast"}, r"velocity: expected \[vx, vy\]"),
-        ({"sample_token": "another"}, "sample_token: expected .*, under which it stands"),
-        ({"tracking_id": 3}, "tracking_id: is no field of the format"),
+        ({"translation": [0.0, float("nan"), 0.0]}, "entry 2: translation: entry 1: expected a finite number"),
+        ({"rotation": [2.0, 0.0, 0.0, 0.0]}, r"\[2\].rotation: expected a unit quaternion"),
+        ({"detection_name": "tram"}, r"\[2\].detection_name: invalid enum value 'tram'"),
+        ({"detection_name": ["car"]}, r"\[2\].detection_name: expected `str`"),
+        ({"velocity": "fast"}, r"\[2\].velocity: expected `array"),
+        ({"sample_token": "another"}, r"\[2\].sample_token: expected .*, under which it stands"),
+        ({"tracking_id": 3}, r"\[2\]: object contains unknown field `tracking_id`"),
     ],
 )
 def test_the_first_wrong_box_is_named(
     da_motion: DeepAccident, tmp_path: Path, sample: str, change: dict[str, object], told: str
 ) -> None:
     path = written(tmp_path / "nuscenes.json", {sample: [entry("bus"), entry(), entry(**{"name": "car", **change})]})
-    with pytest.raises(ResultsError, match=f"results: {token('sample', sample)}: entry 2: {told}.*{REMEDY}"):
+    with pytest.raises(ResultsError, match=f"results of '{token('sample', sample)}': {told}.*{REMEDY}"):
         results_from_nuscenes(da_motion, path)
 
 

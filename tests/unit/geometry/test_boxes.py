@@ -200,8 +200,6 @@ def test_gap_by_hand(square: Boxes) -> None:
     sizes = [[2, 2, 2], [2, 2, 2], [2, 2, 2], [9, 0.5, 1], [2, 1, 1], [1, 1, 1]]
     others = Boxes.from_arrays(centers, sizes, [0, np.pi, np.pi / 4, 0.1, 0, 0], frame="lidar")
     assert_allclose(square.distance_bev(others), [[2, np.hypot(2, 3), 2 - np.sqrt(2), 0, 0, 0]], atol=1e-12)
-    assert_allclose(square.center_distance(others), [[4, np.hypot(4, 5), 3, 0, 2, 0]])
-    assert_allclose(square.center_distance(others, in_3d=True), [[4, np.hypot(4, 5), 3, 0, 2, 9]])
 
 
 def test_tilted_boxes_count_as_if_upright(square: Boxes) -> None:
@@ -231,7 +229,7 @@ def test_boxes_that_are_nowhere_have_no_gap_and_hold_nothing(square: Boxes, colu
         assert_array_equal(nowhere.iou_bev(square), [[0]])
 
 
-@pytest.mark.parametrize("compare", ["iou_bev", "iou_3d", "distance_bev", "center_distance"])
+@pytest.mark.parametrize("compare", ["iou_bev", "iou_3d", "distance_bev"])
 def test_comparing_needs_one_frame_with_a_ground(two: Boxes, compare: str) -> None:
     none = two.select([])
     assert getattr(two, compare)(none).shape == (2, 0)
@@ -242,9 +240,6 @@ def test_comparing_needs_one_frame_with_a_ground(two: Boxes, compare: str) -> No
     in_camera = two.transform(SE3.identity(), "Camera_Back")
     with pytest.raises(GeometryError, match=r"Camera_Back have no ground plane, .*; transform them to ego or lidar"):
         getattr(in_camera, compare)(in_camera)
-    assert two.center_distance(two, in_3d=True).shape == (2, 2)
-    with pytest.raises(GeometryError, match="cannot be compared"):
-        two.center_distance(elsewhere, in_3d=True)
 
 
 def test_counts_are_those_of_contains(two: Boxes) -> None:
@@ -308,7 +303,7 @@ def test_the_callers_arrays_are_copied() -> None:
 
 
 def test_other_things_than_boxes_and_transforms_are_refused(two: Boxes) -> None:
-    for compare in (two.iou_bev, two.iou_3d, two.distance_bev, two.center_distance):
+    for compare in (two.iou_bev, two.iou_3d, two.distance_bev):
         with pytest.raises(GeometryError, match="other: expected Boxes, found NoneType"):
             compare(None)
     with pytest.raises(GeometryError, match=r"a Box is one row of Boxes, found list; boxes\[0\] picks one"):

@@ -78,19 +78,6 @@ def test_remove_close_cuts_a_circle_around_the_sensor(cloud: LidarPointCloud) ->
         cloud.remove_close(-1)
 
 
-def test_the_first_point_of_a_voxel_stays(cloud: LidarPointCloud) -> None:
-    assert rows(cloud.voxel_downsample(1)) == [0, 1, 3, 4]
-    assert rows(cloud.voxel_downsample(0.1)) == [0, 1, 2, 3, 4]
-    assert rows(cloud.voxel_downsample(100)) == [0, 3, 4]  # voxels meet at the origin
-    assert len(cloud.crop(x=(90, 91)).voxel_downsample(1)) == 0
-    with pytest.raises(GeometryError, match="size: expected metres above 0, found 0"):
-        cloud.voxel_downsample(0)
-    with pytest.raises(GeometryError, match="voxels of 1e-09 m are too many; give a larger size"):
-        cloud.voxel_downsample(1e-9)
-    with pytest.raises(GeometryError, match=r"NaN or infinity, .* select the finite points first"):
-        LidarPointCloud(np.array([[np.nan, 0, 0]]), np.zeros(1)).voxel_downsample(1)
-
-
 def test_select_picks_points(cloud: LidarPointCloud) -> None:
     assert rows(cloud.select([4, 0])) == [4, 0]
     assert rows(cloud.select([])) == []
@@ -111,7 +98,7 @@ def test_clouds_of_one_frame_join(cloud: LidarPointCloud) -> None:
 def test_points_keep_their_sources(cloud: LidarPointCloud, tmp_path: Path) -> None:
     of_two = replace(cloud, agent=[0, 0, 4, 4, 4], time_lag=[0, 0, 0.1, 0.1, 0.2])
     assert (of_two.agent.dtype, of_two.time_lag.dtype) == (np.int8, np.float32)
-    part = of_two.transform(SE3.identity(), "ego").crop(x=(1, 11)).voxel_downsample(1)
+    part = of_two.transform(SE3.identity(), "ego").crop(x=(1, 11)).select([0, 2])
     assert rows(part) == [1, 4]
     part.save(tmp_path / "part.npz")
     for each in (part, LidarPointCloud.load(tmp_path / "part.npz"), concatenate([part], "ego")):
@@ -155,8 +142,6 @@ def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
     for wrong in ("near", None, [1.0]):
         with pytest.raises(GeometryError, match="radius: expected metres from 0 on, found"):
             cloud.remove_close(wrong)
-        with pytest.raises(GeometryError, match="size: expected metres above 0, found"):
-            cloud.voxel_downsample(wrong)
     with pytest.raises(GeometryError, match=r"grid: expected a BevGrid, found \(-50, 50\); ranges go by name"):
         cloud.crop((-50, 50))
     with pytest.raises(GeometryError, match="target_from_source: expected an SE3, found NoneType"):

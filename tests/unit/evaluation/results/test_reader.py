@@ -39,42 +39,37 @@ def with_entry(kind: str, **changes: Any) -> Document:
     return told
 
 
-HEADERS: dict[str, tuple[Any, ...]] = {
-    "another format": ({"format": "COCO"}, 'format: expected "DeepAccident results", found "COCO"'),
+HEADERS: dict[str, tuple[Document, str]] = {
+    "another format": ({"format": "COCO"}, "format: "),
     "no format": ({"format": ...}, 'has no "format" (a nuScenes results file?); put "format"'),
-    "no version": ({"version": ...}, "version: is missing"),
+    "no version": ({"version": ...}, "required field `version`"),
     "a newer version": ({"version": 2}, "version: a newer results format (2, this devkit's is 1); update the devkit"),
     "an older version": ({"version": 0}, "version: an older results format (0, this devkit's is 1); write it again"),
-    "a version that is a text": ({"version": "1"}, 'version: expected 1, found "1"'),
-    "a version that is true": ({"version": True}, "version: expected 1, found true"),
-    "no task": ({"task": ...}, "task: is missing"),
-    "an unknown task": ({"task": "tracking"}, 'task: expected one of motion, accident, detection, found "tracking"'),
-    "a list of tasks": (
-        {"task": ["accident"]},
-        'task: expected one of motion, accident, detection, found ["accident"]',
-    ),
-    "no meta": ({"meta": ...}, "meta: is missing"),
-    "meta that is a text": ({"meta": "mine"}, 'meta: expected an object, {} to say nothing, found "mine"'),
-    "no results": ({"results": ...}, "results: is missing"),
-    "an unknown field": ({"result": {}}, "result: is no field of the format"),
-    "results in a list": ({"results": []}, "results: expected an object, sample token to list of entries, found []"),
-    "no sample": ({"results": {}}, "results: holds no sample"),
+    "a version that is a text": ({"version": "1"}, "version: "),
+    "a version that is true": ({"version": True}, "version: "),
+    "no task": ({"task": ...}, "required field `task`"),
+    "an unknown task": ({"task": "tracking"}, "task: "),
+    "a list of tasks": ({"task": ["accident"]}, "task: "),
+    "another task": ({"task": "detection"}, f"results of '{FIRST}': [0]: "),
+    "no meta": ({"meta": ...}, "required field `meta`"),
+    "meta that is a text": ({"meta": "mine"}, "meta: expected a mapping"),
+    "no results": ({"results": ...}, "required field `results`"),
+    "an unknown field": ({"result": {}}, "unknown field `result`"),
+    "results in a list": ({"results": []}, "results: expected `object`"),
+    "no sample": ({"results": {}}, "results: expected `object` of length >= 1"),
     "an empty token": ({"results": {"": []}}, "results: expected a sample's token"),
-    "a token of a parent": ({"results": {"a/../b": []}}, "results: expected a sample's token", "'a/../b'"),
-    "null for no accident": ({"results": {FIRST: None}}, f"results: {FIRST}: expected a list of entries, [] for none"),
-    "an object for a list": ({"results": {FIRST: plain.accident()}}, f"results: {FIRST}: expected a list of entries"),
-    "an entry that is a number": (
-        {"results": {FIRST: [], SECOND: [3]}},
-        f"results: {SECOND}: entry 0: expected an object",
-    ),
+    "a token of a parent": ({"results": {"a/../b": []}}, "results: expected a sample's token, <scenario_type>"),
+    "null for no accident": ({"results": {FIRST: None}}, f"results of '{FIRST}': expected `array`"),
+    "an object for a list": ({"results": {FIRST: plain.accident()}}, f"results of '{FIRST}': expected `array`"),
+    "an entry that is a number": ({"results": {FIRST: [], SECOND: [3]}}, f"results of '{SECOND}': [0]: expected"),
 }
 
 
 @pytest.mark.parametrize("kind", HEADERS)
 def test_headers(tmp_path: Path, kind: str) -> None:
-    changes, *words = HEADERS[kind]
+    changes, words = HEADERS[kind]
     told = {name: value for name, value in {**plain.accidents(), **changes}.items() if value is not ...}
-    refused(plain.write_json(tmp_path / "accident.json", told), "accident.json: ", *words)
+    refused(plain.write_json(tmp_path / "accident.json", told), "accident.json: ", words)
 
 
 TEXTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
@@ -86,8 +81,8 @@ TEXTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "Infinity": ("[13.0,", "[-Infinity,", (f"{FIRST}: entry 0: positions: entry 1: entry 0: ", "found Infinity")),
     "NaN in meta": ('"plain"', "[NaN]", ("meta: method: entry 0: expected a finite number, found NaN",)),
     "beyond floats in meta": ('"plain"', "1e999", ("meta: cannot be written as JSON",)),
-    "beyond floats": ('"time": 0', '"time": 1e999', (f"results: {FIRST}: entry 1: time: expected a finite number",)),
-    "whole beyond floats": ('"time": 0', f'"time": 1{"0" * 400}', (f"results: {FIRST}: entry 1: time: expected",)),
+    "beyond floats": ('"time": 0', '"time": 1e999', (f"results of '{FIRST}': [1].time: number out of range",)),
+    "whole beyond floats": ('"time": 0', f'"time": 1{"0" * 400}', (f"results of '{FIRST}': [1].time: ",)),
     "thousands of digits": ('"time": 0', f'"time": 1{"0" * 9000}', ("accident.json: ",)),
     "other bytes than UTF-8": ('"plain"', '"\udcff"', ("is no JSON (",)),
     "half a character in meta": (
@@ -116,34 +111,25 @@ def test_what_is_no_json(tmp_path: Path, kind: str) -> None:
 
 
 ACCIDENTS: dict[str, tuple[dict[str, Any], str]] = {
-    "no positions": ({"positions": ...}, "positions: is missing (expected positions, time, score)"),
-    "one position": ({"positions": [[1, 2]]}, "positions: expected two points [[x, y], [x, y]]"),
-    "positions in space": ({"positions": [[1, 2, 0], [3, 4, 0]]}, "positions: expected two points"),
-    "positions that are flat": ({"positions": [1, 2, 3, 4]}, "positions: expected two points"),
-    "a position that is a text": (
-        {"positions": [[1, "2"], [3, 4]]},
-        "positions: expected two points",
-    ),
-    "a position that is true": ({"positions": [[1, True], [3, 4]]}, "positions: expected two points"),
-    "a time that is a text": (
-        {"time": "soon"},
-        'time: expected a finite number of seconds from 0 to 1,000,000, found "soon"',
-    ),
-    "a time of the past": ({"time": -0.5}, "time: expected a finite number of seconds from 0 to 1,000,000, found -0.5"),
-    "positions whose squares overflow": ({"positions": [[1e200, 0], [0, 0]]}, "positions: expected two points"),
-    "a time beyond all recordings": ({"time": 1.7e308}, "time: expected a finite number of seconds from 0"),
-    "no time": ({"time": ...}, "time: is missing"),
-    "null for a score": ({"score": None}, "score: expected a finite number, found null"),
-    "a score that is true": ({"score": True}, "score: expected a finite number, found true"),
-    "an id that is a float": ({"ids": [1236.0, 1240]}, "ids: expected two whole numbers, or null"),
-    "an id that is true": ({"ids": [True, 1240]}, "ids: expected two whole numbers, or null"),
-    "an id that is a text": ({"ids": ["1236", 1240]}, "ids: expected two whole numbers, or null"),
-    "three ids": (
-        {"ids": [1, 2, 3]},
-        "ids: expected two whole numbers, or null where they are not known, found [1, 2, 3]",
-    ),
-    "an id of 70 bits": ({"ids": [2**70, 1]}, "ids: expected two whole numbers"),
-    "a misspelt field": ({"id": [1, 2]}, "id: is no field of the format (expected positions, time, score, ids)"),
+    "no positions": ({"positions": ...}, ": object missing required field `positions`"),
+    "one position": ({"positions": [[1, 2]]}, ".positions: expected `array` of length 2"),
+    "positions in space": ({"positions": [[1, 2, 0], [3, 4, 0]]}, ".positions[0]: expected `array` of length 2"),
+    "positions that are flat": ({"positions": [1, 2, 3, 4]}, ".positions[0]: expected `array`"),
+    "a position that is a text": ({"positions": [[1, "2"], [3, 4]]}, ".positions[0][1]: expected `float`"),
+    "a position that is true": ({"positions": [[1, True], [3, 4]]}, ".positions[0][1]: expected `float`"),
+    "a time that is a text": ({"time": "soon"}, ".time: expected `float`"),
+    "a time of the past": ({"time": -0.5}, ".time: expected `float` >= 0"),
+    "positions whose squares overflow": ({"positions": [[1e200, 0], [0, 0]]}, ".positions[0][0]: expected `float` <="),
+    "a time beyond all recordings": ({"time": 1.7e308}, ".time: expected `float` <= 1000000"),
+    "no time": ({"time": ...}, ": object missing required field `time`"),
+    "null for a score": ({"score": None}, ".score: expected `float`"),
+    "a score that is true": ({"score": True}, ".score: expected `float`"),
+    "an id that is a float": ({"ids": [1236.0, 1240]}, ".ids[0]: expected `int`"),
+    "an id that is true": ({"ids": [True, 1240]}, ".ids[0]: expected `int`"),
+    "an id that is a text": ({"ids": ["1236", 1240]}, ".ids[0]: expected `int`"),
+    "three ids": ({"ids": [1, 2, 3]}, ".ids: expected `array` of length 2"),
+    "an id of 70 bits": ({"ids": [2**70, 1]}, ".ids[0]: expected `int` <="),
+    "a misspelt field": ({"id": [1, 2]}, ": object contains unknown field `id`"),
 }
 
 
@@ -151,34 +137,28 @@ ACCIDENTS: dict[str, tuple[dict[str, Any], str]] = {
 def test_accidents(tmp_path: Path, kind: str) -> None:
     changes, words = ACCIDENTS[kind]
     path = plain.write_json(tmp_path / "accident.json", with_entry("accident", **changes))
-    refused(path, f"results: {FIRST}: entry 1: {words}")
+    refused(path, f"results of '{FIRST}': [1]{words}", "schema/results/README.md")
 
 
 BOXES: dict[str, tuple[dict[str, Any], str]] = {
     "another sample's token": (
         {"sample_token": SECOND},
-        f"sample_token: expected {FIRST}, under which it stands, found",
+        f".sample_token: expected {FIRST}, under which it stands, found '{SECOND}'",
     ),
-    "no token": ({"sample_token": ...}, "sample_token: is missing"),
-    "a translation on the ground": ({"translation": [1, 2]}, "translation: expected [x, y, z] of finite numbers"),
-    "a translation beyond the world": ({"translation": [1e9, 2, 3]}, "translation: expected [x, y, z] of finite num"),
-    "a negative size": ({"size": [1, -2, 1]}, "size: expected [width, length, height] of finite numbers from 0"),
-    "a yaw": ({"rotation": 0.3}, "rotation: expected a unit quaternion [w, x, y, z], found 0.3"),
-    "a quaternion of length 2": ({"rotation": [2, 0, 0, 0]}, "rotation: expected a unit quaternion"),
-    "a quaternion beyond floats": ({"rotation": [1e300, 0, 0, 0]}, "rotation: expected a unit quaternion"),
-    "null in a velocity": (
-        {"velocity": [None, None]},
-        "velocity: expected [vx, vy] of finite numbers up to 1,000,000, m/s",
-    ),
-    "a velocity in space": ({"velocity": [1, 2, 0]}, "velocity: expected [vx, vy]"),
-    "an unknown category": (
-        {"detection_name": "bus"},
-        "detection_name: expected one of car, truck",
-    ),
-    "a category's number": ({"detection_name": 0}, "detection_name: expected one of car, truck"),
-    "a list of categories": ({"detection_name": ["car"]}, "detection_name: expected one of car, truck"),
-    "a score that is a text": ({"detection_score": "0.9"}, 'detection_score: expected a finite number, found "0.9"'),
-    "an unknown field": ({"tracking_id": "3"}, "tracking_id: is no field of the format"),
+    "no token": ({"sample_token": ...}, ": object missing required field `sample_token`"),
+    "a translation on the ground": ({"translation": [1, 2]}, ".translation: expected `array` of length 3"),
+    "a translation beyond the world": ({"translation": [1e9, 2, 3]}, ".translation[0]: expected `float` <= 1000000"),
+    "a negative size": ({"size": [1, -2, 1]}, ".size[1]: expected `float` >= 0"),
+    "a yaw": ({"rotation": 0.3}, ".rotation: expected `array`"),
+    "a quaternion of length 2": ({"rotation": [2, 0, 0, 0]}, ".rotation: expected a unit quaternion [w, x, y, z]"),
+    "a quaternion beyond floats": ({"rotation": [1e300, 0, 0, 0]}, ".rotation: expected a unit quaternion"),
+    "null in a velocity": ({"velocity": [None, None]}, ".velocity[0]: expected `float`"),
+    "a velocity in space": ({"velocity": [1, 2, 0]}, ".velocity: expected `array` of length 2"),
+    "an unknown category": ({"detection_name": "bus"}, ".detection_name: invalid enum value 'bus'"),
+    "a category's number": ({"detection_name": 0}, ".detection_name: expected `str`"),
+    "a list of categories": ({"detection_name": ["car"]}, ".detection_name: expected `str`"),
+    "a score that is a text": ({"detection_score": "0.9"}, ".detection_score: expected `float`"),
+    "an unknown field": ({"tracking_id": "3"}, ": object contains unknown field `tracking_id`"),
 }
 
 
@@ -186,7 +166,7 @@ BOXES: dict[str, tuple[dict[str, Any], str]] = {
 def test_boxes(tmp_path: Path, kind: str) -> None:
     changes, words = BOXES[kind]
     path = plain.write_json(tmp_path / "detection.json", with_entry("detection", **changes))
-    refused(path, f"results: {FIRST}: entry 1: {words}")
+    refused(path, f"results of '{FIRST}': [1]{words}", "schema/results/README.md")
 
 
 def test_the_first_of_several_wrong_entries_is_named(tmp_path: Path) -> None:
@@ -195,18 +175,64 @@ def test_the_first_of_several_wrong_entries_is_named(tmp_path: Path) -> None:
     for token, number in ((tokens[40], 3), (tokens[41], 0), (tokens[97], 4)):
         results[token][number]["score"] = "high"
     path = plain.write_json(tmp_path / "accident.json", plain.document("accident", results=results))
-    refused(path, f'results: {tokens[40]}: entry 3: score: expected a finite number, found "high"')
+    refused(path, f"results of '{tokens[40]}': [3].score: expected `float`")
+
+
+IGNORED: dict[str, tuple[str, str]] = {
+    "a name twice": ('{"a": 1, "a": 2}', "attribute_name: a: stands there twice"),
+    "NaN": ("[NaN]", "attribute_name: entry 0: expected a finite number, found NaN"),
+    "half a character": ('"\\ud83d"', "attribute_name: expected characters, found half of one"),
+    "nested deeply": ("[" * 70 + "]" * 70, "nested more than 64 levels deep"),
+    "other bytes than UTF-8": ('"\udcff"', "is no JSON ("),
+    "another field twice": ('1, "velocity": null', "velocity: stands there twice"),
+}
+
+
+@pytest.mark.parametrize("kind", IGNORED)
+def test_what_is_ignored_is_json_too(tmp_path: Path, kind: str) -> None:
+    value, words = IGNORED[kind]
+    told, path = plain.detections(), tmp_path / "detection.json"
+    told["results"][FIRST][1]["attribute_name"] = 12345
+    text = json.dumps(told)
+    assert len(read_results(plain.write_json(path, told))) == 3
+    path.write_text(text.replace("12345", '{"a:": [":"]}'), encoding="utf-8")
+    assert len(read_results(path)) == 3
+    path.write_text(text.replace("12345", value), encoding="utf-8", errors="surrogateescape")
+    refused(path, words)
+
+
+def test_colons_in_tokens_and_meta(tmp_path: Path) -> None:
+    told = plain.document("detection", results={"a:b/é": [plain.box("a:b/é")]}) | {"meta": {"u:": "http://a:1"}}
+    for ascii_alone in (True, False):
+        path = tmp_path / "detection.json"
+        path.write_text(json.dumps(told, ensure_ascii=ascii_alone), encoding="utf-8")
+        results = read_results(path)
+        assert (results.tokens, results.meta) == (("a:b/é",), {"u:": "http://a:1"})
+
+
+def test_numbers_are_read_to_the_last_bit(tmp_path: Path) -> None:
+    """As Python reads them, in every way in which they can be written."""
+    source = np.random.default_rng(0)
+    values = np.concatenate([source.normal(0, 1e3, 1500), source.integers(0, 2**62, 1500).view(np.float64)])
+    texts = [f"{value:.{digits}{how}}" for value in values.tolist() for digits in (15, 17, 25) for how in "eg"]
+    texts += ["-0", "-0.0", "1E+2", "5e-324", "2.2250738585072011e-308", "9007199254740993", "18446744073709551616"]
+    entries = ",".join(f'{{"positions": [[0, 0], [0, 0]], "time": 0, "score": {text}}}' for text in texts)
+    text = json.dumps(plain.document("accident", results={FIRST: 0})).replace(": 0}", f": [{entries}]}}")
+    (tmp_path / "accident.json").write_text(text, encoding="utf-8")
+    read: Any = read_results(tmp_path / "accident.json").prediction(FIRST)
+    expected = np.array([float(json.loads(text)) for text in texts])
+    np.testing.assert_array_equal(np.array([each.score for each in read]).view(np.int64), expected.view(np.int64))
 
 
 MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
-    "no form": (lambda told: told.pop("form"), ("form: is missing",)),
-    "a form that is a text": (lambda told: told.update(form="instances"), ("form: expected an object",)),
-    "no step": (lambda told: told["form"].pop("step"), ("form: step: is missing",)),
+    "no form": (lambda told: told.pop("form"), ("required field `form`",)),
+    "a form that is a text": (lambda told: told.update(form="instances"), ("form: expected `object`",)),
+    "no step": (lambda told: told["form"].pop("step"), ("form: object missing required field `step`",)),
     "a step of no frame": (lambda told: told["form"].update(step=0.25), ("form: step: expected seconds",)),
-    "a step that is a text": (lambda told: told["form"].update(step="0.5"), ("form: step: expected a number",)),
-    "no prediction": (lambda told: told["form"].update(predictions=0), ("form: predictions: expected a whole",)),
-    "half a frame": (lambda told: told["form"].update(frames=2.5), ("form: frames: expected a whole number from 1",)),
-    "true frames": (lambda told: told["form"].update(frames=True), ("form: frames: expected a whole number from 1",)),
+    "a step that is a text": (lambda told: told["form"].update(step="0.5"), ("form.step: expected `float`",)),
+    "no prediction": (lambda told: told["form"].update(predictions=0), ("form.predictions: expected `int` >= 1",)),
+    "half a frame": (lambda told: told["form"].update(frames=2.5), ("form.frames: expected `int`",)),
+    "true frames": (lambda told: told["form"].update(frames=True), ("form.frames: expected `int`",)),
     "more than memory": (
         lambda told: told["form"].update(predictions=10**9),
         (
@@ -214,38 +240,41 @@ MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
             "more than memory holds",
         ),
     ),
-    "an unknown store": (lambda told: told["form"].update(stored="logits"), ("form: stored: expected one of",)),
-    "an unknown orientation": (lambda told: told["form"].update(orientation="north"), ("form: orientation: expected",)),
-    "unknown labels": (lambda told: told["form"].update(labels="mine"), ("form: labels: expected one of",)),
-    "an axis of two numbers": (lambda told: told["form"].update(x=[-2, 2]), ("form: x: expected start, end and cell",)),
-    "an axis of texts": (lambda told: told["form"].update(y=["a", "b", "c"]), ("form: y: expected a number",)),
+    "an unknown store": (lambda told: told["form"].update(stored="logits"), ("form.stored: ",)),
+    "an unknown orientation": (lambda told: told["form"].update(orientation="north"), ("form.orientation: ",)),
+    "unknown labels": (lambda told: told["form"].update(labels="mine"), ("form.labels: ",)),
+    "an axis of two numbers": (lambda told: told["form"].update(x=[-2, 2]), ("form.x: expected `array` of length 3",)),
+    "an axis of texts": (lambda told: told["form"].update(y=["a", "b", "c"]), ("form.y[0]: expected `float`",)),
     "an axis of half cells": (lambda told: told["form"].update(x=[-2, 2, 0.3]), ("form: x: ", "whole number of cells")),
-    "an unknown field": (lambda told: told["form"].update(z=1), ("form: z: is no field of the format",)),
-    "no shards": (lambda told: told.update(shards=[]), ("shards: expected a list of at least one",)),
-    "a shard that is a text": (lambda told: told["shards"].append("a.npz"), ("shards: entry 2: expected an object",)),
-    "no checksum": (lambda told: told["shards"][1].pop("checksum"), ("shards: entry 1: checksum: is missing",)),
+    "an unknown field": (lambda told: told["form"].update(z=1), ("form: object contains unknown field `z`",)),
+    "no shards": (lambda told: told.update(shards=[]), ("shards: expected `array` of length >= 1",)),
+    "a shard that is a text": (lambda told: told["shards"].append("a.npz"), ("shards[2]: expected `object`",)),
+    "no checksum": (
+        lambda told: told["shards"][1].pop("checksum"),
+        ("shards[1]: object missing required field `checksum`",),
+    ),
     "another checksum": (lambda told: told["shards"][1].update(checksum="00"), ("shards/00001.npz: ", "checksum")),
     "another size": (
         lambda told: told["shards"][0].update(bytes=7),
-        ("entry 0: bytes: shards/00000.npz should have 7",),
+        ("shards[0]: bytes: shards/00000.npz should have 7",),
     ),
     "a size that is a text": (
         lambda told: told["shards"][0].update(bytes="7"),
-        ("entry 0: bytes: expected the file's",),
+        ("shards[0].bytes: expected `int`",),
     ),
     "a shard that is not there": (
         lambda told: told["shards"][1].update(file="b.npz"),
-        ("entry 1: file: b.npz cannot be",),
+        ("shards[1]: file: b.npz cannot be",),
     ),
     "a shard outside": (lambda told: told["shards"][1].update(file="../b.npz"), ("file: expected a path inside",)),
     "an absolute path": (lambda told: told["shards"][1].update(file="/etc/passwd"), ("file: expected a path inside",)),
     "a shard that is a folder": (
         lambda told: told["shards"][1].update(file="shards"),
-        ("entry 1: file: shards is not",),
+        ("shards[1]: file: shards is not",),
     ),
     "a shard twice": (
         lambda told: told["shards"].append(told["shards"][0]),
-        ("entry 2: file: shards/00000.npz is another",),
+        ("shards[2]: file: shards/00000.npz is another",),
     ),
     "a sample in two shards": (
         lambda told: told["shards"][1]["tokens"].append(FIRST),
@@ -257,11 +286,15 @@ MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
     ),
     "a token that is a number": (
         lambda told: told["shards"][0]["tokens"].append(3),
-        ("shards: entry 0: tokens: expected a sample's token, a text, found 3",),
+        ("shards[0].tokens[2]: expected `str`",),
+    ),
+    "a token of a parent": (
+        lambda told: told["shards"][0]["tokens"].append("a/.."),
+        ("shards[0].tokens: expected a sample's token, <scenario_type>",),
     ),
     "no tokens": (
         lambda told: told["shards"][0].update(tokens=[]),
-        ("entry 0: tokens: expected a list of at least one",),
+        ("shards[0].tokens: expected `array` of length >= 1",),
     ),
     "a sample without arrays": (
         lambda told: told["shards"][1]["tokens"].append("a/b/ego_vehicle/001"),
@@ -284,7 +317,7 @@ def test_links_out_of_the_folder(tmp_path: Path) -> None:
     folder = plain.write_motion(tmp_path / "motion")
     outside = (folder / "shards" / "00001.npz").rename(tmp_path / "outside.npz")
     (folder / "shards" / "00001.npz").symlink_to(outside)
-    refused(folder, "shards: entry 1: file: shards/00001.npz is a link that leads out of the folder")
+    refused(folder, "shards[1]: file: shards/00001.npz is a link that leads out of the folder")
 
 
 def heads(**changes: np.ndarray) -> dict[str, np.ndarray]:
@@ -343,7 +376,7 @@ ARRAYS: dict[str, tuple[str, dict[str, np.ndarray], tuple[str, ...]]] = {
     "objects": (
         "instances",
         maps(instance=GOOD["instance"].astype(object)),
-        ("instance: holds Python objects, a pickle; store numbers",),
+        ("instance: cannot be read (expected numbers",),
     ),
     "complex ids": ("instances", maps(instance=GOOD["instance"].astype(complex)), ("instance: ", "found complex128")),
     "heads among maps": ("instances", heads(), ("segmentation.npy: belongs to no sample of the shard",)),
@@ -431,9 +464,9 @@ def test_half_of_the_paths(tmp_path: Path, missing: str) -> None:
     refused(folder, f"shards/00000.npz: {FIRST}: {missing}: is missing")
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy(array: np.ndarray, version: tuple[int, int] = (1, 0)) -> bytes:
     buffer = io.BytesIO()
-    np.save(buffer, array)
+    np.lib.format.write_array(buffer, array, version)
     return buffer.getvalue()
 
 
@@ -450,14 +483,24 @@ CONTENTS: dict[str, tuple[bytes, str]] = {
     "a pickle": (pickle.dumps([1, 2]), "instance: cannot be read"),
     "an empty member": (b"", "instance: cannot be read"),
     "a header that is cut": (npy(plain.instance_arrays()["instance"])[:40], "instance: cannot be read"),
-    "numbers that are cut": (npy(plain.instance_arrays()["instance"])[:-9], "instance: expected 288 bytes of numbers"),
+    "numbers that are cut": (
+        npy(plain.instance_arrays()["instance"])[:-9],
+        "instance: cannot be read (its array has 279",
+    ),
     "more numbers": (
         npy(plain.instance_arrays()["instance"]) + b"\0",
-        "instance: expected 288 bytes of numbers, found 289",
+        "instance: cannot be read (its array has 289 bytes",
     ),
-    "the claim of a giant": (claiming((10**6, 3, 6, 8)), "instance: expected shape (1 to 2, 3, 6, 8), found (1000000,"),
-    "a negative shape": (claiming((-2, 3, 6, 8)), "instance: expected shape (1 to 2, 3, 6, 8), found (-2, 3, 6, 8)"),
-    "a header of 4 GB": (b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1), "instance: expected npy format 1.0"),
+    "the claim of a giant": (claiming((10**6, 3, 6, 8)), "instance: cannot be read (its array has 288 bytes"),
+    "a negative shape": (
+        claiming((-2, 3, 6, 8)),
+        "instance: cannot be read (expected numbers or text, found shape (-2, 3, 6, 8)",
+    ),
+    "another format": (
+        npy(plain.instance_arrays()["instance"], (2, 0)),
+        "instance: expected npy format 1.0, as numpy.save writes numbers",
+    ),
+    "a header of 4 GB": (b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1), "instance: cannot be read ("),
 }
 
 

@@ -109,7 +109,7 @@ class TestWriter:
             "accident": [
                 (PREDICTIONS["motion"](), "expected a list of Accidents, found a MotionOutput; write that to results"),
                 ([1], "expected a MotionOutput or a list of Accidents, found list with int"),
-                ([Accident(positions=np.ones((2, 2)), time=0.5, ids=(2**70, 1))], "ids: expected two whole numbers"),
+                ([Accident(positions=np.ones((2, 2)), time=0.5, ids=(2**70, 1))], "[0].ids[0]: expected `int` <="),
             ],
             "detection": [
                 ([], "expected DetectedBoxes, found list; make them with DetectedBoxes.from_arrays("),
@@ -195,17 +195,17 @@ class TestResults:
     def test_a_copy_reads_again(self, results: Results) -> None:
         content = pickle.dumps(results)
         assert len(content) < 1000
-        reader.contents_of.cache_clear()
+        reader.kept.clear()
         copy = pickle.loads(content)
         assert (copy.task, copy.path, copy.fingerprint) == (results.task, results.path, results.fingerprint)
         assert (copy.tokens, copy.meta, copy.form) == (results.tokens, results.meta, results.form)
         assert len(copy.prediction(SECOND)) == len(results.prediction(SECOND))
 
     def test_a_process_parses_once(self, results: Results, monkeypatch: pytest.MonkeyPatch) -> None:
-        def parsed(content: bytes) -> None:
+        def parsed(content: bytes, path: Path) -> None:
             raise AssertionError("parsed again")
 
-        monkeypatch.setattr(reader, "parsed_json", parsed)
+        monkeypatch.setattr(reader, "read_document", parsed)
         for _ in range(3):
             pickle.loads(pickle.dumps(results)).prediction(FIRST)
         read_results(results.path).prediction(FIRST)
@@ -224,7 +224,7 @@ class TestResults:
         file.write_bytes(file.read_bytes().replace(b'"meta": {}', b'"meta": {"a": 1}'))
         with pytest.raises(ResultsError, match="was changed after it was opened; open it again"):
             results.check()
-        reader.contents_of.cache_clear()
+        reader.kept.clear()
         with pytest.raises(ResultsError, match="was changed after it was opened; open it again"):
             pickle.loads(copy).prediction(FIRST)
         assert read_results(results.path).fingerprint != results.fingerprint
