@@ -8,8 +8,8 @@ from typing import Any, Final
 from deepaccident_devkit.render.markup import Markup, breakable, joined, tag
 from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.safety import AccidentRow
-from deepaccident_devkit.safety.report_rows import CRITICAL, DECELERATIONS
-from deepaccident_devkit.safety.tables import number_text
+from deepaccident_devkit.safety.report import CRITICAL, DECELERATIONS
+from deepaccident_devkit.safety.reports import number_text
 from deepaccident_devkit.taxonomy import AGENTS
 
 _GROUPS: Final[Mapping[str, Sequence[str]]] = {

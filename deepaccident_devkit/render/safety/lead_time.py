@@ -14,7 +14,7 @@ from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, MUTED_
 from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, LeadTimeLedger, MeanTime
-from deepaccident_devkit.safety.ledger_report import CAVEAT
+from deepaccident_devkit.safety.lead_times import CAVEAT
 from deepaccident_devkit.taxonomy import AGENTS
 
 if TYPE_CHECKING:

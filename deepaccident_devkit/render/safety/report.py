@@ -26,7 +26,7 @@ from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, re
 from deepaccident_devkit.render.safety.lead_time import LEAD_TIME_SIZE, render_lead_times
 from deepaccident_devkit.render.theme import DARK
 from deepaccident_devkit.safety import SafetyReport
-from deepaccident_devkit.safety.avoidability_shares import GROUPS
+from deepaccident_devkit.safety.avoidability import GROUPS
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -10,8 +10,8 @@ from deepaccident_devkit.render.markup import Markup, facts, joined, table, tag
 from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.render.safety.accident_table import actor_words
 from deepaccident_devkit.safety import COALITIONS, OUTCOMES, PARTNERS, OutcomeShares, SafetyReport
-from deepaccident_devkit.safety.ledger_report import CAVEAT
-from deepaccident_devkit.safety.tables import number_text
+from deepaccident_devkit.safety.lead_times import CAVEAT
+from deepaccident_devkit.safety.reports import number_text
 
 _LEADS: Final = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 """Seconds of warning that the tables have columns for."""
