@@ -14,8 +14,8 @@ from deepaccident_devkit.evaluation.runs import Bundle
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
 from deepaccident_devkit.evaluation.runs.shapes import EACH, LINE, NUMBER, OBJECT, WHOLE, misfits
 from deepaccident_devkit.explore.scenarios import UNKNOWN
+from deepaccident_devkit.pages import scalar
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
-from deepaccident_devkit.render.markup import scalar
 
 _GROUP: Final = {
     "value": (None, LINE),

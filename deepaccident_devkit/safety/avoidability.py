@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats, checked
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats, checked, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of
 from deepaccident_devkit.safety.contact import Pair, contact_made, pair_of
 from deepaccident_devkit.safety.outcomes import (
@@ -27,7 +28,7 @@ from deepaccident_devkit.safety.outcomes import (
     outcomes_of,
     undisturbed,
 )
-from deepaccident_devkit.safety.reports import Report, Row, each_scenario, reasons_text, those_of
+from deepaccident_devkit.safety.scenarios import each_scenario, reasons_text, those_of
 from deepaccident_devkit.safety.secondary import SecondaryContact, secondary_contacts
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import columns_text
@@ -140,8 +141,8 @@ class Avoidability(FrozenArrays):
                 "brakers": brakers,
                 "deceleration": deceleration,
                 "avoidable": bool(np.isfinite(moments.time[row])),
-                "last_moment": _rounded(moments.time[row], 2),
-                "slack": _rounded(self.slack.flat[row], 2),
+                "last_moment": known(moments.time[row], 2),
+                "slack": known(self.slack.flat[row], 2),
                 "switches": int(moments.switches[row]),
                 "extrapolated": bool(moments.extrapolated[row]),
                 "secondary": [
@@ -162,9 +163,9 @@ class Avoidability(FrozenArrays):
         return {
             "margin": self.check.margin,
             "time": round(self.check.time, 6),
-            "speeds": _rounded(self.check.speeds, 3),
-            "delta_v": _rounded(self.check.delta_v, 3),
-            "delta_v_ranges": _rounded(ranges, 3),
+            "speeds": known(self.check.speeds, 3),
+            "delta_v": known(self.check.delta_v, 3),
+            "delta_v_ranges": known(ranges, 3),
         }
 
     @property
@@ -181,9 +182,9 @@ class Avoidability(FrozenArrays):
                     "deceleration": braking.deceleration,
                     "outcome": [OUTCOMES[code] for code in outcomes.outcome[:, column]],
                     "extrapolated": outcomes.extrapolated[:, column].tolist(),
-                    "speeds": _rounded(outcomes.speeds[:, column], 3),
-                    "delta_v": _rounded(outcomes.delta_v[:, column], 3),
-                    "reduction": _rounded(outcomes.reduction[:, column], 3),
+                    "speeds": known(outcomes.speeds[:, column], 3),
+                    "delta_v": known(outcomes.delta_v[:, column], 3),
+                    "reduction": known(outcomes.reduction[:, column], 3),
                 }
 
 
@@ -291,14 +292,6 @@ def _secondary(
     brakes = np.repeat(np.array(MASKS), len(decelerations), axis=0)
     starts = np.where(brakes & np.isfinite(moments.time)[:, None], moments.time[:, None], np.inf)
     return tuple(secondary_contacts(accident, tracks, starts, np.tile(decelerations, len(MASKS))))
-
-
-def _rounded(values: ArrayLike, digits: int) -> Any:
-    """Rounded numbers for JSON, in lists; None for those that are not finite."""
-    array = np.asarray(values)
-    if array.ndim:
-        return [_rounded(each, digits) for each in array]
-    return round(array.item(), digits) if np.isfinite(array) else None
 
 
 GROUPS: Final = ("vehicles", "head-on", "pedestrians")
@@ -441,7 +434,7 @@ class AvoidabilityReport(Report):
             "accidents": [{"group": group_of(each), **each.to_dict(warnings=False)} for each in self.accidents],
         }
 
-    def tables(self) -> dict[str, Iterable[Row]]:
+    def named_tables(self) -> dict[str, Iterable[Row]]:
         """Last moments, contacts with others, shares of outcomes, the self-check, and what is left out."""
         return {
             "avoidability_last_moments": self._last_moment_rows(),

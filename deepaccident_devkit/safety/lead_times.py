@@ -17,21 +17,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import GeometryError, NotAvailableError
+from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.accidents import Skipped, accident_of
 from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
-from deepaccident_devkit.safety.reports import (
-    Report,
-    Row,
-    each_scenario,
-    reasons_text,
-    short_agent,
-    skipped_rows,
-    those_of,
-)
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, AgentName
+from deepaccident_devkit.safety.scenarios import each_scenario, reasons_text, skipped_rows, those_of
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, AgentName, short_name
 from deepaccident_devkit.text import columns_text
 
 if TYPE_CHECKING:
@@ -226,11 +219,11 @@ class LeadTimes(FrozenArrays):
             "ego_collides": self.ego_collides,
             "missing": list(self.missing),
             "num_frames": self.num_frames,
-            "lead_seconds": dict(zip(names, _known(self.leads), strict=True)),
+            "lead_seconds": dict(zip(names, known(self.leads), strict=True)),
             "first_frames": dict(zip(names, frames, strict=True)),
-            "gain_seconds": dict(zip(PARTNERS, _known(self.gains), strict=True)),
-            "loss_seconds": dict(zip(PARTNERS, _known(self.losses), strict=True)),
-            "shapley_seconds": dict(zip(PARTNERS, _known(self.shapley), strict=True)),
+            "gain_seconds": dict(zip(PARTNERS, known(self.gains), strict=True)),
+            "loss_seconds": dict(zip(PARTNERS, known(self.losses), strict=True)),
+            "shapley_seconds": dict(zip(PARTNERS, known(self.shapley), strict=True)),
         }
 
     @property
@@ -286,10 +279,6 @@ def _whole_ledger(observed: BoolArray, partners: tuple[AgentName, ...]) -> tuple
     shapley = np.full(len(PARTNERS), np.nan)
     shapley[places] = shapley_values(leads)
     return every_frame, every_lead, shapley
-
-
-def _known(values: FloatArray) -> list[float | None]:
-    return [None if np.isnan(value) else value for value in values.tolist()]
 
 
 CAVEAT: Final = "Observation bounds warning from above; it is no prediction."
@@ -410,7 +399,7 @@ class LeadTimeLedger(Report):
             "skipped": [asdict(each) for each in self.skipped],
         }
 
-    def tables(self) -> dict[str, Iterable[Row]]:
+    def named_tables(self) -> dict[str, Iterable[Row]]:
         """`lead_times`, a row an accident, seconds with all their digits; and `skipped`."""
         return {"lead_times": [_CSV_HEADING, *map(_csv_row, self.accidents)], "skipped": skipped_rows(self.skipped)}
 
@@ -429,7 +418,7 @@ class LeadTimeLedger(Report):
         return "\n\n".join(blocks)
 
     def _accidents_text(self) -> str:
-        heading = ("seconds before the impact", "ego alone", *(f"+ {short_agent(name)}" for name in PARTNERS), "all")
+        heading = ("seconds before the impact", "ego alone", *(f"+ {short_name(name)}" for name in PARTNERS), "all")
         rows = [
             (
                 each.scenario,
@@ -449,7 +438,7 @@ class LeadTimeLedger(Report):
 
     def _means_text(self) -> str:
         means = zip(PARTNERS, self.mean_gains, self.mean_losses, self.mean_shapley, strict=True)
-        rows = [(short_agent(name), *(mean.text for mean in each)) for name, *each in means]
+        rows = [(short_name(name), *(mean.text for mean in each)) for name, *each in means]
         alone, together = self.mean_leads[0].text, self.mean_together.text
         start = "observed by all agents from the first frame on, so that the lead may be longer than the recording: "
         never = f"never observed together: by the ego alone {_percent(self.share_never_alone)}, by all agents "

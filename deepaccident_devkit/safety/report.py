@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit.arrays import ShortRepr
+from deepaccident_devkit.arrays import ShortRepr, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.interactions import InteractionConfig, InteractionPairs, interactions
+from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.accidents import Skipped
 from deepaccident_devkit.safety.avoidability import (
     BRAKERS,
@@ -23,10 +23,10 @@ from deepaccident_devkit.safety.avoidability import (
 from deepaccident_devkit.safety.lead_times import LeadTimeLedger, LeadTimes, lead_times, ledger_of
 from deepaccident_devkit.safety.observation import ObservationRule
 from deepaccident_devkit.safety.outcomes import BRAKINGS
-from deepaccident_devkit.safety.reports import Report, Row, each_scenario, those_of, tried
+from deepaccident_devkit.safety.scenarios import each_scenario, those_of, tried
 from deepaccident_devkit.safety.stories import Story, scenario_facts, story_text
 from deepaccident_devkit.safety.twins import Parting, TwinDiff, TwinReport, diff_of_accident, twins_of
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -73,7 +73,7 @@ class PairMeasures:
     def of(cls, pairs: InteractionPairs, first: int, second: int) -> PairMeasures | None:
         """Those of two actors in `interactions(…).pairs`; None if they never come under a threshold there."""
         at = pairs.position(first, second)
-        return None if at is None else cls(time_exposed=_known(pairs.tet[at, 0]), pet=_known(abs(pairs.pet[at])))
+        return None if at is None else cls(time_exposed=known(pairs.tet[at, 0], 2), pet=known(abs(pairs.pet[at]), 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,6 +105,11 @@ class AccidentRow(ShortRepr):
         return list(self.story.facts["accident"]["pair"])
 
     @property
+    def names(self) -> list[str]:
+        """What the two are called."""
+        return [actor_name(each) for each in self.colliders]
+
+    @property
     def severity(self) -> float:
         """The larger delta-v of the two, m/s; −1 if none is known."""
         return max((each["delta_v"] for each in self.colliders if each["delta_v"] is not None), default=-1.0)
@@ -131,12 +136,12 @@ class AccidentRow(ShortRepr):
         if len(self.brakes) == 1:
             row = self.replayed.accident.agents.index("ego_vehicle")
         values = zip(self.replayed.decelerations.tolist(), self.replayed.slack[row].tolist(), strict=True)
-        return {deceleration: _known(slack) for deceleration, slack in values}
+        return {deceleration: known(slack, 2) for deceleration, slack in values}
 
     @property
     def parts(self) -> float | None:
         """Seconds before the impact at which the first actor acts otherwise in the twin; None if none does."""
-        return None if self.twin is None else _known(self.twin.to_dict()["time_to_impact"], 1)
+        return None if self.twin is None else known(self.twin.to_dict()["time_to_impact"], 1)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON; None for what is not known."""
@@ -160,6 +165,12 @@ class AccidentRow(ShortRepr):
         }
 
 
+def actor_name(actor: Mapping[str, Any]) -> str:
+    """An actor of a story's facts: `ego (car)`, or `cyclist 1234` for one that is no agent."""
+    category = actor["category"] or "road user"
+    return f"{short_name(actor['agent'])} ({category})" if actor["agent"] else f"{category} {actor['actor_id']}"
+
+
 def csv_row(row: AccidentRow) -> list[Any]:
     """The cells of `ROW_HEADING`."""
     told = row.to_dict()
@@ -169,10 +180,6 @@ def csv_row(row: AccidentRow) -> list[Any]:
     brakes = " ".join(each or "none" for each in row.brakes)
     last = [told[name] for name in ("twin", "twin_parts", "story")]
     return [row.scenario, *colliders, *measures, told["pet"], *row.leads.values(), brakes, *moments, *last]
-
-
-def _known(value: float | None, digits: int = 2) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -243,7 +250,7 @@ class SafetyReport(Report):
             "left_out": [dict(zip(("scenario", "part", "reason"), each, strict=True)) for each in self.left_out],
         }
 
-    def tables(self) -> dict[str, Iterable[Row]]:
+    def named_tables(self) -> dict[str, Iterable[Row]]:
         """`accidents`, a row an accident (metres, seconds, m/s, degrees), and `left_out`."""
         return {
             "accidents": [ROW_HEADING, *map(csv_row, self.rows)],

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, ShortRepr
+from deepaccident_devkit.arrays import ShortRepr, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, agents_by_actor
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability
 from deepaccident_devkit.safety.observation import observed_actors
-from deepaccident_devkit.safety.reports import each_scenario, those_of, tried
+from deepaccident_devkit.safety.scenarios import each_scenario, those_of, tried
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.collisions import Contact, collision
 from deepaccident_devkit.v2x.configurations import agents_of
@@ -59,8 +59,8 @@ def story_text(facts: Mapping[str, Any]) -> str:
 
 def actor_words(actor: Mapping[str, Any]) -> str:
     """What an actor is called: an agent by its role, any other road user by its class."""
-    known = _AGENTS.get(actor["agent"] or "")
-    return known or (f"a {actor['category']}" if actor["category"] else "a road user")
+    role = _AGENTS.get(actor["agent"] or "")
+    return role or (f"a {actor['category']}" if actor["category"] else "a road user")
 
 
 def _collision(facts: Mapping[str, Any], accident: Mapping[str, Any]) -> str:
@@ -275,7 +275,7 @@ def _accident(
         "pair": [_collider(record, accident, contact, braked, which) for which in range(2)],
         "time": round((accident.last_frame - 1) * FRAME_PERIOD, 1),
         "gap": round(contact.gap, 2),
-        "closing_speed": _known(contact.closing_speed),
+        "closing_speed": known(contact.closing_speed, 2),
         "impact_angle": round(math.degrees(contact.impact_angle)),
         "seen": _seen(dataset, accident),
         "braking": None if braked is None else _braking(accident, braked),
@@ -292,9 +292,9 @@ def _collider(
         "category": accident.categories[which],
         "agent": agent,
         "turn": record[turn] if turn else None,  # type: ignore[literal-required]
-        "speed": _known(contact.speeds[which]),
+        "speed": known(contact.speeds[which], 2),
         "side": contact.sides[which],
-        "delta_v": None if braked is None else _known(braked.check.delta_v[which]),
+        "delta_v": None if braked is None else known(braked.check.delta_v[which], 2),
     }
 
 
@@ -318,7 +318,7 @@ def _braking(accident: Accident, braked: Avoidability) -> dict[str, Any]:
         "by": [accident.agents[which] for which in by],
         "deceleration": float(braked.decelerations[column]),
         "avoidable": bool(np.isfinite(slack)),
-        "slack": _known(slack),
+        "slack": known(slack, 2),
     }
 
 
@@ -333,8 +333,8 @@ def _nearest(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> di
     row = rows[np.argmin(pairs.min_ttc[rows])]
     return {
         "pair": [_actor(dataset, record["token"], actor) for actor in pairs.actor_ids[row].tolist()],
-        "min_ttc": _known(pairs.min_ttc[row]),
-        "min_gap": _known(pairs.min_gap[row]),
+        "min_ttc": known(pairs.min_ttc[row], 2),
+        "min_gap": known(pairs.min_gap[row], 2),
     }
 
 
@@ -345,8 +345,3 @@ def _labelled(dataset: Dataset, record: ScenarioRecord) -> bool:
 def _actor(dataset: Dataset, scenario: str, actor_id: int) -> dict[str, Any]:
     category = dataset.get("instance", f"{scenario}/actor/{actor_id}")["category"]
     return {"actor_id": actor_id, "category": category, "agent": agents_by_actor(dataset, scenario).get(actor_id)}
-
-
-def _known(value: float | FloatArray, digits: int = 2) -> float | None:
-    number = float(value)
-    return round(number, digits) if math.isfinite(number) else None

@@ -14,26 +14,16 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked_number
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked_number, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError, TokenError
-from deepaccident_devkit.files import path_of
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
+from deepaccident_devkit.reports import Report, Row, write_csv
 from deepaccident_devkit.safety.accidents import Skipped, accident_of
-from deepaccident_devkit.safety.reports import (
-    Report,
-    Row,
-    each_scenario,
-    number_text,
-    reasons_text,
-    short_agent,
-    skipped_rows,
-    those_of,
-    write_csv,
-)
+from deepaccident_devkit.safety.scenarios import each_scenario, reasons_text, skipped_rows, those_of
 from deepaccident_devkit.safety.twin_matching import MatchedBy, Recording, matched_rows, recording_of, shift_of, shifted
-from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, UNTRACKED_ID, AgentName, frame_timestamp
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, UNTRACKED_ID, AgentName, frame_timestamp, short_name
+from deepaccident_devkit.text import columns_text, number_text
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -273,7 +263,7 @@ class TwinDiff(FrozenArrays):
             "parting_time": None if parting is None else frame_timestamp(parting),
             "time_to_impact": None if parting is None else (self.num_frames[0] - parting) * FRAME_PERIOD,
             "pair": [int(self.actor_ids[row, 0]) for row in self.pair],
-            "gap_at_impact": _known(self.gaps[0, self.num_frames[0] - 1]),
+            "gap_at_impact": known(self.gaps[0, self.num_frames[0] - 1]),
             "nearest_gap_in_twin": None if nearest is None else nearest.gap,
             "nearest_frame_in_twin": None if nearest is None else nearest.frame,
             "actors": [self._actor(row) for row in self.order.tolist()],
@@ -289,8 +279,8 @@ class TwinDiff(FrozenArrays):
         columns = [*self.actor_ids[rows].T.tolist(), (frames + 1).tolist()]
         values = [*self.poses[:, rows, frames].transpose(0, 2, 1).reshape(6, -1), *self.speeds[:, rows, frames]]
         values += [self.distances[rows, frames], self.heading_differences[rows, frames]]
-        columns += [[_known(value) for value in each] for each in values]
-        return write_csv(path_of(path), [_OVER_TIME, *zip(*columns, strict=True)])
+        columns += [known(each) for each in values]
+        return write_csv(path, [_OVER_TIME, *zip(*columns, strict=True)])
 
     def _actor(self, row: int) -> dict[str, Any]:
         ids: list[int] = self.actor_ids[row].tolist()
@@ -304,22 +294,18 @@ class TwinDiff(FrozenArrays):
             "collides": row in self.pair,
             "matched_by": self.matched_by[row],
             "parting_frame": frame or None,
-            "position_at_parting": [_known(value) for value in at[0]],
-            "twin_position_at_parting": [_known(value) for value in at[1]],
+            "position_at_parting": known(at[0]),
+            "twin_position_at_parting": known(at[1]),
             "largest_distance": _largest(self.distances[row]),
             "largest_heading_difference": _largest(self.heading_differences[row]),
             "largest_speed_difference": _largest(self.speed_differences[row]),
         }
 
 
-def _known(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
-
-
 def _largest(values: FloatArray) -> float | None:
     """The value farthest from 0; None if none is known."""
-    known = values[~np.isnan(values)]
-    return float(known[np.argmax(np.abs(known))]) if len(known) else None
+    there = values[~np.isnan(values)]
+    return float(there[np.argmax(np.abs(there))]) if len(there) else None
 
 
 def twin_diff(dataset: Dataset, scenario: RowArgument, parting: Parting | None = None) -> TwinDiff:
@@ -462,7 +448,7 @@ class TwinReport(Report):
             "torn": [asdict(each) for each in self.torn],
         }
 
-    def tables(self) -> dict[str, Iterable[Row]]:
+    def named_tables(self) -> dict[str, Iterable[Row]]:
         """`twins`, `twin_actors`, `torn_twins` and `skipped`; metres, seconds, m/s, radians."""
         told = [each.to_dict() for each in self.diffs]
         actors = ((each["accident"], *map(actor.get, _OF_ACTORS)) for each in told for actor in each["actors"])
@@ -571,7 +557,7 @@ def _first_to_part(diff: TwinDiff) -> str:
 
 
 def _who(category: str, agent: str | None, actor_id: int) -> str:
-    return f"{category} {actor_id}" if agent is None else short_agent(agent)
+    return f"{category} {actor_id}" if agent is None else short_name(agent)
 
 
 def _line(diff: TwinDiff) -> tuple[str, ...]:
@@ -589,7 +575,7 @@ def _line(diff: TwinDiff) -> tuple[str, ...]:
 
 def _actor_line(actor: dict[str, Any]) -> tuple[str, ...]:
     turn, frame = actor["largest_heading_difference"], actor["parting_frame"]
-    who = actor["category"] if actor["agent"] is None else short_agent(actor["agent"])
+    who = actor["category"] if actor["agent"] is None else short_name(actor["agent"])
     return (
         *("–" if actor[name] is None else str(actor[name]) for name in ("actor_id", "twin_id")),
         f"{who}, collides" if actor["collides"] else who,

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN
 from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
-from deepaccident_devkit.evaluation.runs.predictors import PredictorTable, number_text
+from deepaccident_devkit.evaluation.runs.predictors import number_text
+from deepaccident_devkit.reports import Table
 from deepaccident_devkit.safety import OUTCOMES
-from deepaccident_devkit.text import columns_text
 
 Json = Mapping[str, Any]
 _COLUMNS: Final = (*OUTCOMES, "if lasting", "warned", "after end", "braking s/min")
@@ -19,7 +19,7 @@ _AT_ONCE: Final = "0"
 """Name of no latency, as JSON has it."""
 
 
-def prevention_tables(prevented: Json) -> list[PredictorTable]:
+def prevention_tables(prevented: Json) -> list[Table]:
     """Two tables for each group of recordings: predictors at the nominal setting, and the predictions at all settings.
 
     Args:
@@ -30,15 +30,15 @@ def prevention_tables(prevented: Json) -> list[PredictorTable]:
         everyone = {GIVEN: given, **{name: each[group] for name, each in prevented["references"].items()}}
         head = (f"{group}, {NOMINAL}", *_COLUMNS)
         notes = tuple(_notes(prevented, group, given))
-        tables.append(PredictorTable(rows=(head, *_predictors(prevented["alarms"], everyone)), notes=notes))
+        tables.append(Table(rows=(head, *_predictors(prevented["alarms"], everyone)), notes=notes))
         rows = tuple((name, *_cells(given, prevented["alarms"], setting=name)) for name in SETTINGS)
-        tables.append(PredictorTable(rows=((f"{group}, {GIVEN}", *_COLUMNS), *rows), notes=()))
+        tables.append(Table(rows=((f"{group}, {GIVEN}", *_COLUMNS), *rows), notes=()))
     return tables
 
 
 def prevention_text(prevented: Json) -> str:
     """All tables of `prevention_tables` and the notes, as aligned lines."""
-    tables = ["\n".join([columns_text(each.rows), *each.notes]) for each in prevention_tables(prevented)]
+    tables = [each.to_text() for each in prevention_tables(prevented)]
     return "\n\n".join([*tables, *(["\n".join(prevented["notes"])] if prevented["notes"] else [])])
 
 

@@ -1,24 +1,16 @@
-"""What the reports of many scenarios share: one pass over the scenarios, JSON, CSV files, and words of their texts."""
+"""`each_scenario`: one computation on many scenarios, in processes or on executors, and what was left out."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-import math
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
+from deepaccident_devkit.reports import Row
 from deepaccident_devkit.safety.accidents import Skipped
-from deepaccident_devkit.text import fixed_text
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -27,44 +19,8 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 Result = TypeVar("Result")
-Row = Sequence[object]
 _RUN_LENGTH: Final = 64
 """Scenarios that are looked at together: some tenths of a second."""
-
-
-class Report(ShortRepr):
-    """Base of reports on many scenarios: what it says, and what its tables are, makes its JSON and its CSV files."""
-
-    __slots__ = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON; None for what is not known."""
-        raise NotImplementedError
-
-    def tables(self) -> Mapping[str, Iterable[Row]]:
-        """File name, without its ending → rows, the heading first; None leaves a cell empty."""
-        raise NotImplementedError
-
-    def to_json(self) -> str:
-        """`to_dict` as one JSON object."""
-        return json.dumps(self.to_dict(), indent=2, ensure_ascii=False)
-
-    def to_csv(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write a file for each of `tables` into a folder, over those that are there; returns their paths.
-
-        Raises:
-            ConfigError: `folder` cannot be written to, or is not one.
-        """
-        folder = writable_folder(folder)
-        return [write_csv(folder / f"{name}.csv", rows) for name, rows in self.tables().items()]
-
-
-def write_csv(path: Path, rows: Iterable[Row]) -> Path:
-    """Write rows, the heading first, into a file, over one that is there; None leaves a cell empty."""
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    write_bytes(path, text.getvalue().encode())
-    return path
 
 
 def skipped_rows(skipped: Iterable[Skipped]) -> list[Row]:
@@ -75,16 +31,6 @@ def skipped_rows(skipped: Iterable[Skipped]) -> list[Row]:
 def reasons_text(title: str, skipped: Iterable[Skipped]) -> str:
     """A line a reason under a title."""
     return "\n".join([f"{title}:", *(f"  {each.reason}" for each in skipped)])
-
-
-def short_agent(agent: str) -> str:
-    """An agent's short name for headings: `ego`, `ego behind`, `other`, `other behind`, `infrastructure`."""
-    return agent.replace("_vehicle", "").replace("_", " ")
-
-
-def number_text(value: float | None, digits: int) -> str:
-    """A number with so many decimals; a dash for None and NaN."""
-    return "–" if value is None or math.isnan(value) else fixed_text(value, digits)
 
 
 def each_scenario(
