@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from deepaccident_devkit.reports import Report
-from deepaccident_devkit.statistics.interactions import SCENARIOS as _CRITICAL
 from deepaccident_devkit.statistics.results import (
+    CRITICAL,
     GROUPS,
     PROBABILITIES,
     TOTAL,
@@ -96,7 +96,7 @@ class DatasetStatistics(Report):
                 rows = [(value, *self._shares(table, value)) for value in table.counts if table.counts[value][TOTAL]]
                 blocks.append(columns_text([(table.field, *self.groups), *rows]))
         blocks += [self._lengths_text(), self._categories_text()]
-        if _CRITICAL in self.histograms:
+        if CRITICAL in self.histograms:
             blocks.append(self._critical_text())
         left_out = {
             f"{table.left_out.counts[TOTAL]:,} {table.left_out.what}"
@@ -123,14 +123,12 @@ class DatasetStatistics(Report):
 
     def _critical_text(self) -> str:
         """Scenarios in which a moving pair comes below some times to collision, of those with labels."""
-        times = self.histograms[_CRITICAL]
+        times = self.histograms[CRITICAL]
         rows = []
         for limit in _LIMITS:
-            cells = []
-            for group in self.groups:
-                count = sum(times.counts[group][: times.edges.index(limit)])
-                cells.append(share_text(count, self.scenarios[group] - self.unlabelled[group]))
-            rows.append((f"below {limit:g} s", *cells))
+            counts = {group: sum(times.counts[group][: times.edges.index(limit)]) for group in self.groups}
+            labelled = {group: self.scenarios[group] - self.unlabelled[group] for group in self.groups}
+            rows.append((f"below {limit:g} s", *(share_text(counts[group], labelled[group]) for group in self.groups)))
         return columns_text([("least TTC of moving pairs", *self.groups), *rows])
 
     def _categories_text(self) -> str:
