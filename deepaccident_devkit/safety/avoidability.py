@@ -49,6 +49,13 @@ _SCAN_STEP: Final = 0.01
 """Seconds between the starts of braking that are tried."""
 _HEAD_ON: Final = 3 * math.pi / 4
 """Least angle between the headings at the end, radians."""
+GROUPS: Final = ("vehicles", "head-on", "pedestrians")
+"""Kinds of accidents that are counted apart: with a pedestrian, who does not brake as a vehicle does; of vehicles that
+meet head-on, where it matters most how the other goes on if one of them brakes; and all others."""
+WARNED: Final = (*BRAKERS, "ego")
+"""Who is warned and brakes; `ego` alone counts only the accidents of the ego."""
+_SHARES: Final = (0.5, 0.9)
+"""Shares of accidents for which the text gives the seconds of warning that they need."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -294,13 +301,6 @@ def _secondary(
     return tuple(secondary_contacts(accident, tracks, starts, np.tile(decelerations, len(MASKS))))
 
 
-GROUPS: Final = ("vehicles", "head-on", "pedestrians")
-"""Kinds of accidents that are counted apart: with a pedestrian, who does not brake as a vehicle does; of vehicles that
-meet head-on, where it matters most how the other goes on if one of them brakes; and all others."""
-WARNED: Final = (*BRAKERS, "ego")
-"""Who is warned and brakes; `ego` alone counts only the accidents of the ego."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OutcomeShares(FrozenArrays):
     """Shares of outcomes over a group of accidents, for L leads of the warning and K ways to brake.
@@ -392,10 +392,6 @@ def _figures(accident: Avoidability, outcomes: Outcomes) -> FloatArray:
     ranges = delta_v_ranges(accident.accident.masses, relative).max(axis=-2)
     classes = outcomes.outcome[..., None] == np.arange(len(OUTCOMES))
     return np.dstack([classes, outcomes.extrapolated, relative, outcomes.delta_v.max(axis=-1), ranges])
-
-
-_SHARES: Final = (0.5, 0.9)
-"""Shares of accidents for which the text gives the seconds of warning that they need."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

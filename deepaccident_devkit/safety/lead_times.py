@@ -33,6 +33,23 @@ if TYPE_CHECKING:
     from deepaccident_devkit.parallel import Engine
 
 _PAIR = 2
+EGO: Final = AGENTS[0]
+PARTNERS: Final = AGENTS[1:]
+"""The agents that can join `ego_vehicle`."""
+CAVEAT: Final = "Observation bounds warning from above; it is no prediction."
+_RESAMPLES: Final = 2000
+_CONFIDENCE: Final = 0.95
+_FEWEST: Final = 6
+"""Accidents of which a mean has an interval."""
+_OF_ACCIDENT: Final = (
+    "scenario",
+    "actor_ids",
+    "categories",
+    "colliding_agents",
+    "ego_collides",
+    "missing",
+    "num_frames",
+)
 
 
 def coalition_members(partners: int) -> BoolArray:
@@ -120,9 +137,6 @@ def shapley_values(leads: ArrayLike) -> FloatArray:
     return result
 
 
-EGO: Final = AGENTS[0]
-PARTNERS: Final = AGENTS[1:]
-"""The agents that can join `ego_vehicle`."""
 _MEMBERS: Final = coalition_members(len(PARTNERS))
 COALITIONS: Final[tuple[tuple[AgentName, ...], ...]] = tuple(
     (EGO, *(name for name, joins in zip(PARTNERS, row, strict=True) if joins)) for row in _MEMBERS.tolist()
@@ -279,13 +293,6 @@ def _whole_ledger(observed: BoolArray, partners: tuple[AgentName, ...]) -> tuple
     shapley = np.full(len(PARTNERS), np.nan)
     shapley[places] = shapley_values(leads)
     return every_frame, every_lead, shapley
-
-
-CAVEAT: Final = "Observation bounds warning from above; it is no prediction."
-_RESAMPLES: Final = 2000
-_CONFIDENCE: Final = 0.95
-_FEWEST: Final = 6
-"""Accidents of which a mean has an interval."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -477,15 +484,6 @@ def _mean_time(values: FloatArray, drawn: FloatArray) -> MeanTime:
     return MeanTime(mean=mean, low=ends[0], high=ends[1], accidents=len(values))
 
 
-_OF_ACCIDENT: Final = (
-    "scenario",
-    "actor_ids",
-    "categories",
-    "colliding_agents",
-    "ego_collides",
-    "missing",
-    "num_frames",
-)
 _CSV_HEADING: Final = (
     *_OF_ACCIDENT,
     *(f"lead_{'+'.join(members)}" for members in COALITIONS),

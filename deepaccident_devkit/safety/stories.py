@@ -45,6 +45,11 @@ _SIDES: Final = {
     "left": "on its left side",
     "right": "on its right side",
 }
+DECELERATION: Final = 6.0
+"""m/s² of the braking that a story tells of: the middle one of `BRAKINGS`."""
+_EGO: Final = "ego_vehicle"
+_TURNS: Final = {_EGO: "ego_direction", "other_vehicle": "other_direction"}
+"""Agent → the column of the scenario table that tells its way."""
 
 
 def story_text(facts: Mapping[str, Any]) -> str:
@@ -162,13 +167,6 @@ def _number(value: float | None, form: str) -> str | None:
 
 def _listed(parts: Iterable[str | None], by: str = ", ") -> str | None:
     return by.join(part for part in parts if part) or None
-
-
-DECELERATION: Final = 6.0
-"""m/s² of the braking that a story tells of: the middle one of `BRAKINGS`."""
-_EGO: Final = "ego_vehicle"
-_TURNS: Final = {_EGO: "ego_direction", "other_vehicle": "other_direction"}
-"""Agent → the column of the scenario table that tells its way."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

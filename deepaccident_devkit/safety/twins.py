@@ -32,6 +32,44 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 _OTHER_ENDING: Final[Mapping[str, str]] = {"normal": "accident", "accident": "normal"}
+_OVER_TIME: Final = (
+    "actor_id",
+    "twin_id",
+    "frame",
+    *("x", "y", "yaw"),
+    *("twin_x", "twin_y", "twin_yaw"),
+    "speed",
+    "twin_speed",
+    "distance",
+    "heading_difference",
+)
+_OF_TWINS: Final = (
+    "accident",
+    "twin",
+    "shift",
+    "begins_together",
+    "parting_frame",
+    "parting_time",
+    "time_to_impact",
+    "gap_at_impact",
+    "nearest_gap_in_twin",
+    "nearest_frame_in_twin",
+)
+_OF_ACTORS: Final = (
+    "actor_id",
+    "twin_id",
+    "category",
+    "agent",
+    "collides",
+    "matched_by",
+    "parting_frame",
+    "largest_distance",
+    "largest_heading_difference",
+    "largest_speed_difference",
+)
+_NAMED: Final = 2
+"""Actors that a line names at most."""
+_APART: Final = "the recordings do not begin together, so that it is not known when they part"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,17 +125,6 @@ def torn_twins(split_of: Mapping[str, str | None]) -> tuple[TornTwins, ...]:
 
 
 _NEVER: Final = 10**6
-_OVER_TIME: Final = (
-    "actor_id",
-    "twin_id",
-    "frame",
-    *("x", "y", "yaw"),
-    *("twin_x", "twin_y", "twin_yaw"),
-    "speed",
-    "twin_speed",
-    "distance",
-    "heading_difference",
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -387,37 +414,6 @@ def _taken(values: Any, rows: IntArray, missing: float = np.nan) -> Any:
     result = values[rows].copy()
     result[rows < 0] = missing
     return result
-
-
-_OF_TWINS: Final = (
-    "accident",
-    "twin",
-    "shift",
-    "begins_together",
-    "parting_frame",
-    "parting_time",
-    "time_to_impact",
-    "gap_at_impact",
-    "nearest_gap_in_twin",
-    "nearest_frame_in_twin",
-)
-_OF_ACTORS: Final = (
-    "actor_id",
-    "twin_id",
-    "category",
-    "agent",
-    "collides",
-    "matched_by",
-    "parting_frame",
-    "largest_distance",
-    "largest_heading_difference",
-    "largest_speed_difference",
-)
-
-
-_NAMED: Final = 2
-"""Actors that a line names at most."""
-_APART: Final = "the recordings do not begin together, so that it is not known when they part"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,5 @@
 """Statistics of interactions: as `da.interactions` has them, and only if asked for."""
 
-
 import numpy as np
 from click.testing import CliRunner
 
