@@ -176,6 +176,20 @@ def as_floats(values: ArrayLike) -> FloatArray:
         raise GeometryError(f"expected numbers, found {type(values).__name__} ({error})") from error
 
 
+def known(values: ArrayLike | None, digits: int | None = None) -> Any:
+    """Numbers as JSON holds them, in lists as deep as the array: None for those that are not finite, and for None.
+
+    Args:
+        values: of any shape.
+        digits: decimals to round to; None for all.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim:
+        return [known(each, digits) for each in array]
+    number = array.item() if np.isfinite(array) else None
+    return number if number is None or digits is None else round(number, digits)
+
+
 def readonly(array: AnyArray) -> AnyArray:
     """Return a read-only view of `array`; the caller's own array stays writable."""
     view = array.view()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +13,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.reports import Report
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CHANNEL_FORMAT,
@@ -32,7 +32,7 @@ _UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Overview:
+class Overview(Report):
     """Counts over one release, or over some of its scenarios.
 
     Attributes:
@@ -72,10 +72,6 @@ class Overview:
     samples: int
     attributes: Mapping[str, Mapping[str, int]]
     left_out: Sequence[str]
-
-    def to_json(self) -> str:
-        """One JSON object."""
-        return json.dumps(asdict(self), indent=2, ensure_ascii=False)
 
     def to_text(self) -> str:
         """Some aligned blocks for a terminal."""

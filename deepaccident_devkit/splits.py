@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Final
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.release import write_split_file
+from deepaccident_devkit.reports import Report
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SCENARIO_ATTRIBUTES, SPLITS, VEHICLE_AGENTS
-from deepaccident_devkit.text import columns_text, natural_order
+from deepaccident_devkit.text import columns_text, natural_order, share_text
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
@@ -156,7 +155,7 @@ def save_selection(scenarios: Iterable[RowArgument], path: str | os.PathLike[str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SplitReport(ShortRepr):
+class SplitReport(Report):
     """How the scenarios of some splits are distributed.
 
     Attributes:
@@ -175,10 +174,6 @@ class SplitReport(ShortRepr):
     attributes: Mapping[str, Mapping[str, Mapping[str, int]]]
     left_out: Sequence[str]
 
-    def to_json(self) -> str:
-        """One JSON object."""
-        return json.dumps(asdict(self), indent=2, ensure_ascii=False)
-
     def to_text(self) -> str:
         """A block of counts and shares for each attribute, a column for each split."""
         names = list(self.scenarios)
@@ -188,15 +183,14 @@ class SplitReport(ShortRepr):
             columns_text([("split", *names)] + [(word, *map(str, row.values())) for word, row in totals.items()]),
         ]
         for field, counts in self.attributes.items():
-            rows = [(value, *(self._cell(name, row[name]) for name in names)) for value, row in counts.items()]
+            rows = [
+                (value, *(share_text(row[name], self.scenarios[name]) for name in names))
+                for value, row in counts.items()
+            ]
             blocks.append(columns_text([(field, *names), *rows]))
         if self.left_out:
             blocks.append(f"left out, as ego_vehicle has five labels or fewer: {len(self.left_out)} scenarios")
         return "\n\n".join(blocks)
-
-    def _cell(self, split: str, count: int) -> str:
-        total = self.scenarios[split]
-        return f"{count} ({round(100 * count / total) if total else 0:>3} %)"
 
 
 def split_report(dataset: Dataset, splits: Splits | Mapping[str, Collection[str]]) -> SplitReport:

@@ -109,6 +109,11 @@ SCENARIO_ATTRIBUTES: Final = ("scenario_type", "town", "weather", "time_of_day",
 """The scenario fields by which overviews and split reports count."""
 
 
+def short_name(agent: str) -> str:
+    """An agent's short name for headings: `ego`, `ego behind`, `other`, `other behind`, `infrastructure`."""
+    return agent.replace("_vehicle", "").replace("_", " ")
+
+
 def frame_timestamp(frame_index: int) -> float:
     """Seconds since the first recorded frame of frame number `frame_index` (counted from 1)."""
     return (frame_index - 1) / 10

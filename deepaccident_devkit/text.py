@@ -1,4 +1,4 @@
-"""Text for people and by them: columns, HTML for a notebook, words in any case, what was probably meant."""
+"""Text for people and by them: columns, numbers, words in any case, what was probably meant."""
 
 import base64
 import math
@@ -51,18 +51,26 @@ class Pictured:
         return html
 
 
-def rows_html(rows: Sequence[Sequence[str]], caption: str = "") -> str:
-    """A table for a notebook; the first row is the heading."""
-    cells = [
-        "".join(f"<{kind}>{escape(word)}</{kind}>" for word in row)
-        for kind, row in zip(["th", *["td"] * (len(rows) - 1)], rows, strict=True)
-    ]
-    return f"<table><caption>{escape(caption)}</caption>{''.join(f'<tr>{each}</tr>' for each in cells)}</table>"
-
-
 def fixed_text(value: float, digits: int) -> str:
     """A number with so many decimals, and no sign on zero."""
     return f"{round(float(value), digits) + 0.0:.{digits}f}"
+
+
+def number_text(value: float | None, digits: int = 1) -> str:
+    """A number with so many decimals; a dash for None and NaN, `never` for an infinite one."""
+    if value is None or math.isnan(value):
+        return "–"
+    return "never" if math.isinf(value) else fixed_text(value, digits)
+
+
+def share_text(count: int, total: int) -> str:
+    """A count, and its share in percent: `1,200 ( 12 %)`."""
+    return f"{count:,} ({round(100 * count / total) if total else 0:>3} %)"
+
+
+def counted(count: int, word: str) -> str:
+    """A number and what it is of: `1 scenario`, `1,200 scenarios`."""
+    return f"{count:,} {word}{'' if count == 1 else 's'}"
 
 
 def size_text(count: int) -> str:

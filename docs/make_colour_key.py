@@ -11,8 +11,7 @@ from deepaccident_devkit.render import colors, detached_figure
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
 from deepaccident_devkit.render.motion_cells import direction_colors
 from deepaccident_devkit.render.pictures import save_picture
-from deepaccident_devkit.render.roles import short_name
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 PICTURE = Path(__file__).parent / "images" / "colour_key.png"
 SIZES = {

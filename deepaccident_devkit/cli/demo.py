@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,15 +16,6 @@ from tqdm import tqdm
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.baselines import Baseline, predict_results
-from deepaccident_devkit.cli.demo_page import (
-    MODEL_PICTURE,
-    PAGE,
-    PICTURES,
-    REPLAY,
-    REPORT_FOLDER,
-    NextStep,
-    demo_page,
-)
 from deepaccident_devkit.cli.options import use_threads_sparingly
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -35,9 +26,11 @@ from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_result
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import place_in, remove_leftovers, write_bytes
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
+from deepaccident_devkit.pages import document
 from deepaccident_devkit.render import detached_figure, render_replay
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
 from deepaccident_devkit.render.pictures import save_picture
+from deepaccident_devkit.render.theme import page_style
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import columns_text
@@ -45,6 +38,20 @@ from deepaccident_devkit.text import columns_text
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import FrameRecord, ScenarioRecord
 
+PAGE: Final = "index.html"
+PICTURES: Final = (
+    "countdown.png",
+    "five_agents_1s_before.png",
+    "ego_cameras_1s_before.png",
+    "motion_labels_1s_before.png",
+)
+"""Files beside the page, as its template shows them."""
+MODEL_PICTURE: Final = "model_1s_before.png"
+"""Likewise, of the picture that is made where PyTorch is installed."""
+REPLAY: Final = "replay.html"
+REPORT_FOLDER: Final = "evaluation"
+_POLICY: Final = "default-src 'none'; img-src 'self' file:; frame-src 'self' file:; style-src 'unsafe-inline'"
+"""A browser loads only what lies beside the page, on a disk or a server; only the pages in frames run anything."""
 SCENARIO: Final = """\
 # The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. A house hides it from
 # ego until about 2.5 s before the impact; from then on it is in ego's front camera.
@@ -94,6 +101,19 @@ _STEPS: Final = {
 _BAR: Final = "{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
 
 
+@dataclass(frozen=True, slots=True)
+class NextStep:
+    """Something to try next.
+
+    Attributes:
+        sentence: what it does.
+        command: for a shell.
+    """
+
+    sentence: str
+    command: str
+
+
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path), default="deepaccident_demo")
 @click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
@@ -130,6 +150,30 @@ def demo(out: Path, workers: int | None) -> None:
     click.echo(f"\nOpen this page in a browser, it shows all that was made: {out / PAGE}")
 
 
+def demo_page(table: Sequence[Sequence[str]], steps: Sequence[NextStep], *, model: bool) -> str:
+    """The complete page; it refers to the other files of its folder by their names.
+
+    Args:
+        table: of `demo_table`.
+        steps: what to try next.
+        model: whether there is a picture of a model's predictions.
+    """
+    heading, *rows = zip(*table, strict=True)  # a column for each set of agents: it fits a narrow window
+    return document(
+        "demo.html",
+        style=page_style(),
+        policy=_POLICY,
+        pictures=PICTURES,
+        model=MODEL_PICTURE if model else "",
+        heading=heading,
+        rows=rows,
+        replay=REPLAY,
+        report=f"{REPORT_FOLDER}/report.html",
+        folder=str(Path.cwd()),
+        steps=steps,
+    )
+
+
 def draw_accident(release: DeepAccident, out: Path) -> None:
     """Render the first accident: the countdown to it, and the five agents, ego's cameras and labels a second before."""
     accident, before = _accident_and_before(release)
@@ -152,8 +196,7 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
     Returns:
         Whether PyTorch is installed; without it there is no picture.
     """
-    [name] = MODEL_PICTURE
-    (out / name).unlink(missing_ok=True)  # of an earlier demo
+    (out / MODEL_PICTURE).unlink(missing_ok=True)  # of an earlier demo
     use_threads_sparingly()
     try:
         from deepaccident_devkit.model import PredictConfig, load_model, predictions
@@ -171,7 +214,7 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
         for ax, frame in zip(column, (0, None), strict=True):
             draw_motion_outcome(found.motion, label, frame=frame, ax=ax)
             ax.set_title(f"{title}: {ax.get_title()}")
-    save_picture(fig, out / name, dpi=80)
+    save_picture(fig, out / MODEL_PICTURE, dpi=80)
     return True
 
 

@@ -13,8 +13,7 @@ from starlette.responses import Response
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError, NotAvailableError, TokenError
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.pages import models, pictures, release, scenario, scenarios
-from deepaccident_devkit.explore.pages.answers import page
-from deepaccident_devkit.explore.pages.static import static_routes
+from deepaccident_devkit.explore.pages.answers import page, static_routes
 
 logger = logging.getLogger(__name__)
 _NOT_THERE: Final = (TokenError, ChoiceError, FieldError, NotAvailableError)

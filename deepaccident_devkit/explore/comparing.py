@@ -10,8 +10,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.runs import compare_bundles
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.evaluations import evaluated
-from deepaccident_devkit.explore.models import Score
-from deepaccident_devkit.explore.standings import scores_of, standings
+from deepaccident_devkit.explore.models import Score, scores_of, standings
 
 if TYPE_CHECKING:
     from deepaccident_devkit.evaluation.runs import Bundle

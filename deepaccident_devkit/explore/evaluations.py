@@ -16,8 +16,8 @@ from deepaccident_devkit.evaluation.runs import Bundle
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE, Line
 from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.json_text import as_record
+from deepaccident_devkit.pages import scalar
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
-from deepaccident_devkit.render.markup import scalar
 
 _METHOD: Final = ("method", "name", "authors", "url", "date")
 """What results say of themselves, and is shown if they do."""

@@ -13,8 +13,8 @@ from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes, 
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.choices import MOST_WORD
+from deepaccident_devkit.explore.models import standings_job
 from deepaccident_devkit.explore.scenarios import UNKNOWN
-from deepaccident_devkit.explore.standings import standings_job
 from deepaccident_devkit.text import natural_order
 
 if TYPE_CHECKING:

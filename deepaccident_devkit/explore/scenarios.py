@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.explore.background import Job, Jobs
 from deepaccident_devkit.interactions import interactions_of
 from deepaccident_devkit.safety import lead_times
-from deepaccident_devkit.safety.scenarios import each_scenario
+from deepaccident_devkit.safety.scenarios import each_scenario, those_of
 from deepaccident_devkit.selection.fields import FIELDS, group_texts, measures_of_moving_pairs
 from deepaccident_devkit.text import natural_order
 
@@ -138,7 +138,7 @@ class Scenarios:
 
     def _accidents(self) -> dict[str, list[Any]]:
         found = each_scenario(accident_columns, self.dataset, label="accidents", workers=self._workers)
-        return _columns(ACCIDENTS, found.results)
+        return _columns(ACCIDENTS, those_of(dict, found))
 
 
 def _columns(job: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:

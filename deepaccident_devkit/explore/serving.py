@@ -21,7 +21,7 @@ from deepaccident_devkit.explore.access import Access, App, Gate
 from deepaccident_devkit.explore.addresses import HostPort, RootPath
 
 LOOPBACK: Final = "127.0.0.1"
-_NEEDED: Final = ("starlette", "uvicorn", "jinja2")
+_NEEDED: Final = ("starlette", "uvicorn")
 _PORTS: Final = range(8765, 8785)
 """Tried first; then the machine chooses one."""
 _LAST_PORT: Final = 0xFFFF

@@ -17,20 +17,18 @@ from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.explore.background import Jobs
 from deepaccident_devkit.explore.choices import SCORE, find_call, where_words
 from deepaccident_devkit.explore.models import Model, open_models
-from deepaccident_devkit.explore.pages.answers import environment
+from deepaccident_devkit.explore.pages.answers import assets
 from deepaccident_devkit.explore.pages.scenario import PARTS
 from deepaccident_devkit.explore.pages.scenarios import SLOW, Cell, cell, entry, score_cell, sort_key
-from deepaccident_devkit.explore.pages.static import assets
 from deepaccident_devkit.explore.static_folder import MARK, exported, target_folder
 from deepaccident_devkit.explore.static_work import REPLAY, THUMBNAIL, Told, Work, tell
 from deepaccident_devkit.explore.verdicts import verdict
 from deepaccident_devkit.files import plain_names, write_bytes
+from deepaccident_devkit.pages import rendered, result_text
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.render.markup import number
-from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.selection import find
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
@@ -39,7 +37,7 @@ MOST: Final = 50
 """Scenarios of an export: a replay takes some seconds and up to 15 MB."""
 INDEX: Final = "index.html"
 _STATIC: Final = "static"
-_ASSETS: Final = ("pages.css", "explore.css", "written.css", "keys.js", "sorting.js")
+_ASSETS: Final = ("pages.css", "explore.css", "keys.js", "sorting.js")
 _FORESEEN: Final = ("motion", "accident")
 """Results that a replay can show."""
 _POLICY: Final = (
@@ -227,19 +225,16 @@ class _Pages:
         def own(token: str) -> str:
             return f"{root}{quote(self._names[token])}"
 
-        text = (
-            environment()
-            .get_template(template)
-            .render(
-                root=root,
-                models=(),
-                static=True,
-                policy=_POLICY,
-                asset=lambda _, name: f"{root}{_STATIC}/{name}",
-                scenario_at=lambda _, token: f"{own(token)}/{INDEX}",
-                thumbnail_at=lambda _, token: f"{own(token)}/{THUMBNAIL}",
-                **context,
-            )
+        text = rendered(
+            template,
+            root=root,
+            models=(),
+            static=True,
+            policy=_POLICY,
+            asset=lambda _, name: f"{root}{_STATIC}/{name}",
+            scenario_at=lambda _, token: f"{own(token)}/{INDEX}",
+            thumbnail_at=lambda _, token: f"{own(token)}/{THUMBNAIL}",
+            **context,
         )
         write_bytes(self._folder / name, text.encode())
 
@@ -274,5 +269,5 @@ def _cell(column: str, value: Any) -> Cell:
     if isinstance(value, str):
         return Cell(short_name(value) if column == "agent" else value, None)
     if isinstance(value, bool):
-        return Cell(number(value), None)
-    return Cell(number(value), sort_key(value))
+        return Cell(result_text(value), None)
+    return Cell(result_text(value), sort_key(value))

@@ -9,13 +9,13 @@ from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.explore.pages.answers import environment
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_context
 from deepaccident_devkit.explore.pages.scenarios import SLOW
 from deepaccident_devkit.explore.scenarios import accident_columns
 from deepaccident_devkit.explore.thumbnails import thumbnail
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.interactions import interactions
+from deepaccident_devkit.pages import rendered
 from deepaccident_devkit.render.replay import recording_of, tried_replay
 from deepaccident_devkit.render.replay.facts import facts
 from deepaccident_devkit.selection.fields import measures_of_moving_pairs
@@ -89,8 +89,7 @@ def _part(dataset: Dataset, token: str, name: str) -> str:
             replace(each, where=_without_place(dataset, each.where), what=_without_place(dataset, each.what))
             for each in context["findings"]
         ]
-    template = environment().get_template(f"parts/{name}.html")
-    return template.render(root="", static=True, frame_number=str, **context)
+    return rendered(f"parts/{name}.html", root="", static=True, frame_number=str, **context)
 
 
 def _without_place(dataset: Dataset, text: str) -> str:

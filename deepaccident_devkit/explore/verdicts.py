@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentsWithin
 from deepaccident_devkit.explore.evaluations import finite
-from deepaccident_devkit.render.markup import scalar
+from deepaccident_devkit.pages import scalar
 from deepaccident_devkit.render.outcomes.accident import count_words
 
 Row = Mapping[str, Any]

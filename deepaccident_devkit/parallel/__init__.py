@@ -3,7 +3,7 @@
 Every function that works on many scenarios or samples takes `workers` and `executor`; none has a pool of its own.
 """
 
-from deepaccident_devkit.parallel.batches import Progress, in_order, run_batch, run_unordered
+from deepaccident_devkit.parallel.batches import Engine, Progress, in_order, run_batch, run_unordered
 from deepaccident_devkit.parallel.calls import Places
 from deepaccident_devkit.parallel.executors import cluster_executor
 from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
@@ -21,6 +21,7 @@ from deepaccident_devkit.parallel.shard import (
 
 __all__ = [
     "MERGE",
+    "Engine",
     "Failure",
     "Part",
     "Places",

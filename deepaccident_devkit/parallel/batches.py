@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, TypeAlias, TypedDict, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError, WorkerError
 from deepaccident_devkit.parallel.calls import Call, Places, marked
@@ -24,6 +24,24 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress: TypeAlias = "bool | Callable[[float], object]"
 """Whether to show a progress bar; or a function that gets each item's share of the work, for a bar of the caller's."""
+
+
+class Engine(TypedDict, total=False):
+    """How bulk work runs: every function that works on many scenarios or samples takes these, and raises these errors.
+
+    ChoiceError: `workers` is less than 1. WorkerError: a worker was killed, or cannot do the work.
+
+    Attributes:
+        workers: processes; 1 for this one alone, None for as many as the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        progress: whether to show a bar.
+    """
+
+    workers: int | None
+    executor: Executor | None
+    progress: bool
+
+
 _SAME_SIGNAL: Final = 0.1
 """Seconds in which a signal that ended a worker ends this process too, if it was sent to all processes of a job."""
 _AHEAD: Final = 4

@@ -14,11 +14,11 @@ from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.pair import PAIR_LAYERS, Pair, draw_pair_from_above, draw_pair_in_camera, number_words
-from deepaccident_devkit.render.roles import in_drawing_order, short_name
+from deepaccident_devkit.render.roles import in_drawing_order
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.v2x.configurations import agents_of

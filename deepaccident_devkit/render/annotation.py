@@ -17,9 +17,10 @@ from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_boxes_i
 from deepaccident_devkit.render.camera import draw_image
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
-from deepaccident_devkit.render.roles import role_colors, short_name
+from deepaccident_devkit.render.roles import role_colors
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.taxonomy import short_name
 from deepaccident_devkit.v2x.projection import camera_of
 
 if TYPE_CHECKING:

@@ -29,12 +29,12 @@ from deepaccident_devkit.render.colors import (
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend, handles_from_above
 from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
-from deepaccident_devkit.render.roles import at_once, collider_ids, label_ids, recorder_ids, role_colors, short_name
+from deepaccident_devkit.render.roles import at_once, collider_ids, label_ids, recorder_ids, role_colors
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.render.town_map import draw_town_map, map_beneath
 from deepaccident_devkit.render.trails import draw_trails
-from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame
+from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame, short_name
 from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x import (
     Agents,

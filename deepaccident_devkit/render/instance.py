@@ -19,13 +19,13 @@ from deepaccident_devkit.render.boxes import draw_boxes_from_above, write_beside
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.roles import agent_actors, camera_name, in_drawing_order, role_colors, short_name
+from deepaccident_devkit.render.roles import agent_actors, camera_name, in_drawing_order, role_colors
 from deepaccident_devkit.render.sights import Sightings, sightings
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title, set_title
 from deepaccident_devkit.render.trails import draw_trail
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
-from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, frame_timestamp
+from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, frame_timestamp, short_name
 from deepaccident_devkit.v2x import Agents, cooperating_agents
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 

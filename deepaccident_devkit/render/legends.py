@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, CATEGORY_MARKERS, COLLIDER_COLOR
-from deepaccident_devkit.render.roles import in_drawing_order, short_name
+from deepaccident_devkit.render.roles import in_drawing_order
 from deepaccident_devkit.render.titles import room_of, text_width
+from deepaccident_devkit.taxonomy import short_name
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -19,10 +19,9 @@ from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.colors import AGENT_COLORS, MUTED_COLOR, OWN_COLOR, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend
-from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
-from deepaccident_devkit.taxonomy import UNTRACKED_ID
+from deepaccident_devkit.taxonomy import UNTRACKED_ID, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, dra
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.legends import box_handles, draw_legend, handles_from_above
-from deepaccident_devkit.render.roles import at_once, in_drawing_order, short_name
+from deepaccident_devkit.render.roles import at_once, in_drawing_order
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
-from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.taxonomy import CAMERAS, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from deepaccident_devkit.render.colors import (
 )
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.motion_maps import DrawnMap, MotionMaps
-from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.taxonomy import short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, AgentName
+from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, AgentName, short_name
 from deepaccident_devkit.v2x import Contact
 from deepaccident_devkit.v2x.configurations import agents_of
 
@@ -62,11 +62,6 @@ def label_ids(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[int]:
     own = dataset.get("agent", dataset.get("sample", sample)["agent_token"])["actor_id"]
     ids: list[int] = np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist()
     return ids
-
-
-def short_name(agent: str) -> str:
-    """An agent's short name for pictures: `ego`, `ego behind`, `other`, `other behind`, `infrastructure`."""
-    return agent.replace("_vehicle", "").replace("_", " ")
 
 
 def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:

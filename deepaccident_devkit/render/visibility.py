@@ -21,11 +21,11 @@ from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
-from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
+from deepaccident_devkit.render.roles import in_drawing_order, role_colors
 from deepaccident_devkit.render.sights import Sights, sights
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
-from deepaccident_devkit.taxonomy import Frame
+from deepaccident_devkit.taxonomy import Frame, short_name
 from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, aggregate_point_cloud
 

@@ -29,13 +29,26 @@ from deepaccident_devkit.interactions import (
     time_to_collision_1d,
 )
 from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, accidents_of
-from deepaccident_devkit.safety.avoidability import Avoidability, avoidability, avoidability_of
-from deepaccident_devkit.safety.avoidability_report import AvoidabilityReport, avoidability_report
-from deepaccident_devkit.safety.avoidability_shares import OutcomeShares, outcome_shares
-from deepaccident_devkit.safety.lead_times import COALITIONS, PARTNERS, LeadTimes, lead_times
-from deepaccident_devkit.safety.leads import coalition_leads, shapley_values
-from deepaccident_devkit.safety.ledger import lead_time_ledger
-from deepaccident_devkit.safety.ledger_report import LeadTimeLedger, MeanTime
+from deepaccident_devkit.safety.avoidability import (
+    Avoidability,
+    AvoidabilityReport,
+    OutcomeShares,
+    avoidability,
+    avoidability_of,
+    avoidability_report,
+    outcome_shares,
+)
+from deepaccident_devkit.safety.lead_times import (
+    COALITIONS,
+    PARTNERS,
+    LeadTimeLedger,
+    LeadTimes,
+    MeanTime,
+    coalition_leads,
+    lead_time_ledger,
+    lead_times,
+    shapley_values,
+)
 from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
 from deepaccident_devkit.safety.outcomes import (
     BRAKINGS,
@@ -46,14 +59,18 @@ from deepaccident_devkit.safety.outcomes import (
     outcomes_of,
     undisturbed,
 )
-from deepaccident_devkit.safety.overall_report import SafetyReport, safety_report
-from deepaccident_devkit.safety.report_rows import AccidentRow, PairMeasures
-from deepaccident_devkit.safety.stories import Story, describe, scenario_facts, stories
-from deepaccident_devkit.safety.story_text import story_text
-from deepaccident_devkit.safety.twin_comparison import twin_diff
-from deepaccident_devkit.safety.twin_diff import Parting, TwinDiff
-from deepaccident_devkit.safety.twin_report import TwinReport, twin_report
-from deepaccident_devkit.safety.twins import TornTwins, torn_twins, twin_of
+from deepaccident_devkit.safety.report import AccidentRow, PairMeasures, SafetyReport, safety_report
+from deepaccident_devkit.safety.stories import Story, describe, scenario_facts, stories, story_text
+from deepaccident_devkit.safety.twins import (
+    Parting,
+    TornTwins,
+    TwinDiff,
+    TwinReport,
+    torn_twins,
+    twin_diff,
+    twin_of,
+    twin_report,
+)
 
 __all__ = [
     "BRAKINGS",

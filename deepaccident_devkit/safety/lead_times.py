@@ -1,23 +1,142 @@
-"""`LeadTimes`: how long before an accident's impact each set of agents first observes both colliders."""
+"""How long before an accident's impact sets of agents first observe both colliders, and what each partner adds.
+
+First over arrays, then of an accident, then of all accidents of a release. An ego and n partners observe two
+colliders. A coalition is the ego with some of the partners: of coalition number k, partner i is one if bit i of k is
+set, so that number 0 is the ego alone and the last one is all of them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
+from math import factorial
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.safety.accidents import accident_of
-from deepaccident_devkit.safety.leads import coalition_members, first_together, leads_from, shapley_values
+from deepaccident_devkit.errors import GeometryError, NotAvailableError
+from deepaccident_devkit.reports import Report, Row
+from deepaccident_devkit.safety.accidents import Skipped, accident_of
 from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
-from deepaccident_devkit.taxonomy import AGENTS, AgentName
+from deepaccident_devkit.safety.scenarios import each_scenario, reasons_text, skipped_rows, those_of
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, AgentName, short_name
+from deepaccident_devkit.text import columns_text
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
+
+_PAIR = 2
 EGO: Final = AGENTS[0]
 PARTNERS: Final = AGENTS[1:]
 """The agents that can join `ego_vehicle`."""
+CAVEAT: Final = "Observation bounds warning from above; it is no prediction."
+_RESAMPLES: Final = 2000
+_CONFIDENCE: Final = 0.95
+_FEWEST: Final = 6
+"""Accidents of which a mean has an interval."""
+_OF_ACCIDENT: Final = (
+    "scenario",
+    "actor_ids",
+    "categories",
+    "colliding_agents",
+    "ego_collides",
+    "missing",
+    "num_frames",
+)
+
+
+def coalition_members(partners: int) -> BoolArray:
+    """Which partners are in each coalition: (2^n, n)."""
+    members: BoolArray = (np.arange(1 << partners)[:, None] >> np.arange(partners) & 1).astype(bool)
+    return members
+
+
+def first_together(observed: ArrayLike) -> IntArray:
+    """The first frame at which the union over a coalition observes both colliders.
+
+    Args:
+        observed: (…, 1 + n, 2, F) bool: whether the ego (first) and each partner observe each collider at each frame.
+            Recordings of several lengths can be one array if they end together, with False before their beginnings.
+
+    Returns:
+        (…, 2^n) position of the frame, from 0; −1 for a coalition that never does.
+
+    Raises:
+        GeometryError: `observed` has another shape.
+    """
+    seen = as_numbers("observed", observed, "truth values (…, agents, 2, frames)", np.bool_)
+    if seen.ndim < 3 or seen.shape[-2] != _PAIR or not seen.shape[-3]:
+        raise GeometryError(f"observed: expected shape (…, agents, 2, frames), found {seen.shape}")
+    coalitions = coalition_members(seen.shape[-3] - 1)
+    both = np.zeros((*seen.shape[:-3], len(coalitions), seen.shape[-1]), dtype=bool)
+    for number, members in enumerate(coalitions):
+        union = np.asarray(seen[..., np.concatenate([[True], members]), :, :].any(axis=-3))
+        both[..., number, :] = union[..., 0, :] & union[..., 1, :]
+    first: IntArray = np.where(both.any(axis=-1), both.argmax(axis=-1) if both.shape[-1] else 0, -1)
+    return first
+
+
+def coalition_leads(observed: ArrayLike) -> FloatArray:
+    """Seconds from the first frame at which a coalition observes both colliders to the last frame, the impact.
+
+    Args:
+        observed: (…, 1 + n, 2, F) bool, as of `first_together`.
+
+    Returns:
+        (…, 2^n) seconds; 0 for a coalition that never does.
+
+    Raises:
+        GeometryError: `observed` has another shape.
+    """
+    return leads_from(first_together(observed), np.shape(observed)[-1])
+
+
+def leads_from(first: IntArray, frames: int) -> FloatArray:
+    """Seconds from the frames that `first_together` gives (…) to the last one of so many; 0 where it gives −1."""
+    leads: FloatArray = np.where(first < 0, 0, frames - 1 - first) * FRAME_PERIOD
+    return leads
+
+
+def shapley_values(leads: ArrayLike) -> FloatArray:
+    """Each partner's exact Shapley value of the gain in lead time over the ego alone.
+
+    That is how much a partner adds to those who joined before it, as a mean over all orders of joining. The values
+    add up to the gain of all partners together.
+
+    Args:
+        leads: (…, 2^n) of each coalition, as `coalition_leads` gives them.
+
+    Returns:
+        (…, n) in the unit of `leads`.
+
+    Raises:
+        GeometryError: the number of coalitions is no power of two.
+    """
+    values = as_numbers("leads", leads)
+    count = values.shape[-1] if values.ndim else 0
+    partners = count.bit_length() - 1
+    if count != 1 << max(partners, 0):
+        raise GeometryError(f"leads: expected one for each of 2^n coalitions, found shape {values.shape}")
+    members = coalition_members(partners)
+    sizes = members.sum(axis=1)
+    weights = np.array(
+        [factorial(size) * factorial(partners - size - 1) / factorial(partners) for size in range(partners)]
+    )
+    result = np.zeros((*values.shape[:-1], partners))
+    for partner in range(partners):
+        without = np.flatnonzero(~members[:, partner])
+        gains = values[..., without + (1 << partner)] - values[..., without]
+        result[..., partner] = gains @ weights[sizes[without]]
+    return result
+
+
 _MEMBERS: Final = coalition_members(len(PARTNERS))
 COALITIONS: Final[tuple[tuple[AgentName, ...], ...]] = tuple(
     (EGO, *(name for name, joins in zip(PARTNERS, row, strict=True) if joins)) for row in _MEMBERS.tolist()
@@ -114,11 +233,11 @@ class LeadTimes(FrozenArrays):
             "ego_collides": self.ego_collides,
             "missing": list(self.missing),
             "num_frames": self.num_frames,
-            "lead_seconds": dict(zip(names, _known(self.leads), strict=True)),
+            "lead_seconds": dict(zip(names, known(self.leads), strict=True)),
             "first_frames": dict(zip(names, frames, strict=True)),
-            "gain_seconds": dict(zip(PARTNERS, _known(self.gains), strict=True)),
-            "loss_seconds": dict(zip(PARTNERS, _known(self.losses), strict=True)),
-            "shapley_seconds": dict(zip(PARTNERS, _known(self.shapley), strict=True)),
+            "gain_seconds": dict(zip(PARTNERS, known(self.gains), strict=True)),
+            "loss_seconds": dict(zip(PARTNERS, known(self.losses), strict=True)),
+            "shapley_seconds": dict(zip(PARTNERS, known(self.shapley), strict=True)),
         }
 
     @property
@@ -176,5 +295,264 @@ def _whole_ledger(observed: BoolArray, partners: tuple[AgentName, ...]) -> tuple
     return every_frame, every_lead, shapley
 
 
-def _known(values: FloatArray) -> list[float | None]:
-    return [None if np.isnan(value) else value for value in values.tolist()]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeanTime:
+    """A mean over accidents.
+
+    Attributes:
+        mean: seconds; None of no accident.
+        low: end of the interval of 95 % by the bootstrap over accidents; None of fewer than six.
+        high: its other end.
+        accidents: of how many.
+    """
+
+    mean: float | None
+    low: float | None
+    high: float | None
+    accidents: int
+
+    @property
+    def text(self) -> str:
+        """Such as `1.52 [1.20, 1.86]`."""
+        if self.mean is None:
+            return "–"
+        return f"{self.mean:.2f}" + ("" if self.low is None else f" [{self.low:.2f}, {self.high:.2f}]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeadTimeLedger(Report):
+    """The lead times of the accidents of a release, or of some of its scenarios.
+
+    Attributes:
+        dataroot: the release's folder.
+        version: `v1` or `v1-mini`.
+        rule: when an actor counts as observed.
+        accidents: in the order of the release.
+        skipped: scenarios of which the lead times cannot be told, and why.
+        without_accident: scenarios whose meta file names no collision.
+    """
+
+    dataroot: str
+    version: str
+    rule: ObservationRule
+    accidents: tuple[LeadTimes, ...]
+    skipped: tuple[Skipped, ...]
+    without_accident: int
+
+    @cached_property
+    def mean_leads(self) -> tuple[MeanTime, ...]:
+        """Of each of `COALITIONS`, the mean lead time; accidents without one of its agents do not count."""
+        return mean_times(np.array([each.leads for each in self.accidents]).reshape(-1, len(COALITIONS)))
+
+    @cached_property
+    def mean_gains(self) -> tuple[MeanTime, ...]:
+        """Of each of `PARTNERS`, the mean of what it adds to the ego alone."""
+        return mean_times(np.array([each.gains for each in self.accidents]).reshape(-1, len(PARTNERS)))
+
+    @cached_property
+    def mean_losses(self) -> tuple[MeanTime, ...]:
+        """Of each of `PARTNERS`, the mean of what all agents lose without it."""
+        return mean_times(np.array([each.losses for each in self.accidents]).reshape(-1, len(PARTNERS)))
+
+    @cached_property
+    def mean_shapley(self) -> tuple[MeanTime, ...]:
+        """Of each of `PARTNERS`, its mean Shapley value."""
+        return mean_times(np.array([each.shapley for each in self.accidents]).reshape(-1, len(PARTNERS)))
+
+    @property
+    def mean_together(self) -> MeanTime:
+        """Of all agents that each accident has."""
+        return mean_times(np.array([each.together for each in self.accidents]).reshape(-1, 1))[0]
+
+    @property
+    def share_never_alone(self) -> float | None:
+        """Share of the accidents whose colliders the ego alone never observes at the same frame; None of none."""
+        return _share([each.never_alone for each in self.accidents])
+
+    @property
+    def share_never_together(self) -> float | None:
+        """The same of all agents together."""
+        return _share([each.never_together for each in self.accidents])
+
+    @property
+    def share_from_the_start(self) -> float | None:
+        """Share of the accidents that all agents observe from the first frame on, so that more may have been cut."""
+        return _share([each.from_the_start for each in self.accidents])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; None for what is not known."""
+        names = ["+".join(members) for members in COALITIONS]
+        return {
+            "dataroot": self.dataroot,
+            "version": self.version,
+            "rule": asdict(self.rule),
+            "caveat": CAVEAT,
+            "summary": {
+                "accidents": len(self.accidents),
+                "ego_collides": sum(each.ego_collides for each in self.accidents),
+                "with_missing_agents": sum(bool(each.missing) for each in self.accidents),
+                "skipped": len(self.skipped),
+                "without_accident": self.without_accident,
+                "share_never_alone": self.share_never_alone,
+                "share_never_together": self.share_never_together,
+                "share_from_the_start": self.share_from_the_start,
+                "together": asdict(self.mean_together),
+                "lead_seconds": _by_name(names, self.mean_leads),
+                "gain_seconds": _by_name(PARTNERS, self.mean_gains),
+                "loss_seconds": _by_name(PARTNERS, self.mean_losses),
+                "shapley_seconds": _by_name(PARTNERS, self.mean_shapley),
+            },
+            "accidents": [each.to_dict() for each in self.accidents],
+            "skipped": [asdict(each) for each in self.skipped],
+        }
+
+    def named_tables(self) -> dict[str, Iterable[Row]]:
+        """`lead_times`, a row an accident, seconds with all their digits; and `skipped`."""
+        return {"lead_times": [_CSV_HEADING, *map(_csv_row, self.accidents)], "skipped": skipped_rows(self.skipped)}
+
+    def to_text(self) -> str:
+        """A table of the accidents and of their means, for a terminal."""
+        counts = (
+            f"{len(self.accidents)} accidents, {sum(each.ego_collides for each in self.accidents)} of them with {EGO} "
+            f"among the colliders; {self.without_accident} scenarios without an accident; {len(self.skipped)} skipped"
+        )
+        head = f"Lead times: DeepAccident {self.version} at {self.dataroot}\nobserved: {self.rule.text}\n{counts}"
+        blocks = [f"{head}\n{CAVEAT}"]
+        if self.accidents:
+            blocks += [self._accidents_text(), self._means_text()]
+        if self.skipped:
+            blocks.append(reasons_text("skipped", self.skipped))
+        return "\n\n".join(blocks)
+
+    def _accidents_text(self) -> str:
+        heading = ("seconds before the impact", "ego alone", *(f"+ {short_name(name)}" for name in PARTNERS), "all")
+        rows = [
+            (
+                each.scenario,
+                _lead_text(each.alone, never=each.never_alone),
+                *(_gain_text(*pair) for pair in zip(each.gains.tolist(), each.shapley.tolist(), strict=True)),
+                _lead_text(each.together, never=each.never_together) + "*" * bool(each.missing),
+            )
+            for each in self.accidents
+        ]
+        notes = [
+            "+: what the partner alone adds to the ego, and in brackets its Shapley value",
+            "never: the colliders are not observed at the same frame",
+        ]
+        if any(each.missing for each in self.accidents):
+            notes.append("*: of the agents that are there; – for the missing ones")
+        return "\n".join([columns_text([heading, *rows]), *notes])
+
+    def _means_text(self) -> str:
+        means = zip(PARTNERS, self.mean_gains, self.mean_losses, self.mean_shapley, strict=True)
+        rows = [(short_name(name), *(mean.text for mean in each)) for name, *each in means]
+        alone, together = self.mean_leads[0].text, self.mean_together.text
+        start = "observed by all agents from the first frame on, so that the lead may be longer than the recording: "
+        never = f"never observed together: by the ego alone {_percent(self.share_never_alone)}, by all agents "
+        return "\n".join(
+            [
+                "means in seconds [interval of 95 %, bootstrap over accidents]",
+                columns_text([("partner", "adds to the ego", "all lose without", "Shapley value"), *rows]),
+                f"lead time: the ego alone {alone}, all agents {together}",
+                f"{never}{_percent(self.share_never_together)} of the accidents",
+                f"{start}{_percent(self.share_from_the_start)}",
+            ]
+        )
+
+
+def mean_times(values: FloatArray) -> tuple[MeanTime, ...]:
+    """The mean of each column of (N, K) seconds over accidents, NaN for unknown, with its bootstrap interval.
+
+    The same accidents are taken for all columns, `_RESAMPLES` times, always by the same random numbers.
+    """
+    count = len(values)
+    known = np.isfinite(values)
+    if not count:
+        return tuple(MeanTime(mean=None, low=None, high=None, accidents=0) for _ in range(values.shape[1]))
+    times = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_RESAMPLES).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        drawn = times @ np.where(known, values, 0) / (times @ known)
+    return tuple(_mean_time(values[known[:, at], at], drawn[:, at]) for at in range(values.shape[1]))
+
+
+def _mean_time(values: FloatArray, drawn: FloatArray) -> MeanTime:
+    ends: Sequence[float | None] = (None, None)
+    if len(values) >= _FEWEST:
+        tail = (1 - _CONFIDENCE) / 2
+        ends = np.nanquantile(drawn, (tail, 1 - tail)).tolist()
+    mean = math.fsum(values.tolist()) / len(values) if len(values) else None
+    return MeanTime(mean=mean, low=ends[0], high=ends[1], accidents=len(values))
+
+
+_CSV_HEADING: Final = (
+    *_OF_ACCIDENT,
+    *(f"lead_{'+'.join(members)}" for members in COALITIONS),
+    *(f"first_frame_{'+'.join(members)}" for members in COALITIONS),
+    *(f"shapley_{name}" for name in PARTNERS),
+)
+
+
+def _csv_row(times: LeadTimes) -> list[Any]:
+    told = times.to_dict()
+    lists = ("actor_ids", "categories", "colliding_agents", "missing")
+    words = {name: " ".join("none" if each is None else str(each) for each in told[name]) for name in lists}
+    return [
+        *({**told, **words}[name] for name in _OF_ACCIDENT),
+        *told["lead_seconds"].values(),
+        *told["first_frames"].values(),
+        *told["shapley_seconds"].values(),
+    ]
+
+
+def _by_name(names: Sequence[str], means: Sequence[MeanTime]) -> dict[str, Any]:
+    return {name: asdict(mean) for name, mean in zip(names, means, strict=True)}
+
+
+def _share(truths: Sequence[bool]) -> float | None:
+    return sum(truths) / len(truths) if truths else None
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{round(100 * share)} %"
+
+
+def _gain_text(gain: float, shapley: float) -> str:
+    return "–" if math.isnan(gain) else f"{gain:.1f} ({shapley:.2f})"
+
+
+def _lead_text(lead: float, *, never: bool) -> str:
+    return "never" if never else f"{lead:.1f}"
+
+
+def lead_time_ledger(
+    dataset: Dataset,
+    scenarios: Iterable[RowArgument] | None = None,
+    rule: ObservationRule | None = None,
+    **how: Unpack[Engine],
+) -> LeadTimeLedger:
+    """The lead times of every accident, and the scenarios of which they cannot be told.
+
+    Args:
+        dataset: the release.
+        scenarios: tokens or records of those to look at, such as `find` gives; None for all.
+        rule: when an actor counts as observed; None for `ObservationRule()`.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+
+    Raises:
+        TokenError: no such scenario.
+    """
+    rule = rule or ObservationRule()
+    found = each_scenario(partial(lead_times, rule=rule), dataset, scenarios, label="lead times", **how)
+    return ledger_of(dataset, found, rule)
+
+
+def ledger_of(dataset: Dataset, found: Sequence[LeadTimes | Skipped | None], rule: ObservationRule) -> LeadTimeLedger:
+    """The ledger of what `lead_times` found in scenarios."""
+    return LeadTimeLedger(
+        dataroot=str(dataset.dataroot),
+        version=dataset.version,
+        rule=rule,
+        accidents=those_of(LeadTimes, found),
+        skipped=those_of(Skipped, found),
+        without_accident=found.count(None),
+    )

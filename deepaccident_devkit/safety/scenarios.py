@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
+from deepaccident_devkit.reports import Row
 from deepaccident_devkit.safety.accidents import Skipped
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
 
+    from deepaccident_devkit.parallel import Engine
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 Result = TypeVar("Result")
@@ -22,19 +23,14 @@ _RUN_LENGTH: Final = 64
 """Scenarios that are looked at together: some tenths of a second."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Found(Generic[Result]):
-    """What a computation found in scenarios.
+def skipped_rows(skipped: Iterable[Skipped]) -> list[Row]:
+    """The table of what is left out."""
+    return [("scenario", "reason"), *((each.scenario, each.reason) for each in skipped)]
 
-    Attributes:
-        results: in the order of the release.
-        skipped: scenarios that lack what it needs, and why.
-        others: how many scenarios it does not concern.
-    """
 
-    results: tuple[Result, ...]
-    skipped: tuple[Skipped, ...]
-    others: int
+def reasons_text(title: str, skipped: Iterable[Skipped]) -> str:
+    """A line a reason under a title."""
+    return "\n".join([f"{title}:", *(f"  {each.reason}" for each in skipped)])
 
 
 def each_scenario(
@@ -44,36 +40,26 @@ def each_scenario(
     *,
     label: str,
     at_once: int = _RUN_LENGTH,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
-) -> Found[Result]:
-    """Apply a computation to scenarios, each once.
+    **how: Unpack[Engine],
+) -> list[Result | Skipped | None]:
+    """Apply a computation to scenarios, each once, in the order of the release.
 
     Args:
         work: an importable function of the devkit (or a `functools.partial` of one) of a release and a scenario's
             record. It returns None for a scenario that it does not concern, and raises NotAvailableError for one that
-            lacks what it needs.
+            lacks what it needs: then there is a Skipped.
         dataset: the release.
-        scenarios: tokens or records; None for all.
+        scenarios: tokens or records; None for all. Raises TokenError.
         label: text of the progress bar.
         at_once: scenarios of a piece of work; 1 where one takes tenths of a second.
-        workers: processes; None chooses by the amount of work.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
-
-    Raises:
-        TokenError: no such scenario.
-        ChoiceError: `workers` is less than 1.
-        WorkerError: a worker was killed, or cannot do the work.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
     """
     chosen = range(len(dataset.scenario)) if scenarios is None else [dataset.getind("scenario", s) for s in scenarios]
     rows = sorted(set(chosen))
     runs = [rows[first : first + at_once] for first in range(0, len(rows), at_once)]
-    how: dict[str, Any] = {"workers": workers, "executor": executor, "label": label, "progress": progress}
     sizes, places = [len(run) for run in runs], Places(reads=dataset.places)
-    parts = in_order(run_unordered(partial(_run, work, dataset), runs, sizes=sizes, places=places, **how))
-    return sorted_out([each for part in parts for each in part])
+    parts = run_unordered(partial(_run, work, dataset), runs, sizes=sizes, places=places, label=label, **how)
+    return [each for part in in_order(parts) for each in part]
 
 
 def _run(
@@ -92,10 +78,6 @@ def tried(
         return Skipped(scenario=scenario["token"], reason=str(error))
 
 
-def sorted_out(found: Sequence[Result | Skipped | None]) -> Found[Result]:
-    """The results of `tried`, those of a kind together."""
-    return Found(
-        results=tuple(each for each in found if each is not None and not isinstance(each, Skipped)),
-        skipped=tuple(each for each in found if isinstance(each, Skipped)),
-        others=sum(each is None for each in found),
-    )
+def those_of(kind: type[Result], found: Iterable[object]) -> tuple[Result, ...]:
+    """Of what `each_scenario` found, what is of a kind: results, or Skipped."""
+    return tuple(each for each in found if isinstance(each, kind))

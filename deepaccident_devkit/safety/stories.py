@@ -1,4 +1,7 @@
-"""`describe`: what happens in a scenario, as facts and as two or three sentences."""
+"""`describe`: what happens in a scenario, as facts and as two or three sentences.
+
+Each clause of a sentence says one fact, and goes where that is unknown.
+"""
 
 from __future__ import annotations
 
@@ -10,29 +13,160 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, ShortRepr
+from deepaccident_devkit.arrays import ShortRepr, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, agents_by_actor
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability
 from deepaccident_devkit.safety.observation import observed_actors
-from deepaccident_devkit.safety.scenarios import each_scenario, tried
-from deepaccident_devkit.safety.story_text import story_text
+from deepaccident_devkit.safety.scenarios import each_scenario, those_of, tried
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.collisions import Contact, collision
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
 
+    from deepaccident_devkit.parallel import Engine
     from deepaccident_devkit.tables.records import ScenarioRecord
 
+_AGENTS: Final = {
+    "ego_vehicle": "the ego",
+    "ego_vehicle_behind": "the vehicle behind the ego",
+    "other_vehicle": "the other vehicle",
+    "other_vehicle_behind": "the vehicle behind the other one",
+    "infrastructure": "the infrastructure",
+}
+_TURN_WORDS: Final = {"straight": "going straight", "left": "turning left", "right": "turning right"}
+_SIDES: Final = {
+    "front": "at its front",
+    "rear": "from behind",
+    "left": "on its left side",
+    "right": "on its right side",
+}
 DECELERATION: Final = 6.0
 """m/s² of the braking that a story tells of: the middle one of `BRAKINGS`."""
 _EGO: Final = "ego_vehicle"
 _TURNS: Final = {_EGO: "ego_direction", "other_vehicle": "other_direction"}
 """Agent → the column of the scenario table that tells its way."""
+
+
+def story_text(facts: Mapping[str, Any]) -> str:
+    """The sentences that facts (`safety.scenario_facts`) come to; None among them leaves its clause out."""
+    accident = facts["accident"]
+    if accident is not None:
+        sentences = [_collision(facts, accident), _seen_text(accident), _avoidance(accident)]
+    else:
+        sentences = [_no_accident(facts), _nearest_text(facts["nearest"])]
+    return " ".join(f"{each[0].upper()}{each[1:]}." for each in sentences if each)
+
+
+def actor_words(actor: Mapping[str, Any]) -> str:
+    """What an actor is called: an agent by its role, any other road user by its class."""
+    role = _AGENTS.get(actor["agent"] or "")
+    return role or (f"a {actor['category']}" if actor["category"] else "a road user")
+
+
+def _collision(facts: Mapping[str, Any], accident: Mapping[str, Any]) -> str:
+    """Where it is, and who hits whom on which side, how fast."""
+    first, second = accident["pair"]
+    if first["side"] == "front" and second["side"] != "front":
+        first, second = second, first  # the first is hit, by the front of the second
+    head_on = first["side"] == second["side"] == "front"
+    verb = "collides head-on with" if head_on else "is hit by"
+    if first["side"] and not head_on:
+        verb = f"is hit {_SIDES[first['side']]} by"
+    sentence = f"{_with_motion(first, closes=True)} {verb} {_with_motion(second)}"
+    details = _listed([_number(accident["closing_speed"], "closing at {:.1f} m/s"), _delta_v(first, second)])
+    return ", ".join(part for part in (_place(facts), sentence, details) if part)
+
+
+def _delta_v(first: Mapping[str, Any], second: Mapping[str, Any]) -> str | None:
+    values = [f"{each:.1f}" for each in (first["delta_v"], second["delta_v"]) if each is not None]
+    return f"with a delta-v of {' and '.join(values)} m/s if masses are as assumed" if values else None
+
+
+def _with_motion(actor: Mapping[str, Any], *, closes: bool = False) -> str:
+    """An actor, what it is, and how it moves."""
+    words = actor_words(actor)
+    kind = f"a {actor['category']}" if actor["agent"] and actor["category"] else None
+    motion = " ".join(
+        part for part in (_TURN_WORDS.get(actor["turn"] or ""), _number(actor["speed"], "at {:.1f} m/s")) if part
+    )
+    more = " ".join(part for part in (kind, motion) if part)
+    if not more:
+        return words
+    return f"{words}, {more}{',' if closes else ''}"
+
+
+def _place(facts: Mapping[str, Any]) -> str | None:
+    lights = {True: "with traffic lights", False: "without traffic lights", None: None}[facts["signalized"]]
+    road = facts["road_type"] or ("junction" if lights else None)
+    town = f"in {facts['town']}" if facts["town"] else None
+    sky = _listed([facts["weather"], facts["time_of_day"]])
+    words = [f"at a {road}" if road else None, lights, town, f"({sky})" if sky else None]
+    return " ".join(word for word in words if word) or None
+
+
+def _seen_text(accident: Mapping[str, Any]) -> str | None:
+    """Who saw both first, and what the ego saw alone; `seen` is agent → seconds before the impact, 0 for never."""
+    seen: Mapping[str, float | None] = accident["seen"]
+    leads = {agent: lead for agent, lead in seen.items() if lead is not None}
+    if not leads:
+        return None
+    best = max(leads, key=lambda agent: (leads[agent], agent == "ego_vehicle"))
+    if not leads[best]:
+        return "no agent alone saw both at one moment"
+    text = f"{_AGENTS[best]} saw both {leads[best]:.1f} s before"
+    ego = leads.get("ego_vehicle")
+    if ego is None or best == "ego_vehicle":
+        return text
+    return f"{text}; the ego alone {f'{ego:.1f} s before' if ego else 'never did'}"
+
+
+def _avoidance(accident: Mapping[str, Any]) -> str | None:
+    braking = accident["braking"]
+    if braking is None or None in (braking["by"], braking["deceleration"], braking["avoidable"]):
+        return None
+    who = _listed([_AGENTS.get(agent, "the other road user") for agent in braking["by"]], " and ")
+    how = f"braking at {braking['deceleration']:g} m/s² by {who}"
+    if not braking["avoidable"]:
+        return f"{how} would not have avoided it at any time"
+    return None if braking["slack"] is None else f"{how} until {braking['slack']:.1f} s before would have avoided it"
+
+
+def _no_accident(facts: Mapping[str, Any]) -> str:
+    what, more = {
+        None: ("it is not known whether anybody collides", ""),
+        False: ("nobody collides", ""),
+        True: ("two collide", ", but the labels do not show how"),
+    }[facts["collision"]]
+    return " ".join(part for part in (_place(facts), what, _number(facts["duration"], "in {:.1f} s")) if part) + more
+
+
+def _nearest_text(nearest: Mapping[str, Any] | None) -> str | None:
+    """The most critical pair."""
+    if nearest is None:
+        return None
+    details = _listed(
+        [
+            _number(nearest["min_ttc"], "a least time to collision of {:.1f} s"),
+            _number(nearest["min_gap"] or None, "a least gap of {:.1f} m"),
+            "outlines that touch" if nearest["min_gap"] == 0 else None,
+        ],
+        " and ",
+    )
+    who = " and ".join(actor_words(each) for each in nearest["pair"])
+    return f"{who} come nearest to a collision, with {details}" if details else None
+
+
+def _number(value: float | None, form: str) -> str | None:
+    return None if value is None else form.format(value)
+
+
+def _listed(parts: Iterable[str | None], by: str = ", ") -> str | None:
+    return by.join(part for part in parts if part) or None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,27 +213,19 @@ def describe(dataset: Dataset, scenario: RowArgument) -> Story:
 def stories(
     dataset: Dataset,
     scenarios: Iterable[RowArgument] | None = None,
-    *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> tuple[Story, ...]:
     """The stories of scenarios, in the order of the release.
 
     Args:
         dataset: the release.
         scenarios: tokens or records; None for all.
-        workers: processes; None chooses by the amount of work.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         TokenError: no such scenario.
-        ChoiceError: `workers` is less than 1.
-        WorkerError: a worker was killed, or cannot do the work.
     """
-    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
-    return each_scenario(describe, dataset, scenarios, label="stories", at_once=1, **how).results
+    return those_of(Story, each_scenario(describe, dataset, scenarios, label="stories", at_once=1, **how))
 
 
 def scenario_facts(
@@ -147,7 +273,7 @@ def _accident(
         "pair": [_collider(record, accident, contact, braked, which) for which in range(2)],
         "time": round((accident.last_frame - 1) * FRAME_PERIOD, 1),
         "gap": round(contact.gap, 2),
-        "closing_speed": _known(contact.closing_speed),
+        "closing_speed": known(contact.closing_speed, 2),
         "impact_angle": round(math.degrees(contact.impact_angle)),
         "seen": _seen(dataset, accident),
         "braking": None if braked is None else _braking(accident, braked),
@@ -164,9 +290,9 @@ def _collider(
         "category": accident.categories[which],
         "agent": agent,
         "turn": record[turn] if turn else None,  # type: ignore[literal-required]
-        "speed": _known(contact.speeds[which]),
+        "speed": known(contact.speeds[which], 2),
         "side": contact.sides[which],
-        "delta_v": None if braked is None else _known(braked.check.delta_v[which]),
+        "delta_v": None if braked is None else known(braked.check.delta_v[which], 2),
     }
 
 
@@ -190,7 +316,7 @@ def _braking(accident: Accident, braked: Avoidability) -> dict[str, Any]:
         "by": [accident.agents[which] for which in by],
         "deceleration": float(braked.decelerations[column]),
         "avoidable": bool(np.isfinite(slack)),
-        "slack": _known(slack),
+        "slack": known(slack, 2),
     }
 
 
@@ -205,8 +331,8 @@ def _nearest(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> di
     row = rows[np.argmin(pairs.min_ttc[rows])]
     return {
         "pair": [_actor(dataset, record["token"], actor) for actor in pairs.actor_ids[row].tolist()],
-        "min_ttc": _known(pairs.min_ttc[row]),
-        "min_gap": _known(pairs.min_gap[row]),
+        "min_ttc": known(pairs.min_ttc[row], 2),
+        "min_gap": known(pairs.min_gap[row], 2),
     }
 
 
@@ -217,8 +343,3 @@ def _labelled(dataset: Dataset, record: ScenarioRecord) -> bool:
 def _actor(dataset: Dataset, scenario: str, actor_id: int) -> dict[str, Any]:
     category = dataset.get("instance", f"{scenario}/actor/{actor_id}")["category"]
     return {"actor_id": actor_id, "category": category, "agent": agents_by_actor(dataset, scenario).get(actor_id)}
-
-
-def _known(value: float | FloatArray, digits: int = 2) -> float | None:
-    number = float(value)
-    return round(number, digits) if math.isfinite(number) else None

@@ -1,30 +1,66 @@
-"""All statistics of a release, or of some of its scenarios: counted in runs of scenarios, and added up."""
+"""All statistics of a release, or of some of its scenarios, on the tables' columns."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
-from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
+from deepaccident_devkit import taxonomy
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.parallel import Places, in_order, run_unordered
-from deepaccident_devkit.statistics import actors
-from deepaccident_devkit.statistics import scenarios as whole
-from deepaccident_devkit.statistics.collisions import collision_histograms, collision_pairs, count_collisions
-from deepaccident_devkit.statistics.interactions import count_interactions, interaction_histograms
+from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.interactions import interactions_of
 from deepaccident_devkit.statistics.report import DatasetStatistics
-from deepaccident_devkit.statistics.selected import Selected
-from deepaccident_devkit.statistics.tally import Tally
+from deepaccident_devkit.statistics.results import (
+    CRITICAL,
+    ENDS,
+    GROUPS,
+    NO_ACCIDENT,
+    NO_DESIGN,
+    PROBABILITIES,
+    TOTAL,
+    UNKNOWN,
+    WITH_OTHER,
+    WITH_PEDESTRIAN,
+    CollisionPair,
+    CountTable,
+    Histogram,
+    LeftOut,
+    QuantileRow,
+    QuantileTable,
+)
+from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, OWN_ACTOR_ID, STATIC_ACTOR_ID
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from deepaccident_devkit.tables.records import AgentRecord, CollisionRecord, ScenarioRecord
+
 Chosen = RowArgument | Iterable[RowArgument] | None
 """Tokens or records of scenarios, or a single one; None for all."""
-RUN_LENGTH = 64
-"""Scenarios that are counted at once: some tenths of a second, so that a release of 691 is no work for a pool."""
+_PARTS: Final = GROUPS[1:]
+"""The groups that the total is made of; a row's code counts in them, −1 for rows that do not count."""
+_EGO: Final = AGENTS[0]
+_SIZES: Final = ("length", "width", "height")
+_BIN: Final = 30
+_ANGLES: Final = tuple(range(-_BIN // 2, 360, _BIN))
+"""Twelve bins around 0°, 30°, …, 330°."""
+_TTCS: Final = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0)
+_OF_SCENARIOS: Final[Mapping[str, tuple[str, str, Sequence[str], str]]] = {
+    "scenario_types": ("Scenario types", "scenario_type", (), "scenarios"),
+    "towns": ("Towns", "town", taxonomy.TOWNS, "scenarios"),
+    "weathers": ("Weather", "weather", taxonomy.WEATHERS, "scenarios"),
+    "weather_frames": ("Weather, by frame", "weather", taxonomy.WEATHERS, "frames"),
+    "times_of_day": ("Time of day", "time_of_day", taxonomy.TIMES_OF_DAY, "scenarios"),
+    "time_of_day_frames": ("Time of day, by frame", "time_of_day", taxonomy.TIMES_OF_DAY, "frames"),
+    "road_types": ("Road types", "road_type", taxonomy.ROAD_TYPES, "scenarios"),
+    "collisions": ("Ended in a collision", "collision", ("yes", "no"), "scenarios"),
+    "ends": ("How scenarios ended", "end", ENDS, "scenarios"),
+}
+"""Table of counts → title, field, words that are there in any case, what is counted."""
 
 
 def dataset_statistics(
@@ -47,7 +83,7 @@ def dataset_statistics(
             all.
         interactions: whether to add how soon moving pairs would collide (`da.interactions`); where these are not kept
             yet, a tenth of a second a scenario.
-        workers: processes; None chooses by the amount of work, one for a release of today's size.
+        workers: processes for these; None chooses by the amount of work.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show a bar.
 
@@ -56,14 +92,34 @@ def dataset_statistics(
         ChoiceError: `scenarios` is nothing of this, or `workers` is less than 1.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    rows = chosen_rows(dataset, scenarios)
-    tallies = tallies_of(
-        dataset, runs_of(rows), interactions=interactions, workers=workers, executor=executor, progress=progress
+    chosen = _Chosen(dataset, _rows_of(dataset, scenarios))
+    pairs, pair_histograms = _collisions(chosen)
+    histograms = [_lengths(chosen), _ego_speeds(chosen), _actors(chosen)]
+    quantiles = [_ego_sizes(chosen), _box_sizes(chosen)]
+    for histogram, table in (_distances(chosen), _speeds(chosen)):
+        histograms.append(histogram)
+        quantiles.append(table)
+    histograms += pair_histograms
+    if interactions:
+        histograms += _interactions(chosen, workers=workers, executor=executor, progress=progress)
+    counts = [*_scenario_counts(chosen), *_actor_counts(chosen)]
+    return DatasetStatistics(
+        dataroot=str(dataset.dataroot),
+        version=dataset.version,
+        release_scenarios=len(dataset.scenario),
+        selected=scenarios is not None,
+        scenarios=_by_group(chosen.scenario_group),
+        frames=_by_group(chosen.group("frame")),
+        samples=_by_group(chosen.group("sample")),
+        unlabelled=chosen.unlabelled.counts,
+        counts={table.name: table for table in counts},
+        histograms={table.name: table for table in histograms},
+        quantiles={table.name: table for table in quantiles},
+        collisions=pairs,
     )
-    return statistics_of(dataset, tallies, selected=scenarios is not None, interactions=interactions)
 
 
-def chosen_rows(dataset: Dataset, scenarios: Chosen) -> Sequence[int]:
+def _rows_of(dataset: Dataset, scenarios: Chosen) -> Sequence[int]:
     """The rows of scenarios, ascending; raises TokenError or ChoiceError."""
     if isinstance(scenarios, str | Mapping):
         scenarios = [scenarios]
@@ -74,87 +130,418 @@ def chosen_rows(dataset: Dataset, scenarios: Chosen) -> Sequence[int]:
     return sorted({dataset.getind("scenario", token) for token in scenarios})
 
 
-def runs_of(rows: Iterable[int]) -> list[list[int]]:
-    """Rows of scenarios in runs of neighbours that are counted together."""
-    return [list(run) for _, run in groupby(rows, lambda row: row // RUN_LENGTH)]
+class _Chosen:
+    """The scenarios that count, and the columns of a release with the group that each row counts for."""
+
+    def __init__(self, dataset: Dataset, rows: Sequence[int]) -> None:
+        self.dataset = dataset
+        self._groups: dict[str, AnyArray] = {}
+        self.scenarios: dict[int, ScenarioRecord] = {row: dataset.scenario[row] for row in rows}
+        self.agents: dict[str, list[AgentRecord]] = {}
+        wanted = {scenario["token"] for scenario in self.scenarios.values()}
+        for agent in dataset.agent[:]:
+            if agent["scenario_token"] in wanted:
+                self.agents.setdefault(agent["scenario_token"], []).append(agent)
+        self.scenario_group = np.full(len(dataset.scenario), -1, dtype=np.int8)
+        for row, scenario in self.scenarios.items():
+            self.scenario_group[row] = _PARTS.index(_split_of(scenario))
+        labelled = np.zeros(len(self.scenario_group), dtype=bool)
+        labelled[self.column("sample", "scenario_row")[self.column("sample", "labelled")]] = True
+        self.labelled_group = np.where(labelled, self.scenario_group, np.int8(-1))
+        without = _by_group(np.where(labelled, np.int8(-1), self.scenario_group))
+        self.unlabelled = LeftOut(what="scenarios without labels", counts=without)
+        self.ends = {
+            each["token"]: scenario_end(each, self.agents.get(each["token"], [])) for each in self.scenarios.values()
+        }
+
+    def column(self, table: str, name: str) -> Any:
+        """A stored column, read-only."""
+        return self.dataset.columns(table)[name]
+
+    def group(self, table: str) -> AnyArray:
+        """(N,) int8 group code of every row of a table."""
+        if table not in self._groups:
+            of, name = (
+                (self.group("sample"), "sample_row") if table == "annotation" else (self.scenario_group, "scenario_row")
+            )
+            self._groups[table] = of[self.column(table, name)]
+        return self._groups[table]
 
 
-def tallies_of(
-    dataset: Dataset,
-    runs: Sequence[Sequence[int]],
-    *,
-    interactions: bool = False,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
-) -> Iterable[Tally]:
-    """The tally of each run of scenarios, in their order; arguments and errors are those of `dataset_statistics`."""
-    return in_order(
-        run_unordered(
-            partial(tally_of, dataset, interactions=interactions),
-            runs,
-            workers=workers,
-            executor=executor,
-            label="counting",
-            progress=progress,
-            sizes=[len(run) for run in runs],
-            places=Places(reads=dataset.places),
-        )
+def _split_of(scenario: ScenarioRecord) -> str:
+    """The group, besides the total, that a scenario counts for."""
+    return scenario["split"] or UNKNOWN
+
+
+def _by_group(groups: AnyArray, weights: Iterable[int] | None = None) -> dict[str, int]:
+    """Group → how many rows (N,) have its code, or the sum of their weights."""
+    counts = np.zeros(len(_PARTS), dtype=np.int64)
+    counted = groups >= 0
+    np.add.at(counts, groups[counted], 1 if weights is None else np.asarray(weights)[counted])
+    return {TOTAL: int(counts.sum()), **dict(zip(_PARTS, counts.tolist(), strict=True))}
+
+
+def _by_code(words: Sequence[str], codes: AnyArray, groups: AnyArray) -> dict[str, dict[str, int]]:
+    """Word → group → how many rows (N,) have its code."""
+    counted = (codes >= 0) & (groups >= 0)
+    keys = codes[counted] * np.int16(len(_PARTS)) + groups[counted]
+    table = np.bincount(keys, minlength=len(words) * len(_PARTS)).reshape(len(words), len(_PARTS))
+    return {
+        word: {TOTAL: int(row.sum()), **dict(zip(_PARTS, row.tolist(), strict=True))}
+        for word, row in zip(words, table, strict=True)
+    }
+
+
+def _histogram(
+    names: tuple[str, str, str, str],
+    counted: str,
+    values: FloatArray,
+    groups: AnyArray,
+    edges: Sequence[float],
+    left_out: LeftOut | None = None,
+) -> Histogram:
+    """A histogram; `names` are name, title, field and unit; rows (N,) with −1 do not count, and NaN never does."""
+    bounds = np.asarray(edges, dtype=np.float64)
+    bins = np.searchsorted(bounds, values, side="right").astype(np.int8)  # 0 below, B + 1 above
+    bins[values == bounds[-1]] = len(bounds) - 1
+    bins[np.isnan(values)] = -1
+    below, *rows, above = _by_code([str(place) for place in range(len(edges) + 1)], bins, groups).values()
+    name, title, field, unit = names
+    return Histogram(
+        name=name,
+        title=title,
+        field=field,
+        unit=unit,
+        counted=counted,
+        edges=tuple(edges),
+        counts={group: tuple(row[group] for row in rows) for group in GROUPS},
+        outside={group: below[group] + above[group] for group in GROUPS},
+        left_out=left_out,
     )
 
 
-def tally_of(dataset: Dataset, rows: Sequence[int], *, interactions: bool = False) -> Tally:
-    """What is counted in neighbouring scenarios, with or without interactions."""
-    selected, tally = Selected(dataset, rows), Tally()
-    whole.count_scenarios(selected, tally)
-    whole.count_egos(selected, tally)
-    actors.count_actors(selected, tally)
-    actors.count_boxes(selected, tally)
-    actors.count_speeds(selected, tally)
-    count_collisions(selected, tally)
-    if interactions:
-        count_interactions(dataset, selected, tally)
-    return tally
+def _quantile_rows(field: str, category: str, values: FloatArray, groups: AnyArray) -> list[QuantileRow]:
+    """The quantiles of values (N,) without NaN in every group."""
+    chosen = [values[groups == code] for code in range(len(_PARTS))]
+    everything = np.concatenate(chosen)
+    return [
+        QuantileRow(
+            field=field,
+            category=category,
+            group=group,
+            number=len(each),
+            values=tuple(np.quantile(each, PROBABILITIES).tolist()) if len(each) else None,
+        )
+        for group, each in zip(GROUPS, [everything, *chosen], strict=True)
+    ]
 
 
-def statistics_of(
-    dataset: Dataset, tallies: Iterable[Tally], *, selected: bool, interactions: bool = False
-) -> DatasetStatistics:
-    """The statistics that the tallies of runs of scenarios add up to.
+def _scenario_counts(chosen: _Chosen) -> list[CountTable]:
+    """Scenarios by type, town, weather, time of day, road type, collision and end; frames by weather and time."""
+    made, records = [], chosen.scenarios.values()
+    groups = chosen.scenario_group[list(chosen.scenarios)]
+    frames = np.array([scenario["num_frames"] for scenario in records], dtype=np.int64)
+    for name, (title, field, known, counted) in _OF_SCENARIOS.items():
+        words = [
+            (chosen.ends[scenario["token"]] if field == "end" else _word(scenario, field)) or UNKNOWN
+            for scenario in records
+        ]
+        others = sorted(set(words) - {*known, UNKNOWN})
+        listed = [*known, *others, *({UNKNOWN} & set(words))]
+        counts = {}
+        for word in listed:
+            here = np.array([each == word for each in words], dtype=bool)
+            counts[word] = _by_group(groups[here], frames[here] if counted == "frames" else None)
+        made.append(CountTable(name=name, title=title, field=field, counted=counted, counts=counts))
+    return made
+
+
+def _actor_counts(chosen: _Chosen) -> list[CountTable]:
+    """Instances, parked ones among them, and annotations, by category."""
+    category, group = chosen.column("instance", "category"), chosen.group("instance")
+    parked = chosen.column("instance", "actor_id") >= STATIC_ACTOR_ID
+    tables = (
+        ("instances", "Instances", "instances", category, group),
+        ("parked_instances", "Parked instances", "instances", category[parked], group[parked]),
+        (
+            *("annotations", "Annotations", "annotations"),
+            *(chosen.column("annotation", "category"), chosen.group("annotation")),
+        ),
+    )
+    return [
+        CountTable(
+            name=name,
+            title=title,
+            field="category",
+            counted=counted,
+            counts=_by_code(CATEGORIES, codes, groups),
+            left_out=chosen.unlabelled,
+        )
+        for name, title, counted, codes, groups in tables
+    ]
+
+
+def _lengths(chosen: _Chosen) -> Histogram:
+    """Recorded frames of scenarios; meta's simulated ones are ten more."""
+    lengths = np.array([scenario["num_frames"] for scenario in chosen.scenarios.values()], dtype=np.float64)
+    groups = chosen.scenario_group[list(chosen.scenarios)]
+    names = ("lengths", "Lengths of scenarios", "length", "frames")
+    return _histogram(names, "scenarios", lengths, groups, tuple(range(30, 101, 10)))
+
+
+def _ego_speeds(chosen: _Chosen) -> Histogram:
+    """Speeds of `ego_vehicle` at its samples, by the first line of their labels."""
+    ego = chosen.column("sample", "agent") == AGENTS.index(_EGO)
+    speeds, groups = np.linalg.norm(chosen.column("sample", "velocity")[ego], axis=1), chosen.group("sample")[ego]
+    without = LeftOut(what="ego samples without a label", counts=_by_group(groups[~np.isfinite(speeds)]))
+    names = ("ego_speeds", "Speed of the ego vehicle", "speed", "m/s")
+    return _histogram(names, "ego samples", speeds, groups, tuple(range(21)), without)
+
+
+def _actors(chosen: _Chosen) -> Histogram:
+    """Actors (instances) of each labelled scenario."""
+    numbers = np.bincount(chosen.column("instance", "scenario_row"), minlength=len(chosen.scenario_group))
+    names = ("actors", "Actors a scenario", "actors", "actors")
+    edges = tuple(range(0, 201, 10))
+    return _histogram(names, "scenarios", numbers.astype(np.float64), chosen.labelled_group, edges, chosen.unlabelled)
+
+
+def _ego_sizes(chosen: _Chosen) -> QuantileTable:
+    """Size of `ego_vehicle`, once a scenario, by its own label row."""
+    ego = chosen.column("agent", "name") == AGENTS.index(_EGO)
+    sizes, groups = chosen.column("agent", "size")[ego], chosen.group("agent")[ego]
+    known = ~np.isnan(sizes).any(axis=1)
+    rows = [
+        row
+        for axis, field in enumerate(_SIZES)
+        for row in _quantile_rows(field, _EGO, sizes[known, axis], groups[known])
+    ]
+    return QuantileTable(
+        name="ego_sizes",
+        title="Size of the ego vehicle",
+        unit="m",
+        counted="scenarios",
+        quantiles=tuple(rows),
+        left_out=LeftOut(what="scenarios whose ego has no label row of its own", counts=_by_group(groups[~known])),
+    )
+
+
+def _box_sizes(chosen: _Chosen) -> QuantileTable:
+    """Length, width and height of all annotations, by category."""
+    categories, sizes = chosen.column("annotation", "category"), chosen.column("annotation", "size")
+    groups, rows = chosen.group("annotation"), []
+    for code, name in enumerate(CATEGORIES):
+        here = np.flatnonzero((categories == code) & (groups >= 0))
+        for axis, field in enumerate(_SIZES):
+            rows += _quantile_rows(field, name, sizes[here, axis], groups[here])
+    return QuantileTable(
+        name="box_sizes",
+        title="Sizes of boxes",
+        unit="m",
+        counted="annotations",
+        quantiles=tuple(rows),
+        left_out=chosen.unlabelled,
+    )
+
+
+def _distances(chosen: _Chosen) -> tuple[Histogram, QuantileTable]:
+    """Horizontal distances of annotated boxes from the LiDAR of their agent; its own box does not count."""
+    x, y = chosen.column("annotation", "translation")[:, :2].T
+    of_others = chosen.column("annotation", "actor_id") != OWN_ACTOR_ID
+    groups = np.where(of_others, chosen.group("annotation"), np.int8(-1))
+    names = ("distances", "Distance from the agent", "distance", "m")
+    what = ("annotations of others", tuple(range(0, 101, 5)), chosen.unlabelled)
+    return _distribution(names, what, np.hypot(x, y), chosen.column("annotation", "category"), groups)
+
+
+def _speeds(chosen: _Chosen) -> tuple[Histogram, QuantileTable]:
+    """Horizontal speeds of actors that are not parked, once an actor and moment, by the labels' velocities."""
+    parked = chosen.column("instance", "actor_id") >= STATIC_ACTOR_ID
+    x, y = chosen.column("track", "velocity")[:, :2].T
+    speeds = np.hypot(x, y)
+    groups = np.where(parked[chosen.column("track", "instance_row")], np.int8(-1), chosen.group("track"))
+    why = "moments of actors whose label has no velocity, and that no agent saw in the frame before or after"
+    left_out = LeftOut(what=why, counts=_by_group(groups[~np.isfinite(speeds)]))
+    names = ("speeds", "Speed of actors that are not parked", "speed", "m/s")
+    what = ("moments of actors", tuple(range(21)), left_out)
+    return _distribution(names, what, speeds, chosen.column("track", "category"), groups)
+
+
+def _distribution(
+    names: tuple[str, str, str, str],
+    what: tuple[str, tuple[int, ...], LeftOut],
+    values: FloatArray,
+    categories: AnyArray,
+    groups: AnyArray,
+) -> tuple[Histogram, QuantileTable]:
+    """A number's histogram over all categories and its quantiles by category; `what` is counted, edges, left out."""
+    _, title, field, unit = names
+    counted, edges, left_out = what
+    known: BoolArray = np.isfinite(values) & (groups >= 0)
+    rows: list[QuantileRow] = []
+    for code, category in enumerate(CATEGORIES):
+        here = np.flatnonzero(known & (categories == code))
+        rows += _quantile_rows(field, category, values[here], groups[here])
+    quantiles = QuantileTable(
+        name=f"{field}_quantiles",
+        title=title,
+        unit=unit,
+        counted=counted,
+        quantiles=tuple(rows),
+        left_out=left_out,
+    )
+    return _histogram(names, counted, values, groups, edges, left_out), quantiles
+
+
+def _interactions(chosen: _Chosen, **how: Any) -> list[Histogram]:
+    """The least time to collision of pairs of which each moves at some frame, and of scenarios."""
+    found = interactions_of(chosen.dataset, list(chosen.scenarios.values()), **how)
+    pairs: list[FloatArray] = [each.pairs.min_ttc[each.pairs.moving] for each in found]
+    codes = chosen.scenario_group[list(chosen.scenarios)]
+    of_pairs = np.concatenate([np.zeros(0), *pairs])
+    of_scenarios = np.array([each.min(initial=np.inf) for each in pairs])
+    texts = (
+        (
+            *("pair_min_ttcs", "Least TTC of moving pairs", "pairs"),
+            *("moving pairs that come near each other on no collision course", of_pairs),
+            np.repeat(codes, [len(each) for each in pairs]),
+        ),
+        (
+            *(CRITICAL, "Least TTC of scenarios", "scenarios"),
+            *("scenarios without labels or moving pairs that would collide", of_scenarios, codes),
+        ),
+    )
+    return [
+        _histogram(
+            (name, title, "least time to collision", "s"),
+            counted,
+            np.where(np.isfinite(values), values, np.nan),
+            groups,
+            _TTCS,
+            LeftOut(what=what, counts=_by_group(groups[~np.isfinite(values)])),
+        )
+        for name, title, counted, what, values, groups in texts
+    ]
+
+
+def _collisions(chosen: _Chosen) -> tuple[tuple[CollisionPair, ...], list[Histogram]]:
+    """The pairs at the last recorded frame by the merged tracks, and how they meet; those without tracks are left out.
+
+    Meta may name one actor twice: that is no pair.
+    """
+    tracks, pairs, without = _tracks_at_the_end(chosen), [], []
+    for row, scenario in chosen.scenarios.items():
+        if scenario["collision"] is None:
+            continue
+        names = {each["actor_id"]: each["name"] for each in chosen.agents.get(scenario["token"], [])}
+        ids = _in_agents_order(scenario["collision"]["ids"], names)
+        here = tracks.get(row, {})
+        if len(set(ids)) == len(ids) and set(ids) <= set(here):
+            pairs.append(_pair(chosen, scenario, [here[actor] for actor in ids], list(map(names.get, ids))))
+        else:
+            without.append(chosen.scenario_group[row])
+    left_out = LeftOut(
+        what="collisions without a pair labelled at the last frame", counts=_by_group(np.array(without, dtype=np.int8))
+    )
+    groups = np.array([_PARTS.index(pair.split) for pair in pairs], dtype=np.int8)
+    bearings = [_wrapped(np.degrees(np.arctan2(pair.y, pair.x))) for pair in pairs]
+    values = {
+        ("collision_angles", "Collision angle", "angle", "°"): [pair.angle for pair in pairs],
+        ("collision_bearings", "Bearing of the other", "bearing", "°"): bearings,
+    }
+    histograms = [
+        _histogram(names, "collisions", np.array(each, dtype=np.float64), groups, _ANGLES, left_out)
+        for names, each in values.items()
+    ]
+    return tuple(pairs), histograms
+
+
+def _tracks_at_the_end(chosen: _Chosen) -> dict[int, dict[int, int]]:
+    """Scenario row → actor id → track row of the colliders at the scenario's last frame."""
+    is_last = np.zeros(len(chosen.column("frame", "index")), dtype=bool)
+    is_last[chosen.column("scenario", "last_frame_row")] = True
+    rows: IntArray = np.flatnonzero(
+        is_last[chosen.column("track", "frame_row")] & chosen.column("track", "is_collider")[:]
+    )
+    actors = chosen.column("instance", "actor_id")[chosen.column("track", "instance_row")[rows]]
+    scenarios = chosen.column("track", "scenario_row")[rows]
+    tracks: dict[int, dict[int, int]] = {}
+    for scenario, actor, row in zip(scenarios.tolist(), actors.tolist(), rows.tolist(), strict=True):
+        tracks.setdefault(scenario, {})[actor] = row
+    return tracks
+
+
+def _pair(
+    chosen: _Chosen, scenario: ScenarioRecord, tracks: Sequence[int], names: Sequence[str | None]
+) -> CollisionPair:
+    """The pair of two track rows, the first of which looks at the other."""
+    first, other = quaternions.yaw_of(chosen.column("track", "rotation")[list(tracks)]).tolist()
+    centers = chosen.column("track", "translation")
+    x, y, _ = centers[tracks[1]] - centers[tracks[0]]
+    cosine, sine = np.cos(first), np.sin(first)
+    categories = [CATEGORIES[chosen.column("track", "category").item(row)] for row in tracks]
+    return CollisionPair(
+        scenario=scenario["token"],
+        split=_split_of(scenario),
+        end=chosen.ends[scenario["token"]] or UNKNOWN,
+        actor=names[0],
+        category=categories[0],
+        other=names[1],
+        other_category=categories[1],
+        angle=_wrapped(np.degrees(other - first)),
+        x=float(cosine * x + sine * y),
+        y=float(cosine * y - sine * x),
+    )
+
+
+def _wrapped(degrees: float) -> float:
+    """The angle in [−15, 345)."""
+    return float((degrees + _BIN / 2) % 360 - _BIN / 2)
+
+
+def _in_agents_order(ids: Sequence[int], names: Mapping[int | None, str]) -> list[int]:
+    """A pair's actor ids, agents first and in the order of `AGENTS`, else as they are."""
+    ranks: dict[str | None, int] = {name: rank for rank, name in enumerate(AGENTS)}
+    return sorted(ids, key=lambda actor: ranks.get(names.get(actor), len(AGENTS)))
+
+
+def scenario_end(scenario: ScenarioRecord, agents: Sequence[AgentRecord]) -> str | None:
+    """How a scenario ended, one of `ENDS`; None without meta, or where meta is silent on agents or roads.
 
     Args:
-        dataset: the release.
-        tallies: of all runs, in any order.
-        selected: whether they are of a selection.
-        interactions: whether these were counted too.
+        scenario: the record.
+        agents: the records of its agents that are in this release.
     """
-    tally = Tally()
-    for each in tallies:
-        tally.add(each)
-    distance_histogram, distance_quantiles = actors.distances(tally)
-    speed_histogram, speed_quantiles = actors.speeds(tally)
-    counts = [*whole.scenario_counts(tally), *actors.actor_counts(tally)]
-    histograms = [
-        whole.lengths(tally),
-        whole.ego_speeds(tally),
-        actors.actors(tally),
-        distance_histogram,
-        speed_histogram,
-        *collision_histograms(tally),
-        *(interaction_histograms(tally) if interactions else ()),
-    ]
-    quantiles = [whole.ego_sizes(tally), actors.box_sizes(tally), distance_quantiles, speed_quantiles]
-    return DatasetStatistics(
-        dataroot=str(dataset.dataroot),
-        version=dataset.version,
-        release_scenarios=len(dataset.scenario),
-        selected=selected,
-        scenarios=tally.by_group("scenarios"),
-        frames=tally.by_group("frames"),
-        samples=tally.by_group("samples"),
-        unlabelled=tally.by_group("unlabelled"),
-        counts={table.name: table for table in counts},
-        histograms={table.name: table for table in histograms},
-        quantiles={table.name: table for table in quantiles},
-        collisions=collision_pairs(tally),
-    )
+    collision = scenario["collision"]
+    if scenario["weather"] is None:  # there is no meta
+        return None
+    if collision is None:
+        return NO_ACCIDENT
+    if "pedestrian" in collision["classes"]:
+        return WITH_PEDESTRIAN
+    if scenario["accident_type"] is not None:
+        return f"design {scenario['accident_type']}"
+    return _undesigned_end(scenario, collision, agents)
+
+
+def _undesigned_end(scenario: ScenarioRecord, collision: CollisionRecord, agents: Sequence[AgentRecord]) -> str | None:
+    """Of a collision that realises no design: whether its pair are agents; None where meta is silent."""
+    here = {agent["name"]: agent["actor_id"] for agent in agents if not agent["is_infrastructure"]}
+    names = collision["agents"] or (None, None)
+    missing = set(taxonomy.VEHICLE_AGENTS) - set(here)  # of a partial download: meta's names stand for their ids
+    if None in here.values() or (missing and collision["agents"] is None):
+        return None
+    known = [actor in here.values() or name in missing for actor, name in zip(collision["ids"], names, strict=True)]
+    if not all(known):
+        return WITH_OTHER
+    story = ("road_type", "spawn_side", "ego_direction", "other_direction")
+    return None if None in [scenario[word] for word in story] else NO_DESIGN  # type: ignore[literal-required]
+
+
+def _word(scenario: ScenarioRecord, field: str) -> str | None:
+    """What a scenario counts as in tables of a field of its record."""
+    if field != "collision":
+        return scenario[field]  # type: ignore[literal-required,no-any-return]
+    if scenario["weather"] is None:  # there is no meta
+        return None
+    return "yes" if scenario["collision"] else "no"

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from typing import Any
 
-from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.files import writable_folder, write_bytes
-from deepaccident_devkit.statistics.interactions import SCENARIOS as _CRITICAL
+from deepaccident_devkit.reports import Report
 from deepaccident_devkit.statistics.results import (
+    CRITICAL,
     GROUPS,
     PROBABILITIES,
     TOTAL,
@@ -26,7 +21,7 @@ from deepaccident_devkit.statistics.results import (
     collision_rows,
 )
 from deepaccident_devkit.taxonomy import CATEGORIES
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.text import columns_text, number_text, share_text
 
 _PAIRS = "collision_pairs"
 _LIMITS = (0.5, 1.0, 1.5, 3.0)
@@ -34,7 +29,7 @@ _LIMITS = (0.5, 1.0, 1.5, 3.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetStatistics(ShortRepr):
+class DatasetStatistics(Report):
     """The statistics of a release, or of some of its scenarios; groups are those of `GROUPS`.
 
     Attributes:
@@ -75,34 +70,13 @@ class DatasetStatistics(ShortRepr):
         """The total and the groups that have a scenario."""
         return (TOTAL, *(group for group in GROUPS[1:] if self.scenarios[group]))
 
-    def to_json(self) -> str:
-        """One JSON object; null for what has no value."""
-        return json.dumps({**asdict(self), "probabilities": PROBABILITIES}, indent=2, ensure_ascii=False)
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; None for what has no value."""
+        return {**asdict(self), "probabilities": PROBABILITIES}
 
-    def to_csv(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write a file a table into a folder, each atomically, over those that are there.
-
-        Args:
-            folder: where; it is made if it is not there.
-
-        Returns:
-            The files' paths.
-
-        Raises:
-            ConfigError: `folder` cannot be written to, or is not one.
-        """
-        folder = writable_folder(folder)
-        contents: dict[str, Iterable[Row]] = {
-            **{table.name: table.rows() for table in self.tables},
-            _PAIRS: collision_rows(self.collisions),
-        }
-        paths = []
-        for name, rows in contents.items():
-            text = io.StringIO(newline="")
-            csv.writer(text, lineterminator="\n").writerows(rows)
-            paths.append(folder / f"{name}.csv")
-            write_bytes(paths[-1], text.getvalue().encode())
-        return paths
+    def named_tables(self) -> dict[str, Iterable[Row]]:
+        """All tables, and the colliding pairs."""
+        return {**{table.name: table.rows() for table in self.tables}, _PAIRS: collision_rows(self.collisions)}
 
     def to_text(self) -> str:
         """Some aligned blocks for a terminal: scenarios (without zeros), a line a category, what is left out."""
@@ -122,7 +96,7 @@ class DatasetStatistics(ShortRepr):
                 rows = [(value, *self._shares(table, value)) for value in table.counts if table.counts[value][TOTAL]]
                 blocks.append(columns_text([(table.field, *self.groups), *rows]))
         blocks += [self._lengths_text(), self._categories_text()]
-        if _CRITICAL in self.histograms:
+        if CRITICAL in self.histograms:
             blocks.append(self._critical_text())
         left_out = {
             f"{table.left_out.counts[TOTAL]:,} {table.left_out.what}"
@@ -137,11 +111,7 @@ class DatasetStatistics(ShortRepr):
         return [f"{counts[group]:,}" for group in self.groups]
 
     def _shares(self, table: CountTable, value: str) -> list[str]:
-        cells = []
-        for group in self.groups:
-            count, total = table.counts[value][group], table.total(group)
-            cells.append(_share(count, total))
-        return cells
+        return [share_text(table.counts[value][group], table.total(group)) for group in self.groups]
 
     def _lengths_text(self) -> str:
         lengths = self.histograms["lengths"]
@@ -153,14 +123,12 @@ class DatasetStatistics(ShortRepr):
 
     def _critical_text(self) -> str:
         """Scenarios in which a moving pair comes below some times to collision, of those with labels."""
-        times = self.histograms[_CRITICAL]
+        times = self.histograms[CRITICAL]
         rows = []
         for limit in _LIMITS:
-            cells = []
-            for group in self.groups:
-                count = sum(times.counts[group][: times.edges.index(limit)])
-                cells.append(_share(count, self.scenarios[group] - self.unlabelled[group]))
-            rows.append((f"below {limit:g} s", *cells))
+            counts = {group: sum(times.counts[group][: times.edges.index(limit)]) for group in self.groups}
+            labelled = {group: self.scenarios[group] - self.unlabelled[group] for group in self.groups}
+            rows.append((f"below {limit:g} s", *(share_text(counts[group], labelled[group]) for group in self.groups)))
         return columns_text([("least TTC of moving pairs", *self.groups), *rows])
 
     def _categories_text(self) -> str:
@@ -168,24 +136,16 @@ class DatasetStatistics(ShortRepr):
         sizes = self.quantiles["box_sizes"]
         rows = []
         for category in CATEGORIES:
-            size = [_number(sizes.median(field, category), 2) for field in ("length", "width", "height")]
+            size = [number_text(sizes.median(field, category), 2) for field in ("length", "width", "height")]
             rows.append(
                 (
                     category,
                     f"{self.counts['instances'].counts[category][TOTAL]:,}",
                     f"{self.counts['annotations'].counts[category][TOTAL]:,}",
                     " × ".join(size) if size[0] != "–" else "–",
-                    _number(self.quantiles["distance_quantiles"].median("distance", category), 1),
-                    _number(self.quantiles["speed_quantiles"].median("speed", category), 1),
+                    number_text(self.quantiles["distance_quantiles"].median("distance", category), 1),
+                    number_text(self.quantiles["speed_quantiles"].median("speed", category), 1),
                 )
             )
         heading = ("category, medians", "instances", "annotations", "l × w × h (m)", "distance (m)", "speed (m/s)")
         return columns_text([heading, *rows])
-
-
-def _share(count: int, total: int) -> str:
-    return f"{count:,} ({round(100 * count / total) if total else 0:>3} %)"
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"

@@ -28,6 +28,8 @@ ENDS: Final = (
 """How a scenario can end, as the reference's statistics say it: designs 1–6 signalised, 7–12 not; the reference calls
 a collision of two agents that realises none of them `none`."""
 
+CRITICAL: Final = "scenario_min_ttcs"
+"""Name of the histogram of the most critical pairs."""
 PROBABILITIES: Final = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 """Of all quantiles; the first and last are the extremes."""
 

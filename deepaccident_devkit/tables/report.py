@@ -1,15 +1,15 @@
 """What indexes a release has on disk: the text behind `deepaccident index info`."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import DatarootError, IndexStoreError, VersionError
 from deepaccident_devkit.release import ReleaseLayout, find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
+from deepaccident_devkit.reports import Report
 from deepaccident_devkit.tables.clearing import holds_index, megabytes, sizes_in
 from deepaccident_devkit.tables.index import Index, index_folders, is_current
 from deepaccident_devkit.tables.indexing import SHARDS_FOLDER, edited_scenarios, is_unfinished
@@ -95,7 +95,7 @@ class IndexInfo(ShortRepr):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexReport(ShortRepr):
+class IndexReport(Report):
     """The indexes of one dataroot.
 
     Attributes:
@@ -108,10 +108,9 @@ class IndexReport(ShortRepr):
     indexes: Sequence[IndexInfo]
     looked_in: Sequence[str]
 
-    def to_json(self) -> str:
-        """One JSON object."""
-        indexes = [{**asdict(info), "scenarios": info.scenarios} for info in self.indexes]
-        return json.dumps({**asdict(self), "indexes": indexes}, indent=2, ensure_ascii=False)
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {**asdict(self), "indexes": [{**asdict(info), "scenarios": info.scenarios} for info in self.indexes]}
 
     def to_text(self) -> str:
         """Some lines an index for a terminal."""

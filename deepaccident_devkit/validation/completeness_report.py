@@ -1,12 +1,12 @@
 """Which files of a release are here and which are missing: the counts, and their text and JSON."""
 
-import json
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 
 from deepaccident_devkit.arrays import ShortRepr
+from deepaccident_devkit.reports import Report
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.text import columns_text, size_text
 
@@ -88,7 +88,7 @@ class SplitFiles(ShortRepr):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Completeness(ShortRepr):
+class Completeness(Report):
     """Which files of a release are here, and which are missing.
 
     Attributes:
@@ -115,10 +115,6 @@ class Completeness(ShortRepr):
     lacking: Sequence[LackingScenario]
     not_here: Mapping[str, Sequence[str]]
     without_calib: Sequence[str]
-
-    def to_json(self) -> str:
-        """One JSON object."""
-        return json.dumps(asdict(self), indent=2, ensure_ascii=False)
 
     def to_text(self) -> str:
         """Blocks of at most 100 columns for a terminal: each split, then the first scenarios that lack something."""

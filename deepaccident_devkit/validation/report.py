@@ -1,15 +1,17 @@
 """What `validate` found: findings, counts against a whole release, and what is still to download."""
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import Any
 
 from deepaccident_devkit.arrays import ShortRepr
+from deepaccident_devkit.reports import Report
 from deepaccident_devkit.tables import SEVERITIES, Finding
 from deepaccident_devkit.tables.velocities import VelocityFit
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CHANNELS, VELOCITY_FRAMES
+from deepaccident_devkit.text import counted
 
 KINDS = ("calib", "label", *CHANNELS)
 """The kinds of files that an agent has."""
@@ -65,7 +67,7 @@ class Coverage(ShortRepr):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ValidationReport(ShortRepr):
+class ValidationReport(Report):
     """What was found in a release.
 
     Attributes:
@@ -101,13 +103,13 @@ class ValidationReport(ShortRepr):
         """Whether all findings are notes, or known of the real release."""
         return all(finding.severity == "note" or finding.known for finding in self.findings)
 
-    def to_json(self) -> str:
-        """One JSON object."""
-        content = asdict(self)
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        content = super().to_dict()
         content["counts"] = self.counts
         content["velocity"]["best"] = self.velocity.best
         content["to_download"] = list(self.coverage.to_download())
-        return json.dumps(content, indent=2, ensure_ascii=False)
+        return content
 
     def to_text(self, *, notes: bool = False, whole: bool = False) -> str:
         """A table for a terminal, worst scenario first.
@@ -134,7 +136,7 @@ class ValidationReport(ShortRepr):
                 by_scenario.setdefault(finding.scenario, []).append(finding)
         for scenario, findings in by_scenario.items():
             counts = Counter(finding.severity for finding in findings)
-            head = ", ".join(_counted(counts[severity], severity) for severity in SEVERITIES if counts[severity])
+            head = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES if counts[severity])
             lines = [f"{scenario or 'the release'}  ({head})"]
             lines += [_line(finding) for finding in findings[:most]]
             if len(findings) > most:
@@ -167,7 +169,7 @@ class ValidationReport(ShortRepr):
             more = [f"  … and {len(missing) - len(shown)} more {_ALL_LISTED}"] if len(missing) > len(shown) else []
             yield "still to download, for a whole release:\n" + "\n".join([*(f"  {line}" for line in shown), *more])
         hidden = self.counts["note"] and not notes
-        verdict = ", ".join(_counted(self.counts[severity], severity) for severity in SEVERITIES)
+        verdict = ", ".join(counted(self.counts[severity], severity) for severity in SEVERITIES)
         yield verdict + (" (--notes lists the notes)" if hidden else "")
 
 
@@ -194,7 +196,3 @@ def empty_recordings() -> dict[str, dict[str, int]]:
 def _line(finding: Finding) -> str:
     known = " (known of the release)" if finding.known else ""
     return f"  {finding.severity:<7} {finding.code}: {finding}{known}"
-
-
-def _counted(count: int, word: str) -> str:
-    return f"{count:,} {word}{'' if count == 1 else 's'}"

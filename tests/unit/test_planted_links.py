@@ -20,9 +20,7 @@ from deepaccident_devkit.explore.keeping import KeptFiles
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.files import held_lock, place_in, remove_in, temporary_path, write_bytes
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
-from deepaccident_devkit.parallel import Shard
 from deepaccident_devkit.release.store.cache import FileCache
-from deepaccident_devkit.statistics.shards import remove_shards, statistics_shard
 from deepaccident_devkit.synth import SynthConfig, generate, make_release
 from deepaccident_devkit.synth.recording import RecordingJob
 from deepaccident_devkit.testing import SmallRelease, write_small_release
@@ -66,15 +64,6 @@ def labels(dataset: DeepAccident, folder: Path) -> None:
     write_label_files(dataset, folder / "out", tokens, config, workers=1)
 
 
-def half_a_statistic(dataset: DeepAccident, folder: Path) -> None:
-    statistics_shard(dataset, Shard(1, 2), folder / "out", workers=1)
-
-
-def statistics(dataset: DeepAccident, folder: Path) -> None:
-    statistics_shard(dataset, Shard(2, 2), folder / "out", workers=1)
-    remove_shards(dataset, folder / "out")
-
-
 def a_release(_: DeepAccident, folder: Path, part: str | None = None) -> None:
     def record(job: RecordingJob) -> None:
         for kind in ("label", "calib"):
@@ -103,7 +92,6 @@ def an_index(dataset: DeepAccident, folder: Path) -> None:
 WRITERS: dict[str, tuple[Writer, Writer]] = {
     "an export": (half_an_export, an_export),
     "labels": (labels, labels),
-    "statistics": (half_a_statistic, statistics),
     "a release": (half_a_release, a_release),
     "an index": (an_index, an_index),
 }

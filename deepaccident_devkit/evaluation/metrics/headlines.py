@@ -9,7 +9,8 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal
 
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.text import choice, rows_html
+from deepaccident_devkit.reports import table_html
+from deepaccident_devkit.text import choice
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
 LIMITS: Final[Mapping[Unit, float]] = MappingProxyType({"%": 100.0, "share": 1.0, "1 - overlap": 1.0})
@@ -117,7 +118,7 @@ class TaskResult(FrozenMappings):
 
     def _repr_html_(self) -> str:
         rows = [(each.name, each.text()) for each in headlines(self.task, self)]
-        return rows_html([("number", "value"), *rows], f"{type(self).__name__}, {self.samples:,} samples")
+        return table_html([("number", "value"), *rows], f"{type(self).__name__}, {self.samples:,} samples")
 
 
 def headlines(task: str, result: object) -> tuple[Headline, ...]:

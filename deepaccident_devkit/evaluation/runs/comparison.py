@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -13,7 +11,7 @@ from typing import Any, Final, Literal
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
-from deepaccident_devkit.files import path_of, write_bytes
+from deepaccident_devkit.reports import write_csv
 from deepaccident_devkit.text import columns_text
 
 Family = Literal["main", "headlines", "other"]
@@ -137,13 +135,7 @@ class Comparison(ShortRepr):
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write a line a number; returns the file's path."""
-        text = io.StringIO(newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows([getattr(each, name) for name in _COLUMNS] for each in self.numbers)
-        target = path_of(path)
-        write_bytes(target, text.getvalue().encode())
-        return target
+        return write_csv(path, [_COLUMNS, *([getattr(each, name) for name in _COLUMNS] for each in self.numbers)])
 
 
 def _text_row(each: ComparedNumber) -> tuple[str, ...]:

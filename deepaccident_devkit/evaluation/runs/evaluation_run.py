@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
-from deepaccident_devkit.text import rows_html
+from deepaccident_devkit.reports import table_html
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -172,7 +172,7 @@ class EvaluationRun:
         ends = {path: f"[{low:.3f}, {high:.3f}]" for path, (low, high) in intervals.items()}
         shown = headlines(self.setup.task, self.result)
         rows = [(each.name, each.text(), ends.get(each.path, "")) for each in shown]
-        return rows_html([("number", "value", heading), *rows], f"{self._title}, {len(self.evaluator):,} samples")
+        return table_html([("number", "value", heading), *rows], f"{self._title}, {len(self.evaluator):,} samples")
 
     @property
     def _title(self) -> str:

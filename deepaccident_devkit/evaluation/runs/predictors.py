@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -13,7 +12,7 @@ from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN, GROUPS
 from deepaccident_devkit.evaluation.runs.bundles import read_bundle
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.reports import Table
 
 Json = Mapping[str, Any]
 Chooser = Literal["best_f1", "quiet", "braking"]
@@ -44,20 +43,7 @@ _FIELD_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PredictorTable:
-    """One group of recordings: the given predictions, and the references.
-
-    Attributes:
-        rows: of texts; the first has the names of the group and of the numbers.
-        notes: lines below it.
-    """
-
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...]
-
-
-def predictor_tables(metrics: Json) -> list[PredictorTable]:
+def predictor_tables(metrics: Json) -> list[Table]:
     """A table for each group of recordings; none if the result has no references.
 
     Args:
@@ -74,13 +60,13 @@ def predictor_tables(metrics: Json) -> list[PredictorTable]:
         columns = _COLUMNS if clean else _FIELD_COLUMNS[group.partition(" ")[0]]
         rows = [(name, *(_cell(figures, path) for path in columns.values())) for name, figures in everyone.items()]
         notes = tuple(_operating(metrics, given)) if clean else ()
-        tables.append(PredictorTable(rows=((group, *columns), *rows), notes=notes))
+        tables.append(Table(rows=((group, *columns), *rows), notes=notes))
     return tables
 
 
 def predictors_text(metrics: Json) -> str:
     """All tables of `predictor_tables`, as aligned lines; empty without any."""
-    return "\n\n".join("\n".join([columns_text(each.rows), *each.notes]) for each in predictor_tables(metrics))
+    return "\n\n".join(each.to_text() for each in predictor_tables(metrics))
 
 
 def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:

@@ -31,11 +31,11 @@ from deepaccident_devkit.evaluation.metrics.warning.prevention import (
 )
 from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN, UNPLACED
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
-from deepaccident_devkit.evaluation.runs.predictors import PredictorTable, number_text
+from deepaccident_devkit.evaluation.runs.predictors import number_text
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
+from deepaccident_devkit.reports import Table
 from deepaccident_devkit.safety import OUTCOMES, Accident, Skipped, accident_of, outcomes_of, undisturbed
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import columns_text
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -227,7 +227,7 @@ def _table(accident: Accident, own: tuple[bool, bool], frame: IntArray) -> Outco
     )
 
 
-def prevention_tables(prevented: Json) -> list[PredictorTable]:
+def prevention_tables(prevented: Json) -> list[Table]:
     """Two tables for each group of recordings: predictors at the nominal setting, and the predictions at all settings.
 
     Args:
@@ -238,15 +238,15 @@ def prevention_tables(prevented: Json) -> list[PredictorTable]:
         everyone = {GIVEN: given, **{name: each[group] for name, each in prevented["references"].items()}}
         head = (f"{group}, {NOMINAL}", *_COLUMNS)
         notes = tuple(_notes(prevented, group, given))
-        tables.append(PredictorTable(rows=(head, *_predictors(prevented["alarms"], everyone)), notes=notes))
+        tables.append(Table(rows=(head, *_predictors(prevented["alarms"], everyone)), notes=notes))
         rows = tuple((name, *_cells(given, prevented["alarms"], setting=name)) for name in SETTINGS)
-        tables.append(PredictorTable(rows=((f"{group}, {GIVEN}", *_COLUMNS), *rows), notes=()))
+        tables.append(Table(rows=((f"{group}, {GIVEN}", *_COLUMNS), *rows), notes=()))
     return tables
 
 
 def prevention_text(prevented: Json) -> str:
     """All tables of `prevention_tables` and the notes, as aligned lines."""
-    tables = ["\n".join([columns_text(each.rows), *each.notes]) for each in prevention_tables(prevented)]
+    tables = [each.to_text() for each in prevention_tables(prevented)]
     return "\n\n".join([*tables, *(["\n".join(prevented["notes"])] if prevented["notes"] else [])])
 
 

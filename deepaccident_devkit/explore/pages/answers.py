@@ -1,25 +1,32 @@
-"""Answers: pages from templates, pictures, and who may keep them how long."""
+"""Answers: pages from templates, pictures, styles and scripts, and who may keep them how long.
+
+Styles and scripts have addresses that change with their content, so that browsers may keep them.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from functools import cache
+from importlib.resources import files
 from typing import Any, Final
 from urllib.parse import quote
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.routing import Route
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.explore.explorer import Explorer
-from deepaccident_devkit.explore.pages.static import asset
-from deepaccident_devkit.render import markup
-from deepaccident_devkit.render.roles import short_name
-from deepaccident_devkit.text import fixed_text, size_text
+from deepaccident_devkit.pages import part, path_in_address
+from deepaccident_devkit.pages import rendered as filled
+from deepaccident_devkit.render.replay import replay_script, replay_style
+from deepaccident_devkit.render.theme import page_style
 
 KEPT: Final = "private, max-age=600"
 """A browser may keep pictures for some minutes: files of a release seldom change."""
+_FOREVER: Final = "private, max-age=31536000, immutable"
+_KINDS: Final = {"css": "text/css", "js": "text/javascript"}
 
 
 def explorer_of(request: Request) -> Explorer:
@@ -48,8 +55,9 @@ def rendered(explorer: Explorer, template: str, root: str, **context: Any) -> st
         root: relative address of the first page.
         **context: what it shows; all texts are escaped.
     """
-    models = [*explorer.models]
-    return environment().get_template(template).render(root=root, models=models, **context)
+    addresses = {"asset": asset, "scenario_at": scenario_address, "thumbnail_at": thumbnail_address}
+    served = {"root": root, "models": [*explorer.models], "static": False, "frame_number": frame_button}
+    return filled(template, **addresses, **served, **context)
 
 
 async def with_slash(request: Request) -> Response:
@@ -64,47 +72,14 @@ def picture(content: bytes, kind: str) -> Response:
     return Response(content, media_type=f"image/{kind}", headers={"Cache-Control": KEPT})
 
 
-@cache
-def environment() -> Environment:
-    """The templates; whatever is not `Markup` is escaped, and a name that is not there is an error.
-
-    The addresses are those of served pages; pages that are written as files set others (`static_pages`).
-    """
-    made = Environment(
-        loader=PackageLoader("deepaccident_devkit.explore"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
-    made.filters |= {
-        "path": path_of,
-        "number": number,
-        "scalar": markup.scalar,
-        "agent": short_name,
-        "breakable": breakable,
-        "thousands": thousands,
-        "counted": counted,
-        "size": size,
-    }
-    made.globals |= {
-        "asset": asset,
-        "frame_number": frame_button,
-        "scenario_at": scenario_address,
-        "static": False,
-        "thumbnail_at": thumbnail_address,
-        "version": __version__,
-    }
-    return made
-
-
 def scenario_address(root: str, token: str) -> str:
     """The relative address of a scenario's page."""
-    return f"{root}scenario/{path_of(token)}/"
+    return f"{root}scenario/{path_in_address(token)}/"
 
 
 def thumbnail_address(root: str, token: str) -> str:
     """The relative address of a scenario's thumbnail."""
-    return f"{root}thumbnail/{path_of(token)}.jpg"
+    return f"{root}thumbnail/{path_in_address(token)}.jpg"
 
 
 def frame_button(number: int) -> Markup:
@@ -112,33 +87,35 @@ def frame_button(number: int) -> Markup:
     return Markup('<button type="button" data-frame="{0}">{0}</button>').format(number)
 
 
-def path_of(text: str) -> str:
-    """A token as a part of an address."""
-    return quote(text, safe="/")
+def static_routes() -> list[Route]:
+    """Where they are."""
+    return [Route("/static/{digest}/{name}", _answer)]
 
 
-def number(value: float | None, digits: int = 1) -> str:
-    """A number with so many decimals; a dash for an unknown one, `never` for an infinite one."""
-    if value is None or value != value:  # noqa: PLR0124 - NaN
-        return "–"
-    return "never" if value in (float("inf"), float("-inf")) else fixed_text(value, digits)
+def asset(root: str, name: str) -> str:
+    """The relative address of a style or script from a page whose way to the first page is `root`."""
+    content = assets()[name]
+    digest = hashlib.blake2b(content.encode(), digest_size=6).hexdigest()
+    return f"{root}static/{digest}/{name}"
 
 
-def thousands(count: int) -> str:
-    """A whole number with commas."""
-    return f"{count:,}"
+@cache
+def assets() -> dict[str, str]:
+    """Name → text."""
+    folder = files("deepaccident_devkit.explore") / "static"
+    own = {each.name: each.read_text(encoding="utf-8") for each in folder.iterdir() if each.name[0] != "_"}
+    return {
+        **own,
+        "pages.css": page_style(),
+        "replay.css": replay_style(),
+        "replay-player.js": replay_script(),
+        "sorting.js": part("sorting.js"),
+    }
 
 
-def counted(count: int, word: str) -> str:
-    """A number and what it is of: `1 scenario`, `1,200 scenarios`."""
-    return f"{count:,} {word}{'' if count == 1 else 's'}"
-
-
-def size(count: int | None) -> str:
-    """Bytes in a unit that suits them; `unknown` for None."""
-    return "unknown" if count is None else size_text(count)
-
-
-def breakable(text: str) -> Markup:
-    """A name that may be broken after `/`, `_` and `=`."""
-    return Markup(markup.breakable(text))  # noqa: S704 - it escapes
+async def _answer(request: Request) -> Response:
+    name = request.path_params["name"]
+    if name not in assets():
+        raise HTTPException(404)
+    kind = _KINDS[name.rpartition(".")[2]]
+    return Response(assets()[name], media_type=kind, headers={"Cache-Control": _FOREVER})

@@ -10,9 +10,10 @@ from deepaccident_devkit.errors import NotAvailableError, TokenError
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.models import Model
-from deepaccident_devkit.explore.pages.answers import explorer_of, path_of
+from deepaccident_devkit.explore.pages.answers import explorer_of
 from deepaccident_devkit.explore.pages.pictures import sample_of
 from deepaccident_devkit.explore.sample_lists import is_sample
+from deepaccident_devkit.pages import path_in_address
 
 SAMPLE = "{type}/{name}/{agent}/{frame:int}"
 
@@ -28,7 +29,7 @@ def model_of(request: Request, name: str = "model") -> Model:
 def sample_path(token: str) -> str:
     """A sample in an address: `type/scenario/agent/12`."""
     scenario, _, frame = token.rpartition("/")
-    return path_of(f"{scenario}/{int(frame)}" if frame.isdecimal() and frame.isascii() else token)
+    return path_in_address(f"{scenario}/{int(frame)}" if frame.isdecimal() and frame.isascii() else token)
 
 
 def known_sample(request: Request, *models: Model) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, Final
 
@@ -10,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from deepaccident_devkit.evaluation.runs import Bundle, results_text
+from deepaccident_devkit.evaluation.runs import Bundle, results_text, scenario_hashes
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.evaluate_command import command_job
 from deepaccident_devkit.explore.evaluations import evaluated
@@ -21,7 +22,6 @@ from deepaccident_devkit.explore.pages.answers import explorer_of, page, with_sl
 from deepaccident_devkit.explore.pages.model_addresses import model_of, models_of_task, titles
 from deepaccident_devkit.explore.pages.samples import rows_of
 from deepaccident_devkit.explore.sample_lists import SampleChoices, listed
-from deepaccident_devkit.explore.truth import truth_job
 
 _WORST: Final = 12
 """Samples on a model's page."""
@@ -111,3 +111,28 @@ def _results_context(explorer: Explorer, model: Model) -> dict[str, Any]:
         "first": rows_of(explorer, model, sorted(model.tokens)[:_WORST]),
         "choices": SampleChoices(),
     }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruthCheck:
+    """A bundle's truth beside the release's.
+
+    Attributes:
+        checked: how many scenarios both have.
+        differing: those of them whose label, meta or calib files are not the same.
+    """
+
+    checked: int
+    differing: tuple[str, ...]
+
+
+def truth_job(explorer: Explorer, name: str, bundle: Bundle) -> Job:
+    """The work that gives the `TruthCheck` of a model's bundle: it reads the files of all its scenarios."""
+
+    def work() -> TruthCheck:
+        stated = bundle.scenarios()
+        found = scenario_hashes(explorer.dataset, stated, workers=explorer.workers)
+        differing = tuple(token for token, each in found.items() if each.as_dict() != stated[token])
+        return TruthCheck(checked=len(found), differing=differing)
+
+    return explorer.jobs.ask(f"truth {name}", f"whether the labels are those that {name} was evaluated with", work)

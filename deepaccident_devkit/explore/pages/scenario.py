@@ -17,9 +17,10 @@ from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, rendered, root_of, with_slash
 from deepaccident_devkit.explore.pages.pictures import SCENARIO, sample_of, token_of
 from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.render.replay import CONTROLS, PLAYER, replay_part, script_json
-from deepaccident_devkit.render.roles import agent_actors, short_name
+from deepaccident_devkit.render.replay import script_json
+from deepaccident_devkit.render.roles import agent_actors
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, describe, lead_times, twin_diff, twin_of
+from deepaccident_devkit.taxonomy import short_name
 from deepaccident_devkit.validation import findings
 
 _MOST_PAIRS: Final = 30
@@ -72,8 +73,6 @@ def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[
         "telling": telling,
         "model": shown,
         "data": script_json(played),
-        "player": replay_part(PLAYER),
-        "controls": replay_part(CONTROLS),
         "parts": PARTS,
         "first_agent": played["agents"][0]["name"],
     }

@@ -15,10 +15,11 @@ from starlette.routing import Route
 from deepaccident_devkit.explore.choices import PAGE, SCORE, SORTS, Choices, Found, found_by
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.models import Model
-from deepaccident_devkit.explore.pages.answers import explorer_of, number, page
+from deepaccident_devkit.explore.pages.answers import explorer_of, page
 from deepaccident_devkit.explore.scenarios import VISIBILITY_RANKS, ending
 from deepaccident_devkit.selection.fields import FIELDS
 from deepaccident_devkit.splits import save_selection
+from deepaccident_devkit.text import number_text
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
@@ -143,7 +144,7 @@ def _setting(record: ScenarioRecord) -> str:
 def cell(value: float | str | None) -> Cell:
     """A measure, or a visibility."""
     rank = VISIBILITY_RANKS.get(value) if isinstance(value, str) else value
-    return Cell(value if isinstance(value, str) else number(value), sort_key(rank))
+    return Cell(value if isinstance(value, str) else number_text(value), sort_key(rank))
 
 
 def sort_key(value: float | None) -> str:

@@ -12,11 +12,12 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.files import path_of, place_in, write_bytes
+from deepaccident_devkit.pages import document
 from deepaccident_devkit.reading import read_bytes
-from deepaccident_devkit.render.evaluation import sections
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, save_figure
 from deepaccident_devkit.render.evaluation.samples import sample_figures
-from deepaccident_devkit.render.markup import Markup, chapters, document, joined, picture, tag
+from deepaccident_devkit.render.evaluation.sections import report_context
+from deepaccident_devkit.render.theme import page_style
 
 REPORT_FILE: Final = "report.html"
 FIGURES_FOLDER: Final = "figures"
@@ -66,29 +67,5 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
         run: of `evaluate_results`.
         figures: with their PNG files, which become part of the page.
     """
-    title = f"{run.setup.task.capitalize()}, protocol {run.setup.protocol}"
-    parts = {
-        "Headline numbers": sections.headline_table(run),
-        **({"Predictors": table} if (table := sections.predictors(run)) else {}),
-        **({"Prevented accidents": table} if (table := sections.prevention(run)) else {}),
-        "Counts": sections.counts(run),
-        "Figures": tag(
-            "div",
-            *(picture(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures),
-            class_="figures",
-        ),
-        "Breakdowns": joined(sections.breakdowns(run)),
-        **({"Sanity": sections.sanity(run.sanity)} if run.sanity is not None else {}),
-        "Choices": sections.choices(run),
-        "Check these numbers": sections.checking(),
-    }
-    mark = _mark(run)
-    return document(
-        f"DeepAccident evaluation: {title}",
-        tag("header", tag("h1", f"DeepAccident evaluation: {title}"), mark, sections.header(run)),
-        chapters(parts, mark),
-    )
-
-
-def _mark(run: EvaluationRun) -> Markup:
-    return Markup("") if run.partial is None else tag("p", run.partial.text(), class_="partial")
+    pictures = [(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures]
+    return document("evaluation_report.html", style=page_style(), pictures=pictures, **report_context(run))

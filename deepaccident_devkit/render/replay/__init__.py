@@ -2,12 +2,9 @@
 
 from deepaccident_devkit.render.replay.recording import recording_of
 from deepaccident_devkit.render.replay.replay import (
-    CONTROLS,
-    PLAYER,
-    SCRIPTS,
-    STYLE,
     render_replay,
-    replay_part,
+    replay_script,
+    replay_style,
     script_json,
     served_replay,
     tried_replay,
@@ -15,14 +12,11 @@ from deepaccident_devkit.render.replay.replay import (
 from deepaccident_devkit.render.replay.sensors import cloud_text
 
 __all__ = [
-    "CONTROLS",
-    "PLAYER",
-    "SCRIPTS",
-    "STYLE",
     "cloud_text",
     "recording_of",
     "render_replay",
-    "replay_part",
+    "replay_script",
+    "replay_style",
     "script_json",
     "served_replay",
     "tried_replay",

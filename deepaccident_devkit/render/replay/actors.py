@@ -12,8 +12,8 @@ from deepaccident_devkit.arrays import AnyArray, IntArray
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.render.roles import actor_color, short_name
-from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.render.roles import actor_color
+from deepaccident_devkit.taxonomy import CAMERAS, short_name
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 from deepaccident_devkit.render.replay.recording import Recording
 from deepaccident_devkit.render.replay.sensors import CameraFiles, CameraPictures
-from deepaccident_devkit.render.roles import short_name
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, short_name
 
 
 def facts(recording: Recording) -> list[list[str]]:

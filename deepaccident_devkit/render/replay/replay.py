@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
 import math
 import os
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
 from deepaccident_devkit.files import path_of, write_bytes
+from deepaccident_devkit.pages import document, part, source_hash
 from deepaccident_devkit.render.colors import (
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
@@ -22,7 +21,6 @@ from deepaccident_devkit.render.colors import (
     OUTCOME_COLORS,
     POINT_COLOR,
 )
-from deepaccident_devkit.render.markup import source_hash
 from deepaccident_devkit.render.missing import is_there
 from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries, camera_entries, camera_title
 from deepaccident_devkit.render.replay.facts import facts, notes, served_notes
@@ -38,7 +36,7 @@ from deepaccident_devkit.render.replay.sensors import (
     lidar_points,
 )
 from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
-from deepaccident_devkit.render.theme import DARK, LIGHT
+from deepaccident_devkit.render.theme import COLORS
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR
 from deepaccident_devkit.v2x import Agents
 
@@ -47,12 +45,6 @@ SIZE_LIMIT: Final = 15_000_000
 _BASE64: Final = 4 / 3
 _BESIDE: Final = 8
 """Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
-SCRIPTS: Final = ("sources.js", "ground.js", "panels.js", "cameras.js", "replay.js")
-"""Each script uses the ones before it."""
-STYLE: Final = "replay.css"
-PLAYER: Final = "player.html"
-CONTROLS: Final = "controls.html"
-"""The two parts of a page that the scripts fill: what is shown, and below all else the controls."""
 
 
 def render_replay(
@@ -244,24 +236,10 @@ def replay_page(title: str, data: Mapping[str, Any]) -> str:
         title: of the window.
         data: what the scripts play, as JSON holds it.
     """
-    style, script = LIGHT + DARK + replay_part(STYLE), "".join(map(replay_part, SCRIPTS))
-    policy = (
-        f"default-src 'none'; img-src data:; style-src '{source_hash(style)}'; script-src '{source_hash(script)}'; "
-        "base-uri 'none'; form-action 'none'"
-    )
-    parts = {
-        "policy": html.escape(policy, quote=False),
-        "title": html.escape(title),
-        "player": replay_part(PLAYER),
-        "controls": replay_part(CONTROLS),
-        "style": style,
-        "script": script,
-        "data": script_json(data),
-    }
-    page = replay_part("replay.html")
-    for name, part in parts.items():  # the data come last, so that nothing in them is replaced
-        page = page.replace(f"<!--{name}-->", part)
-    return page
+    style = COLORS + replay_style()
+    policy = f"default-src 'none'; img-src data:; style-src '{source_hash(style)}'; base-uri 'none'; form-action 'none'"
+    written = script_json(data)
+    return document("replay/replay.html", style=style, policy=policy, script=replay_script(), title=title, data=written)
 
 
 def script_json(data: Mapping[str, Any]) -> str:
@@ -272,6 +250,11 @@ def script_json(data: Mapping[str, Any]) -> str:
     return text
 
 
-def replay_part(name: str) -> str:
-    """The text of one of the files of which a page is made: `SCRIPTS`, `STYLE`, `PLAYER`, `CONTROLS`."""
-    return (files(__package__) / name).read_text(encoding="utf-8")
+def replay_style() -> str:
+    """The rules of a replay, beside those of the colours."""
+    return part("replay/replay.css")
+
+
+def replay_script() -> str:
+    """The scripts of a replay; each uses the ones before it."""
+    return "".join(part(f"replay/{name}.js") for name in ("sources", "ground", "panels", "cameras", "replay"))

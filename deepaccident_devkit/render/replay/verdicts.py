@@ -18,7 +18,7 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.outcomes.accident import count_words
 from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.taxonomy import short_name
 
 Foreseen = Results | Mapping[str, MotionOutput | Iterable[Accident]]
 """A results file of motion or accidents, or predictions by sample token."""

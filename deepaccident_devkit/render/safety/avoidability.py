@@ -14,7 +14,7 @@ from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SERIES_COLORS
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.safety import OUTCOMES, AvoidabilityReport, OutcomeShares
-from deepaccident_devkit.safety.avoidability_shares import GROUPS
+from deepaccident_devkit.safety.avoidability import GROUPS
 from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:

@@ -11,11 +11,10 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.render.axes import figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, MUTED_COLOR, OWN_COLOR, SERIES_COLORS
-from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, LeadTimeLedger, MeanTime
-from deepaccident_devkit.safety.ledger_report import CAVEAT
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.safety.lead_times import CAVEAT
+from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

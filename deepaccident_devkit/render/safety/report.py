@@ -6,27 +6,29 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import place_in, plain_names, writable_folder, write_bytes
+from deepaccident_devkit.pages import document, part
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.axes import detached_figure
-from deepaccident_devkit.render.markup import chapters, document, picture, tag
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.replay import tried_replay
-from deepaccident_devkit.render.safety import report_sections
-from deepaccident_devkit.render.safety.accident_table import accident_table, by_severity
 from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, render_avoidability
 from deepaccident_devkit.render.safety.lead_time import LEAD_TIME_SIZE, render_lead_times
-from deepaccident_devkit.render.theme import DARK
-from deepaccident_devkit.safety import SafetyReport
-from deepaccident_devkit.safety.avoidability_shares import GROUPS
+from deepaccident_devkit.render.theme import page_style
+from deepaccident_devkit.safety import COALITIONS, OUTCOMES, PARTNERS, AccidentRow, OutcomeShares, SafetyReport
+from deepaccident_devkit.safety.avoidability import GROUPS
+from deepaccident_devkit.safety.lead_times import CAVEAT
+from deepaccident_devkit.safety.report import CRITICAL, DECELERATIONS, actor_name
+from deepaccident_devkit.taxonomy import AGENTS, short_name
+from deepaccident_devkit.text import number_text
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -37,7 +39,16 @@ REPORT_FILE: Final = "report.html"
 REPLAYS: Final = 10
 """Replay pages that are made if nobody says how many."""
 _DPI: Final = 150
-_TITLE: Final = "Accidents of DeepAccident: who saw them, and what would have avoided them"
+_LEADS: Final = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
+"""Seconds of warning that the tables have columns for."""
+_WARNED: Final = {
+    "ego": "the ego is warned and brakes",
+    "both": "both are warned and brake",
+    "first": "the first is warned and brakes",
+    "second": "the second is warned and brakes",
+}
+_LISTED: Final = 10
+"""Rows of the tables of the largest and the least."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,25 +126,94 @@ def report_html(
         pages: scenario → path of its replay page, relative to the report.
         failed: scenarios of which no replay page could be made, and why.
     """
-    addresses = {scenario: quote(name) for scenario, name in pages.items()}
-    shown = (picture(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures)
-    parts = {
-        "Accidents avoided": report_sections.avoided(report),
-        "Who saw it first": report_sections.lead_times(report),
-        **({"Figures": tag("div", *shown, class_="figures")} if figures else {}),
-        "Self-check": report_sections.margins(report),
-        "Critical without a collision": report_sections.critical(report),
-        "Twins torn apart": report_sections.torn(report),
-        "All accidents": accident_table(report.rows, addresses),
-        "Left out": report_sections.left_out(report, failed),
-    }
     return document(
-        _TITLE,
-        tag("header", tag("h1", _TITLE), report_sections.header(report)),
-        chapters(parts),
-        style=DARK + _part("report.css"),
-        script=_part("sorting.js"),
+        "safety_report.html",
+        style=page_style(),
+        script=part("sorting.js"),
+        report=report,
+        header=_header(report),
+        shares=list(_shares(report)),
+        caveat=CAVEAT,
+        partners=[
+            [short_name(name), *(mean.text for mean in means)]
+            for name, *means in zip(
+                PARTNERS, report.ledger.mean_gains, report.ledger.mean_losses, report.ledger.mean_shapley, strict=True
+            )
+        ],
+        sets=[
+            [", ".join(map(short_name, members)), mean.text, f"{mean.accidents:,}"]
+            for members, mean in zip(COALITIONS, report.ledger.mean_leads, strict=True)
+        ],
+        gaps=[[name, f"{count:,}"] for name, count in report.avoidability.margin_counts.items()],
+        largest=[[name, number_text(gap, 3)] for name, gap in _largest(report.avoidability.margins)],
+        nearest=list(_nearest(report))[:_LISTED],
+        torn_twins=[
+            [each.scenarios[0], each.splits[0], each.scenarios[1], each.splits[1]] for each in report.twins.torn
+        ],
+        left_out=[*report.left_out, *((scenario, "replay pages", reason) for scenario, reason in failed)],
+        pictures=[(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures],
+        rows=by_severity(report.rows),
+        pages={scenario: quote(name) for scenario, name in pages.items()},
+        agents=AGENTS,
+        decelerations=DECELERATIONS,
+        critical_ttc=CRITICAL,
     )
+
+
+def by_severity(rows: Iterable[AccidentRow]) -> list[AccidentRow]:
+    """The accidents with the largest delta-v first."""
+    return sorted(rows, key=lambda row: (-row.severity, row.scenario))
+
+
+def _header(report: SafetyReport) -> dict[str, str]:
+    """What was looked at, and how much of it."""
+    avoidability = report.avoidability
+    return {
+        "release": f"{report.version}, {report.dataroot}",
+        "scenarios": f"{report.scenarios:,}, {report.ledger.without_accident:,} without an accident",
+        "accidents": f"{len(report.rows):,}, {len(avoidability.accidents):,} of them replayed",
+        "left out": f"{len(avoidability.dropped):,} not shown by their recording, {len(avoidability.skipped):,} "
+        f"without meta or labels, {len(report.broken):,} broken",
+        "observed": report.ledger.rule.text,
+        "devkit": __version__,
+    }
+
+
+def _shares(report: SafetyReport) -> Iterator[dict[str, Any]]:
+    """A table of the shares that braking avoids, by the seconds of warning, for each group and for who is warned."""
+    shares = report.avoidability.shares
+    order = [each.group for each in shares], list(_WARNED)
+    for each in sorted(shares, key=lambda each: (order[0].index(each.group), order[1].index(each.warned))):
+        leads = [(lead, round(lead * 10)) for lead in _LEADS if round(lead * 10) < len(each.leads)]
+        rows = [
+            [f"reaction {way.reaction:g} s, {way.deceleration:g} m/s²", *(_share(each, at, column) for _, at in leads)]
+            for column, way in enumerate(each.brakings)
+        ]
+        counts = ["accidents recorded for so long", *(f"{each.accidents[at]:,}" for _, at in leads)]
+        yield {
+            "title": f"{each.group}: {_WARNED[each.warned]} ({each.accidents.max():,} accidents)",
+            "open": each.group == shares[0].group and each.warned in ("ego", "both"),
+            "heading": ["warned before the end (s)", *(f"{lead:g}" for lead, _ in leads)],
+            "rows": [*rows, counts],
+        }
+
+
+def _share(shares: OutcomeShares, at: int, column: int) -> tuple[str, str]:
+    """The share avoided, and below it the share that is hit only later."""
+    share, later = shares.shares[at, column, OUTCOMES.index("avoided")], shares.extrapolated[at, column]
+    return f"{100 * share:.0f} %", f"{100 * later:.0f} % later" if later else ""
+
+
+def _largest(margins: Mapping[str, float]) -> list[tuple[str, float]]:
+    return sorted(margins.items(), key=lambda each: -each[1])[:_LISTED]
+
+
+def _nearest(report: SafetyReport) -> Iterator[list[str]]:
+    """The normal recordings in which two come near a collision, the nearest first."""
+    for story in report.normal:
+        if (nearest := story.facts["nearest"]) is not None:
+            numbers = (number_text(nearest[name], 2) for name in ("min_ttc", "min_gap"))
+            yield [story.facts["scenario"], *numbers, " and ".join(map(actor_name, nearest["pair"]))]
 
 
 def replay_names(scenarios: Iterable[str]) -> dict[str, str]:
@@ -178,7 +258,3 @@ def _figures(report: SafetyReport) -> Iterator[_Drawn]:
 
 def _draw_avoidability(report: SafetyReport, group: str) -> Figure:
     return render_avoidability(report.avoidability, group, fig=detached_figure(AVOIDABILITY_SIZE))
-
-
-def _part(name: str) -> str:
-    return (files(__package__) / name).read_text(encoding="utf-8")

@@ -13,10 +13,10 @@ from deepaccident_devkit.render.boxes import draw_boxes_from_above
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
 from deepaccident_devkit.render.colors import MUTED_COLOR, OWN_COLOR, SERIES_COLORS
 from deepaccident_devkit.render.legends import draw_legend
-from deepaccident_devkit.render.roles import actor_color, short_name
+from deepaccident_devkit.render.roles import actor_color
 from deepaccident_devkit.render.styles import has_tokens, in_own_settings
 from deepaccident_devkit.safety import TwinDiff
-from deepaccident_devkit.taxonomy import CATEGORIES, frame_timestamp
+from deepaccident_devkit.taxonomy import CATEGORIES, frame_timestamp, short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -67,7 +67,7 @@ def test_predict_takes_them_by_their_name(release_root: Path, tmp_path: Path) ->
 def test_the_demo_shows_their_prediction(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "_SECONDS_BEFORE", 0.1)  # the release is short
     assert demo.draw_model(da, tmp_path)
-    [name] = demo.MODEL_PICTURE
+    name = demo.MODEL_PICTURE
     assert (tmp_path / name).stat().st_size > 20_000
     page = demo.demo_page([], [], model=True)
     assert page.index("motion_labels_1s_before.png") < page.index(name)

@@ -358,7 +358,7 @@ def test_a_browser_that_fails_is_no_error(monkeypatch: pytest.MonkeyPatch) -> No
         module._open("http://127.0.0.1:1/")
 
 
-@pytest.mark.parametrize("name", ["starlette", "uvicorn", "jinja2"])
+@pytest.mark.parametrize("name", ["starlette", "uvicorn"])
 def test_a_missing_extra_is_an_error_with_the_remedy(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     need_extra()
     monkeypatch.setitem(sys.modules, name, None)

@@ -23,7 +23,7 @@ from deepaccident_devkit.explore import Explorer, export_pages, static_pages, st
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_html
 from deepaccident_devkit.explore.verdicts import verdict
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.taxonomy import short_name
 
 pytestmark = pytest.mark.slow
 
@@ -71,7 +71,7 @@ def test_what_is_written(made: Made, da_motion: DeepAccident) -> None:
     tokens = [scenario["token"] for scenario in da_motion.scenario]
     of_scenarios = [f"{token}/{name}" for token in tokens for name in ("index.html", "replay.html", "thumbnail.jpg")]
     found = contents(made.index.parent)
-    static = {"explore.css", "keys.js", "pages.css", "sorting.js", "written.css"}
+    static = {"explore.css", "keys.js", "pages.css", "sorting.js"}
     assert found.keys() == {"index.html", ".deepaccident_pages", *of_scenarios, *(f"static/{each}" for each in static)}
     assert [path.name for path in made.index.parent.parent.glob(".*")] == []
 

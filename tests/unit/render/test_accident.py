@@ -20,9 +20,9 @@ from deepaccident_devkit.render.accident import accident_words, draw_countdown, 
 from deepaccident_devkit.render.best_view import best_view
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.pair import Pair
-from deepaccident_devkit.render.roles import camera_name, short_name
+from deepaccident_devkit.render.roles import camera_name
 from deepaccident_devkit.render.video import render_scenario_video
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
 from deepaccident_devkit.v2x import collision
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 

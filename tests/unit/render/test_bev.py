@@ -26,9 +26,9 @@ from deepaccident_devkit.render.colors import (
     OWN_COLOR,
     POINT_COLOR,
 )
-from deepaccident_devkit.render.roles import collider_ids, short_name
+from deepaccident_devkit.render.roles import collider_ids
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, short_name
 from deepaccident_devkit.v2x import Link, PoseNoise, cooperative_boxes
 
 

@@ -14,8 +14,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import detached_figure, render_frame, render_sample
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.moments import draw_shared_moment
-from deepaccident_devkit.render.roles import short_name
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
 
 pytestmark = pytest.mark.slow
 

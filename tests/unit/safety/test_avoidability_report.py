@@ -23,7 +23,7 @@ from deepaccident_devkit.safety import (
     avoidability_report,
     outcome_shares,
 )
-from deepaccident_devkit.safety.avoidability_shares import GROUPS, group_of
+from deepaccident_devkit.safety.avoidability import GROUPS, group_of
 from deepaccident_devkit.safety.outcomes import delta_v_ranges
 from deepaccident_devkit.safety.secondary import SecondaryContact
 
@@ -178,7 +178,7 @@ def test_of_a_release(own_release: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (own_release / bare["folder"] / bare["scenario_type"] / "meta" / f"{bare['name']}.txt").unlink()
     shutil.rmtree(own_release / ".deepaccident")
     dataset = DeepAccident("v1", own_release, verbose=False)
-    module = importlib.import_module("deepaccident_devkit.safety.avoidability_report")
+    module = importlib.import_module("deepaccident_devkit.safety.avoidability")
     real = module.accident_of
 
     def moved_apart(dataset: DeepAccident, scenario: str) -> object:

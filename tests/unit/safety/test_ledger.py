@@ -13,7 +13,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, LeadTimes, ObservationRule, lead_time_ledger, lead_times
-from deepaccident_devkit.safety.ledger_report import CAVEAT, mean_times
+from deepaccident_devkit.safety.lead_times import CAVEAT, mean_times
 from deepaccident_devkit.safety.observation import observed_actors
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from damaged_releases import damaged_release
 
+import deepaccident_devkit.safety.report as report_module
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.safety import (
     SafetyReport,
@@ -18,12 +19,11 @@ from deepaccident_devkit.safety import (
     describe,
     interactions,
     lead_time_ledger,
-    overall_report,
     safety_report,
     stories,
     twin_report,
 )
-from deepaccident_devkit.safety.avoidability_report import Dropped
+from deepaccident_devkit.safety.avoidability import Dropped
 
 
 @pytest.fixture(scope="module")
@@ -62,16 +62,16 @@ def test_a_row_has_the_numbers_of_its_accident(da_motion: DeepAccident, report: 
 
 def test_each_accident_is_replayed_once(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
     replayed = []
-    once = overall_report.looked_into
+    once = report_module.looked_into
 
-    def counted(dataset: DeepAccident, scenario: str) -> Any:
-        replayed.append(scenario)
+    def counted(dataset: DeepAccident, scenario: Any) -> Any:
+        replayed.append(scenario["token"])
         return once(dataset, scenario)
 
     def never(*_: object, **__: object) -> None:
         pytest.fail("the story replays the accident itself")
 
-    monkeypatch.setattr(overall_report, "looked_into", counted)
+    monkeypatch.setattr(report_module, "looked_into", counted)
     monkeypatch.setattr(importlib.import_module("deepaccident_devkit.safety.stories"), "avoidability", never)
     (row,) = safety_report(da_motion, da_motion.find(collision=True), workers=1).rows
     assert replayed == [row.scenario]
@@ -81,10 +81,10 @@ def test_each_accident_is_replayed_once(da_motion: DeepAccident, monkeypatch: py
 def test_an_accident_that_cannot_be_replayed_keeps_its_row(
     da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def apart(_: object, scenario: str) -> Dropped:
-        return Dropped(Skipped(scenario=scenario, reason="2.00 m apart"), 2.0)
+    def apart(_: object, scenario: Any) -> Dropped:
+        return Dropped(Skipped(scenario=scenario["token"], reason="2.00 m apart"), 2.0)
 
-    monkeypatch.setattr(overall_report, "looked_into", apart)
+    monkeypatch.setattr(report_module, "looked_into", apart)
     report = safety_report(da_motion, da_motion.find(collision=True), workers=1)
     (row,) = report.rows
     assert (row.replayed, row.last_moments, row.brakes, row.severity) == (None, {}, [], -1.0)

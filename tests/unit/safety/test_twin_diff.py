@@ -13,7 +13,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.safety import Parting, TwinDiff, twin_diff, twin_report
-from deepaccident_devkit.safety.twin_report import diff_text
+from deepaccident_devkit.safety.twins import diff_text
 
 TOKENS = {"accident": "type1_subtype1_accident/a", "twin": "type1_subtype1_normal/a"}
 

@@ -1,0 +1,49 @@
+"""Reports: one value and named tables in all forms, with names that are harmless."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from report_page import Page
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.reports import Report, Row, Table, table_html
+
+HOSTILE = "<script>alert('1')</script>"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Speeds(Report):
+    """Speeds by name; None is not known."""
+
+    speeds: dict[str, float | None]
+
+    def named_tables(self) -> dict[str, Iterable[Row]]:
+        return {"speeds": [("name", "m/s"), *self.speeds.items()], "empty": [("name",)]}
+
+
+def test_all_forms_have_the_same_numbers(tmp_path: Path) -> None:
+    report = Speeds(speeds={HOSTILE: 1.5, "b": None})
+    assert json.loads(report.to_json()) == report.to_dict() == {"speeds": {HOSTILE: 1.5, "b": None}}
+    speeds, empty = report.to_csv(tmp_path / "new")
+    assert speeds.read_text() == f"name,m/s\n{HOSTILE},1.5\nb,\n"
+    assert empty.read_text() == "name\n"
+    assert report.to_text() == f"speeds\nname{' ' * 25}m/s\n{HOSTILE}  1.5\nb\n\nempty\nname"
+    page = Page(report.to_html())
+    assert (len(page.all("table")), len(page.all("tr")), page.all("script")) == (2, 4, [])
+    assert HOSTILE in page.text
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="is a file; give a folder"):
+        Speeds(speeds={}).to_csv(tmp_path / "file")
+
+
+def test_notes_stand_below_a_table() -> None:
+    assert Table(rows=[("a", "b"), ("name", "1.0")], notes=("of one",)).to_text() == "a       b\nname  1.0\nof one"
+    assert table_html([("a",), ("b",)], "c") == (
+        "<table><caption>c</caption><tr><th>a</th></tr><tr><td>b</td></tr></table>"
+    )
