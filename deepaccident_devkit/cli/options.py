@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import click
 from click.core import ParameterSource
 
-from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.parallel import MERGE, Part, Shard, cluster_executor
@@ -334,17 +333,6 @@ def frame_range_parameter(verb: Verb) -> Verb:
         help="Only these frames of a scenario, counted from 1.",
     )
     return option(verb)
-
-
-def old_frames_parameter(verb: Verb) -> Verb:
-    """Give a verb `old_frames`: --frames, which --frame-range replaces."""
-    return click.option("--frames", "old_frames", callback=_old_frames, hidden=True, help="Old name.")(verb)
-
-
-def _old_frames(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
-    if value is not None:
-        warn_deprecated("--frames FIRST..LAST", "--frame-range FIRST..LAST", since="0.1", gone_in="0.2")
-    return _frame_range(context, parameter, value)
 
 
 def _frame_range(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
