@@ -7,7 +7,7 @@ digest. Then the names that changed, came and went are printed. Exit status 1 if
 
     python .ci/tools/digests.py ../main . --expect 'evaluate/warning/boxes/*' --expect 'export/*.manifest.json'
 
-It takes some two minutes on two free cores.
+It takes some four minutes of a processor.
 """
 
 import argparse

@@ -4,7 +4,6 @@ import re
 from importlib import import_module
 from pathlib import Path
 
-import deepaccident_devkit
 from deepaccident_devkit.evaluation.results import FORMAT_VERSION
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_VERSION
 from deepaccident_devkit.motion import label_folder
