@@ -25,8 +25,8 @@ same text in the terminal.
 | command | what it does |
 |---|---|
 | `deepaccident demo` | Makes a small synthetic release in `deepaccident_demo/`, and a page that shows it. |
-| `deepaccident info DATAROOT` | Prints what a release holds; with `--missing`, what a download lacks. |
-| `deepaccident validate DATAROOT` | Prints what is wrong, unusual or missing in a download. |
+| `deepaccident info DATAROOT` | Prints what a release holds. |
+| `deepaccident validate DATAROOT` | Prints what is wrong or unusual in a download; with `--files`, what is missing. |
 | `deepaccident index DATAROOT` | Makes the index before you need it. |
 | `deepaccident synth OUT` | Makes a synthetic release, so that you can work without the data. |
 | `deepaccident render VIEW DATAROOT --out FILE` | Renders a picture of the first accident, or of a row that you name. |

@@ -36,7 +36,8 @@ What keeps a scenario from being indexed is found by the same code that indexes 
 there is nothing of that kind. Findings marked *known* are the real release's own, not your download's.
 
 A sensor's folder or an agent that is completely absent is no fault, since most downloads are partial. The end of the
-report lists what is still to download.
+report counts the files that are here and missing; `--files` prints that alone, within seconds
+([what is missing of a download](format.md#what-is-missing-of-a-download)).
 
 [fault_table.md](fault_table.md) tells which of 200 planted faults it finds.
 
@@ -44,9 +45,9 @@ report lists what is still to download.
 
 One object: `dataroot`, `version`, `deep`; `scenarios` and `samples` that were looked at; `counts` by how bad;
 `findings`, worst scenario first, each with `code`, `severity`, `scenario` (null for the release as a whole), `where`,
-`what`, `remedy` and `known`; `coverage` with the `scenarios` here and `expected` by split and the `recordings` by
-split, agent and kind of file; `to_download`, a sentence each; `velocity` with how many moving `boxes` were tried, how
-many each hypothesis `fits`, and the `best` one. With `--scenario` there is nothing in `coverage`.
+`what`, `remedy` and `known`; `files`, what is here and missing of each split, agent and kind of file (all that
+`--files --json` prints); `velocity` with how many moving `boxes` were tried, how many each hypothesis `fits`, and the
+`best` one.
 
 ## The findings
 

@@ -36,6 +36,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=os.environ.get("DEEPACCIDENT_REAL") or None,
         help="folder with a real scenario, for tests/real, which are skipped without [DEEPACCIDENT_REAL]",
     )
+    parser.addoption("--pin", action="store_true", help="write tests/data/pinned.json anew (tests/test_pinned.py)")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -175,23 +175,6 @@ def test_info_counts_only_the_scenarios_of_where(own_release: Path) -> None:
     assert (wrong.returncode, "town: found 'Twon03'; possible are Town03" in wrong.stderr) == (2, True)
 
 
-def test_old_names_work_and_say_so_in_one_line(own_release: Path, tmp_path: Path) -> None:
-    old = run("info", own_release, "--where", "visibility=unknown")
-    assert (old.returncode, "scenarios; all counts" in old.stdout) == (0, True)
-    assert old.stderr.splitlines()[-1] == (  # after indexing
-        "warning: the name 'visibility' is deprecated since 0.1 and gone in 0.2; use 'accident_visibility'"
-    )
-    out = tmp_path / "a.mcap"
-    chosen = ["export", "mcap", own_release, "--out", out, "--channels", "lidar01", "--agents", "ego_vehicle"]
-    old = run(*chosen, "--frames", "2..3")
-    assert old.stderr.startswith(
-        "warning: --frames FIRST..LAST is deprecated since 0.1 and gone in 0.2; use --frame-ra"
-    )
-    written = out.read_bytes()
-    run(*chosen, "--frame-range", "2..3")
-    assert written == out.read_bytes()
-
-
 @pytest.mark.slow
 def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "stats"

@@ -18,7 +18,6 @@ NOT_FOR_USERS = {
         "cli",
         "dataset",
         "deepaccident",
-        "deprecations",
         "files",
         "json_text",
         "nuscenes_names",

@@ -6,17 +6,13 @@ SIGTERM, 141 if the reader of the output went away.
 
 import logging
 import os
-import re
 import sys
-import warnings
-from typing import Any
 
 import click
 
 from deepaccident_devkit.cli.groups import ModuleVerbs
 from deepaccident_devkit.cli.interruption import run_interruptibly
 from deepaccident_devkit.cli.streams import lasting_streams
-from deepaccident_devkit.deprecations import DEPRECATED
 from deepaccident_devkit.errors import DeepAccidentError, SomeFailedError
 
 _ERROR_STATUS = 2
@@ -81,23 +77,8 @@ def _run() -> None:
     shown = logging.StreamHandler()
     shown.addFilter(lambda record: record.name.partition(".")[0] not in _OF_DASK)  # its errors come as exceptions too
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[shown])
-    _show_deprecations()
     try:
         run_interruptibly(deepaccident)
     except (DeepAccidentError, OSError) as error:  # an OSError: a full disk, a folder without permission
         click.echo(f"error: {error}", err=True)
         sys.exit(_FINDINGS_STATUS if isinstance(error, SomeFailedError) else _ERROR_STATUS)
-
-
-def _show_deprecations() -> None:
-    """Show our own deprecations as plain lines; Python hides them outside scripts."""
-    others = warnings.showwarning
-
-    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-        if category is DeprecationWarning and re.match(DEPRECATED, str(message)):
-            click.echo(f"warning: {message}", err=True)
-        else:
-            others(message, category, *where, **more)
-
-    warnings.filterwarnings("always", DEPRECATED, DeprecationWarning)
-    warnings.showwarning = show

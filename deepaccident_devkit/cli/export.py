@@ -13,7 +13,6 @@ from deepaccident_devkit.cli.options import (
     agent_names,
     agents_parameter,
     frame_range_parameter,
-    old_frames_parameter,
     refuse_unused,
     release_parameters,
 )
@@ -61,7 +60,6 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
     help="Sensors, such as Camera_Front or lidar01.  [default: all]",
 )
 @frame_range_parameter
-@old_frames_parameter
 @click.option(
     "--points",
     callback=_points,
@@ -84,7 +82,6 @@ def mcap(
     agents: tuple[str, ...],
     channels: tuple[str, ...],
     results: Path | None,
-    old_frames: range | None,
     **options: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as an MCAP file for Foxglove or rerun.
@@ -94,7 +91,6 @@ def mcap(
     """
     names = agent_names(agents)
     choices = {name: options.pop(name) for name in ("frames", "points", "labels", "motion_labels")}
-    choices["frames"] = choices["frames"] or old_frames
     choices["agents"] = None if names == AGENTS else names
     choices["channels"] = [name for text in channels for name in text.split(",")] if channels else None
     config = McapConfig.of(**choices)  # before the release is indexed

@@ -3,14 +3,13 @@
 import functools
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 from click.core import ParameterSource
 
-from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.parallel import MERGE, Part, Shard, cluster_executor
@@ -296,22 +295,10 @@ def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
 
 def refuse_unused(why: str, *parameters: str) -> None:
     """End with a usage error if one of these options of the verb that runs was given, because it changes nothing."""
-    for option in _given(parameters):
-        raise click.UsageError(f"{option} changes nothing {why}; leave it out", click.get_current_context())
-
-
-def tell_unused(why: str, *parameters: str) -> None:
-    """Print a note for each of these options of the verb that runs, if it was given: it changes nothing."""
-    for option in _given(parameters):
-        click.echo(f"{option} changes nothing {why}", err=True)
-
-
-def _given(parameters: Collection[str]) -> Iterator[str]:
-    """Those of some options that the call of the verb that runs has, as one writes them."""
     context = click.get_current_context()
     for option in context.command.params:
         if option.name in parameters and context.get_parameter_source(option.name) is not ParameterSource.DEFAULT:
-            yield option.opts[0]
+            raise click.UsageError(f"{option.opts[0]} changes nothing {why}; leave it out", context)
 
 
 def pixel_size(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -334,17 +321,6 @@ def frame_range_parameter(verb: Verb) -> Verb:
         help="Only these frames of a scenario, counted from 1.",
     )
     return option(verb)
-
-
-def old_frames_parameter(verb: Verb) -> Verb:
-    """Give a verb `old_frames`: --frames, which --frame-range replaces."""
-    return click.option("--frames", "old_frames", callback=_old_frames, hidden=True, help="Old name.")(verb)
-
-
-def _old_frames(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
-    if value is not None:
-        warn_deprecated("--frames FIRST..LAST", "--frame-range FIRST..LAST", since="0.1", gone_in="0.2")
-    return _frame_range(context, parameter, value)
 
 
 def _frame_range(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:

@@ -9,7 +9,7 @@ import click
 from deepaccident_devkit.cli.options import files_parameters, part_parameters, refuse_unused, say_part_done
 from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.release.store import Dataroot
-from deepaccident_devkit.validation import merged_validation, validate_release, validation_shard
+from deepaccident_devkit.validation import merged_validation, release_completeness, validate_release, validation_shard
 
 _FINDINGS_STATUS = 1
 
@@ -23,6 +23,12 @@ _FINDINGS_STATUS = 1
     metavar="FOLDER",
     help="Folder to keep what is found in each scenario: the same command then goes on, and shards meet there.",
 )
+@click.option(
+    "--files",
+    is_flag=True,
+    help="Only list folders: which scenarios are whole, and how many files and bytes of each split, agent and sensor "
+    "are here and missing.",
+)
 @click.option("--deep", is_flag=True, help="Also decode each image and array, and compare them with the labels.")
 @click.option(
     "--scenario", "scenarios", multiple=True, metavar="TOKEN", help="Only this scenario; you can repeat this option."
@@ -32,8 +38,8 @@ _FINDINGS_STATUS = 1
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document, for programs.")
 def validate(
     dataroot: Dataroot,
-    version: str,
     scenarios: tuple[str, ...],
+    files: bool,
     notes: bool,
     whole: bool,
     as_json: bool,
@@ -43,23 +49,29 @@ def validate(
 ) -> None:
     """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
 
-    The command reads the files and each scenario, not the index.
+    The command reads the files and each scenario, not the index. The report ends with the files that are missing.
     Exit status 0: there are only notes and known findings of the real release. 1: there are errors or other warnings.
     2: the release cannot be read.
     """
+    how |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
+    if files:
+        refuse_unused("with --files, which opens no file", "deep", "notes", "whole", "parts", "shard", "merge")
+        del how["deep"]
+        counted = release_completeness(dataroot, **how)
+        click.echo(counted.to_json() if as_json else counted.to_text())
+        return
     if as_json:
         refuse_unused("with --json, which has all findings and notes", "notes", "whole")
-    how |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
     if part is None:
-        report = validate_release(dataroot, version, parts=parts, **how)
+        report = validate_release(dataroot, parts=parts, **how)
     elif parts is None:
         raise click.UsageError("--shard and --merge need a folder, in which the parts lie; give --parts FOLDER too")
     elif isinstance(part, Shard):
-        done = validation_shard(dataroot, part, parts, version, **how)
+        done = validation_shard(dataroot, part, parts, **how)
         say_part_done(part, f"{len(done)} scenarios")
         return
     else:
-        report = merged_validation(dataroot, parts, version, **how)
+        report = merged_validation(dataroot, parts, **how)
     click.echo(report.to_json() if as_json else report.to_text(notes=notes, whole=whole))
     if not report.is_good:
         sys.exit(_FINDINGS_STATUS)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.headlines import headlines, value_text
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import Bundle, read_bundle

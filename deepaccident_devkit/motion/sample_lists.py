@@ -10,7 +10,6 @@ import numpy as np
 
 from deepaccident_devkit.arrays import checked_number
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice
@@ -27,7 +26,7 @@ _RELEASED_HORIZON: Final = 2.0
 def samples(
     dataset: Dataset,
     split: str | os.PathLike[str],
-    purpose: Purpose | None = None,
+    purpose: Purpose,
     protocol: SampleProtocol = "released",
     *,
     horizon: float = _RELEASED_HORIZON,
@@ -48,7 +47,7 @@ def samples(
     Args:
         dataset: the release.
         split: `train`, `val`, … or a split file, as `Dataset.split_scenarios` takes it.
-        purpose: `train`, `evaluate`, `all` or `every`. None means `train`, and is deprecated: a DeprecationWarning.
+        purpose: `train`, `evaluate`, `all` or `every`.
         protocol: `released` has only a horizon of 2 s and accident scenarios; `paper` allows others.
         horizon: seconds before the end, a multiple of 0.5; only for `evaluate`.
         scope: `accident` or `all`; only for `evaluate`.
@@ -62,10 +61,6 @@ def samples(
         NotAvailableError: the split is unknown, this release has no scenario of it, or none of its samples has labels
             (the test split has none).
     """
-    if purpose is None:
-        what = "samples(split) without a purpose (the training list)"
-        warn_deprecated(what, 'training_samples(split) or samples(split, "train")', since="0.1", gone_in="0.2")
-        purpose = "train"
     listed: str = choice("purpose", purpose, _STEPS)
     protocol = choice("protocol", protocol, get_args(SampleProtocol))
     scope = choice("scope", scope, get_args(Scope))

@@ -12,7 +12,6 @@ import numpy as np
 from deepaccident_devkit import taxonomy
 from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import FieldError, NotAvailableError
 from deepaccident_devkit.interactions import InteractionPairs, Interactions, interactions_of
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
@@ -64,20 +63,17 @@ class Field:
 
 
 def field_of(name: str) -> Field:
-    """The field that a filter names; raises FieldError. An old name warns."""
-    field = FIELDS.get(current_name(name))
+    """The field that a filter names; raises FieldError."""
+    field = FIELDS.get(full_name(name))
     if field is None:
         possible = possible_text(name, [*FIELDS, *_SHORT])
         raise FieldError(f"scenarios cannot be found by '{name}'; the fields are {possible}")
     return field
 
 
-def current_name(name: str) -> str:
-    """The full name of a field or attribute today, whatever the case of a given one; an old name warns."""
-    name = _SHORT.get(name.lower(), name.lower())
-    if name in _RENAMED:
-        warn_deprecated(f"the name '{name}'", f"'{_RENAMED[name]}'", since="0.1", gone_in="0.2")
-    return _RENAMED.get(name, name)
+def full_name(name: str) -> str:
+    """The full name of a field or attribute in small letters, also of a short one."""
+    return _SHORT.get(name.lower(), name.lower())
 
 
 def group_texts(dataset: Dataset, scenario: ScenarioRecord) -> dict[str, str | None]:
@@ -186,7 +182,6 @@ _MEASURES: Final[Mapping[str, Callable[[InteractionPairs, BoolArray], float]]] =
     "max_drac": lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0)),
 }
 _SHORT = {"type": "scenario_type", "length": "num_frames"}
-_RENAMED = {"visibility": "accident_visibility", "junction": "road_type"}
 _WORTH_A_BAR: Final = 32
 """Scenarios whose interactions take some seconds, if none are kept."""
 _FEW: Final = ("scenario_type", "town")

@@ -6,13 +6,12 @@ from deepaccident_devkit.validation.checks import ScenarioCheck
 from deepaccident_devkit.validation.codes import CODES
 from deepaccident_devkit.validation.completeness import release_completeness
 from deepaccident_devkit.validation.completeness_report import Completeness, FileCount, LackingScenario, SplitFiles
-from deepaccident_devkit.validation.report import Coverage, ValidationReport
+from deepaccident_devkit.validation.report import ValidationReport
 from deepaccident_devkit.validation.validate import findings, merged_validation, validate_release, validation_shard
 
 __all__ = [
     "CODES",
     "Completeness",
-    "Coverage",
     "FileCount",
     "Finding",
     "LackingScenario",

@@ -16,7 +16,6 @@ from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.scan import times_digest
 from deepaccident_devkit.tables.velocities import VelocityFit, total_fit
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
-from deepaccident_devkit.validation.inventory import Recording
 
 NO_FIT = total_fit([])
 
@@ -29,19 +28,17 @@ class ScenarioCheck:
         token: the scenario's.
         findings: in the order of the checks.
         samples: agents times frames.
-        recordings: which agents have which kinds of file.
         velocity: what the labels' velocities fit.
     """
 
     token: str
     findings: tuple[Finding, ...]
     samples: int
-    recordings: frozenset[Recording]
     velocity: VelocityFit = NO_FIT
 
     def to_json(self) -> str:
         """One JSON object, from which `of_json` makes an equal one."""
-        return json.dumps({**asdict(self), "recordings": sorted(self.recordings)})
+        return json.dumps(asdict(self))
 
     @classmethod
     def of_json(cls, text: bytes) -> ScenarioCheck:
@@ -51,7 +48,6 @@ class ScenarioCheck:
             token=stored["token"],
             findings=tuple(Finding(**each) for each in stored["findings"]),
             samples=stored["samples"],
-            recordings=frozenset((agent, kind) for agent, kind in stored["recordings"]),
             velocity=VelocityFit(**stored["velocity"]),
         )
 

@@ -5,15 +5,25 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
+from deepaccident_devkit.errors import ReleaseError, TokenError
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release, read_split_file
 from deepaccident_devkit.release.layout import frame_sizes, names_without_calib
-from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of
+from deepaccident_devkit.release.store import Dataroot, ReleasePath, open_dataroot, places_of
 from deepaccident_devkit.tables.scan import ENDINGS
 from deepaccident_devkit.tables.split_assignment import assign_splits
-from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT, EXPECTED_MINI_SCENARIOS, EXPECTED_SCENARIOS, SPLITS
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    BEV_CAMERA,
+    CHANNEL_FORMAT,
+    CHANNELS,
+    EXPECTED_MINI_SCENARIOS,
+    EXPECTED_SCENARIOS,
+    SPLITS,
+)
 from deepaccident_devkit.validation.completeness_report import (
     Completeness,
     FileCount,
@@ -21,13 +31,16 @@ from deepaccident_devkit.validation.completeness_report import (
     SplitFiles,
     summed,
 )
-from deepaccident_devkit.validation.report import KINDS, NOT_IN_TEST, UNKNOWN_SPLIT
-from deepaccident_devkit.validation.validate import chosen_scenarios
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
 _META = "meta"
+_KINDS = ("calib", "label", *CHANNELS)
+"""The kinds of files that an agent has."""
+_NOT_IN_TEST = ("label", BEV_CAMERA, _META)
+"""Kinds that the test split ships without."""
+_UNKNOWN_SPLIT = "unknown"
 _Part = tuple[str | None, str]
 """Agent and kind of file; no agent and `meta`."""
 
@@ -84,21 +97,29 @@ def release_completeness(
         WorkerError: a worker was killed, or cannot do the work.
     """
     layout = find_release(open_dataroot(root), version)
+    return completeness(layout, scenarios, str(root), workers=workers, executor=executor, progress=progress)
+
+
+def completeness(
+    layout: ReleaseLayout, scenarios: Collection[str] | None, dataroot: str, *, lenient: bool = False, **how: Any
+) -> Completeness:
+    """What `release_completeness` gives of a release that was found; what cannot be listed may count as missing.
+
+    Args:
+        layout: the release, with the split files to read.
+        scenarios: tokens of the scenarios to look at; None for all.
+        dataroot: its name.
+        lenient: whether a folder that cannot be listed counts as empty.
+        **how: `workers`, `executor` and `progress`.
+    """
     folders = chosen_scenarios(layout, scenarios)
-    files = run_batch(
-        _files_here,
-        folders,
-        workers=workers,
-        executor=executor,
-        label="listing files",
-        progress=progress,
-        places=Places(reads=places_of(layout.root)),
-    )
+    listing = partial(_files_here, lenient=lenient)
+    files = run_batch(listing, folders, label="listing files", places=Places(reads=places_of(layout.root)), **how)
     counted = _count_all(layout, {folder: here for folder, here in zip(folders, files, strict=True) if here.frames})
     lacking = [_lacking(each) for each in counted if any(count.missing for count in each.counts)]
     strays = [] if scenarios is not None else _without_calib(layout, counted)
     return Completeness(
-        dataroot=str(root),
+        dataroot=dataroot,
         version=layout.version,
         selected=scenarios is not None,
         scenarios=len(counted),
@@ -111,12 +132,23 @@ def release_completeness(
     )
 
 
-def _files_here(scenario: ScenarioFolder) -> _FilesHere:
+def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
+    """The scenarios of some tokens, None for all; raises TokenError."""
+    chosen = [folder for folder in layout.scenarios if scenarios is None or folder.token in scenarios]
+    unknown = sorted(set(scenarios or ()) - {folder.token for folder in chosen})
+    if unknown:
+        raise TokenError(
+            f"{layout.root}: has no scenario {unknown[0]!r}; its folders name {len(layout.scenarios)} others"
+        )
+    return chosen
+
+
+def _files_here(scenario: ScenarioFolder, *, lenient: bool) -> _FilesHere:
     endings = {**ENDINGS, **CHANNEL_FORMAT}
     found = {
-        (agent, kind): frame_sizes(scenario.kind_folder(agent, kind), endings[kind])
+        (agent, kind): _sizes(scenario.kind_folder(agent, kind), endings[kind], lenient=lenient)
         for agent in AGENTS
-        for kind in KINDS
+        for kind in _KINDS
     }
     frames = max((frame for (_, kind), sizes in found.items() if kind in ENDINGS for frame in sizes), default=0)
     sizes: dict[_Part, tuple[int, int]] = {}
@@ -131,6 +163,16 @@ def _files_here(scenario: ScenarioFolder) -> _FilesHere:
     return _FilesHere(frames=frames, sizes=sizes)
 
 
+def _sizes(folder: ReleasePath, ending: str, *, lenient: bool) -> Mapping[int, int]:
+    """Frame → bytes of its file in a folder."""
+    try:
+        return frame_sizes(folder, ending)
+    except ReleaseError:
+        if not lenient:
+            raise
+        return {}
+
+
 def _count_all(layout: ReleaseLayout, found: Mapping[ScenarioFolder, _FilesHere]) -> list[_Counted]:
     """The counts of every scenario, with estimates by what is here of all of them."""
     split_of = assign_splits(layout).split_of
@@ -143,7 +185,7 @@ def _count_all(layout: ReleaseLayout, found: Mapping[ScenarioFolder, _FilesHere]
     means = {kind: size[kind] / number for kind, number in files.items() if number}
     counted = []
     for folder, here in found.items():
-        split = layout.version if layout.version == "v1-mini" else split_of.get(folder.token, UNKNOWN_SPLIT)
+        split = layout.version if layout.version == "v1-mini" else split_of.get(folder.token, _UNKNOWN_SPLIT)
         counts = [_count(part, here, means, in_test=split == "test") for part in here.sizes]
         counted.append(_Counted(folder, split, counts))
     return counted
@@ -153,7 +195,7 @@ def _count(part: _Part, files: _FilesHere, means: Mapping[str, float], *, in_tes
     agent, kind = part
     here, in_bytes = files.sizes[part]
     expected = 1 if kind == _META else files.frames
-    if in_test and not here and kind in (*NOT_IN_TEST, _META):
+    if in_test and not here and kind in _NOT_IN_TEST:
         expected = 0
     missing = expected - here
     estimate = None if missing and kind not in means else round(missing * means.get(kind, 0))
@@ -187,7 +229,7 @@ def _splits(
     of_release = {version: EXPECTED_MINI_SCENARIOS} if version == "v1-mini" else EXPECTED_SCENARIOS
     expected = {} if selected else of_release
     splits = {}
-    for split in (*SPLITS, version, UNKNOWN_SPLIT):
+    for split in (*SPLITS, version, _UNKNOWN_SPLIT):
         here = [each for each in counted if each.split == split]
         if not here and split not in expected:
             continue

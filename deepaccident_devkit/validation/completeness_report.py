@@ -118,6 +118,11 @@ class Completeness(Report):
 
     def to_text(self) -> str:
         """Blocks of at most 100 columns for a terminal: each split, then the first scenarios that lack something."""
+        selected = " (a selection of scenarios)" if self.selected else ""
+        return f"DeepAccident {self.version} at {self.dataroot}{selected}\n{self.section()}"
+
+    def section(self) -> str:
+        """The same without the release's name, as a part of another report."""
         blocks = [
             self._head(),
             *(_split_text(name, split) for name, split in self.splits.items()),
@@ -144,7 +149,6 @@ class Completeness(Report):
         total = self.total
         missing = f"{total.missing:,} are missing{f' (size: {_estimate(total)})' if total.missing else ''}"
         lines = [
-            f"DeepAccident {self.version} at {self.dataroot}{' (a selection of scenarios)' if self.selected else ''}",
             f"{_counted(self.scenarios)} here, {self.whole:,} of them whole",
             f"{total.here:,} of their {total.expected:,} files are here ({size_text(total.bytes_here)}), {missing}",
         ]

@@ -1,4 +1,4 @@
-"""What `validate` found: findings, counts against a whole release, and what is still to download."""
+"""What `validate` found: findings, and which files are here and missing."""
 
 import sys
 from collections import Counter
@@ -6,64 +6,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.tables import SEVERITIES, Finding
 from deepaccident_devkit.tables.velocities import VelocityFit
-from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CHANNELS, VELOCITY_FRAMES
+from deepaccident_devkit.taxonomy import VELOCITY_FRAMES
 from deepaccident_devkit.text import counted
+from deepaccident_devkit.validation.completeness_report import Completeness
 
-KINDS = ("calib", "label", *CHANNELS)
-"""The kinds of files that an agent has."""
-NOT_IN_TEST = ("label", BEV_CAMERA)
-"""Kinds that the test split ships without."""
-UNKNOWN_SPLIT = "unknown"
 _LINES_A_SCENARIO = 8
 _ALL_LISTED = "(--all lists all)"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Coverage(ShortRepr):
-    """Which part of a whole release is here.
-
-    Attributes:
-        scenarios: split → scenarios here; `unknown` for those of no known split.
-        expected: split → scenarios of the whole release.
-        recordings: split → agent → kind of file → scenarios that have any of it.
-    """
-
-    scenarios: Mapping[str, int]
-    expected: Mapping[str, int]
-    recordings: Mapping[str, Mapping[str, Mapping[str, int]]]
-
-    def to_download(self) -> Iterator[str]:
-        """What is missing for a whole release, a sentence each."""
-        here, whole = sum(self.scenarios.values()), sum(self.expected.values())
-        if set(self.scenarios) <= set(self.expected):
-            for split, total in self.expected.items():
-                if self.scenarios.get(split, 0) < total:
-                    yield f"{split}: {total - self.scenarios.get(split, 0)} of {total} scenarios"
-        elif here < whole:
-            yield f"{whole - here} of {whole} scenarios (the splits of those here are not all known)"
-        for split, agents in self.recordings.items():
-            yield from self._missing_kinds(split, agents)
-
-    def _missing_kinds(self, split: str, agents: Mapping[str, Mapping[str, int]]) -> Iterator[str]:
-        """What the scenarios of a split that are here lack; kinds that lack the same share a sentence."""
-        scenarios = self.scenarios[split]
-        kinds_of: dict[tuple[tuple[str, int], ...], list[str]] = {}
-        for kind in KINDS:
-            if split == "test" and kind in NOT_IN_TEST:
-                continue
-            lacking = tuple((agent, scenarios - counts[kind]) for agent, counts in agents.items())
-            kinds_of.setdefault(tuple(pair for pair in lacking if pair[1]), []).append(kind)
-        for lacking, kinds in kinds_of.items():
-            if not lacking:
-                continue
-            everywhere = len(lacking) == len(agents) and all(count == scenarios for _, count in lacking)
-            places = ", ".join(f"{agent} in {count} of {scenarios} scenarios" for agent, count in lacking)
-            name = f"split {split}" if split == UNKNOWN_SPLIT else split
-            yield f"{name}: {', '.join(kinds)} of {'all agents' if everywhere else places}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +28,7 @@ class ValidationReport(Report):
         scenarios: how many were looked at.
         samples: agents times frames of those.
         findings: worst scenario first, within it worst first.
-        coverage: what is here of a whole release.
+        files: which are here, and which are missing.
         velocity: in which frame the labels' velocities fit the displacements.
         velocity_frames: scenario → what its labels' velocities are in; None where it cannot be told.
     """
@@ -88,7 +39,7 @@ class ValidationReport(Report):
     scenarios: int
     samples: int
     findings: Sequence[Finding]
-    coverage: Coverage
+    files: Completeness
     velocity: VelocityFit
     velocity_frames: Mapping[str, str | None]
 
@@ -108,7 +59,6 @@ class ValidationReport(Report):
         content = super().to_dict()
         content["counts"] = self.counts
         content["velocity"]["best"] = self.velocity.best
-        content["to_download"] = list(self.coverage.to_download())
         return content
 
     def to_text(self, *, notes: bool = False, whole: bool = False) -> str:
@@ -116,10 +66,10 @@ class ValidationReport(Report):
 
         Args:
             notes: whether to list what is only worth knowing, too.
-            whole: whether to list all that was found of a scenario, and all that is to download.
+            whole: whether to list all that was found of a scenario.
         """
         most = sys.maxsize if whole else _LINES_A_SCENARIO
-        blocks = [self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(most, notes=notes)]
+        blocks = [self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)]
         return "\n\n".join(blocks)
 
     def _head(self) -> str:
@@ -143,7 +93,7 @@ class ValidationReport(Report):
                 lines.append(f"  … and {len(findings) - most} more {_ALL_LISTED}")
             yield "\n".join(lines)
 
-    def _closing(self, most: int, *, notes: bool) -> Iterator[str]:
+    def _closing(self, *, notes: bool) -> Iterator[str]:
         by_code = Counter((finding.severity, finding.code, finding.known) for finding in self.findings)
         if by_code:
             rank = {severity: place for place, severity in enumerate(SEVERITIES)}
@@ -163,11 +113,7 @@ class ValidationReport(Report):
                 f"label velocities: {best}\n"
                 f"  scenarios: {scenarios}; of {self.velocity.boxes:,} moving boxes fit: {shares}"
             )
-        missing = list(self.coverage.to_download())
-        if missing:
-            shown = missing[:most]
-            more = [f"  … and {len(missing) - len(shown)} more {_ALL_LISTED}"] if len(missing) > len(shown) else []
-            yield "still to download, for a whole release:\n" + "\n".join([*(f"  {line}" for line in shown), *more])
+        yield f"files: {self.files.section()}"
         hidden = self.counts["note"] and not notes
         verdict = ", ".join(counted(self.counts[severity], severity) for severity in SEVERITIES)
         yield verdict + (" (--notes lists the notes)" if hidden else "")
@@ -186,11 +132,6 @@ def worst_first(findings: Sequence[Finding]) -> list[Finding]:
         return (finding.scenario is not None, *badness, finding.scenario or "", rank[finding.severity])
 
     return sorted(findings, key=place)
-
-
-def empty_recordings() -> dict[str, dict[str, int]]:
-    """Agent → kind of file → 0."""
-    return {agent: dict.fromkeys(KINDS, 0) for agent in AGENTS}
 
 
 def _line(finding: Finding) -> str:

@@ -19,8 +19,8 @@ _NAMED = 3
 """Repeated lines that a finding names at most."""
 
 
-def check_splits(layout: ReleaseLayout) -> tuple[SplitAssignment, list[Finding]]:
-    """Which split each scenario belongs to, by the split files that can be read, and what is wrong with all of them."""
+def check_splits(layout: ReleaseLayout) -> tuple[ReleaseLayout, list[Finding]]:
+    """The release with those split files that can be read, and what is wrong with all of them."""
     found: list[Finding] = []
     readable: dict[str, ReleasePath] = {}
     for split, path in layout.split_files.items():
@@ -31,8 +31,9 @@ def check_splits(layout: ReleaseLayout) -> tuple[SplitAssignment, list[Finding]]
             continue
         readable[split] = path
         found += _repeated(path, lines)
-    splits = assign_splits(replace(layout, split_files=readable))
-    return splits, [*found, *_assignment_findings(splits), *_twins(splits)]
+    layout = replace(layout, split_files=readable)
+    splits = assign_splits(layout)
+    return layout, [*found, *_assignment_findings(splits), *_twins(splits)]
 
 
 def _repeated(path: ReleasePath, lines: list[tuple[str, ...]]) -> Iterator[Finding]:

@@ -19,21 +19,14 @@ from deepaccident_devkit.release.store import Dataroot, checksums_compared, open
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.build import read_scenario
 from deepaccident_devkit.tables.scan import scan_scenario
-from deepaccident_devkit.tables.split_assignment import SplitAssignment
 from deepaccident_devkit.tables.velocities import fit_velocities, total_fit
-from deepaccident_devkit.taxonomy import EXPECTED_MINI_SCENARIOS, EXPECTED_SCENARIOS
 from deepaccident_devkit.validation.agreement import check_agreement
 from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, kept_check, kept_path
+from deepaccident_devkit.validation.completeness import chosen_scenarios, completeness
 from deepaccident_devkit.validation.inventory import absences, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses
-from deepaccident_devkit.validation.report import (
-    UNKNOWN_SPLIT,
-    Coverage,
-    ValidationReport,
-    empty_recordings,
-    worst_first,
-)
+from deepaccident_devkit.validation.report import ValidationReport, worst_first
 from deepaccident_devkit.validation.sensors import check_sensors
 from deepaccident_devkit.validation.split_files import check_splits
 from deepaccident_devkit.validation.story import check_story
@@ -78,8 +71,9 @@ def validate_release(
     """
     layout = find_release(open_dataroot(root), version)
     work = _Work(deep=deep, parts=None if parts is None else writable_folder(parts))
-    checks = work.run(chosen_scenarios(layout, scenarios), workers=workers, executor=executor, progress=progress)
-    return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
+    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
+    checks = work.run(chosen_scenarios(layout, scenarios), **how)
+    return _report(layout, checks, scenarios, root=root, deep=deep, **how)
 
 
 def validation_shard(root: Dataroot, shard: Shard, parts: Path, version: str = "v1", **how: Any) -> list[ScenarioCheck]:
@@ -110,7 +104,7 @@ def merged_validation(root: Dataroot, parts: Path, version: str = "v1", **how: A
     layout = find_release(open_dataroot(root), version)
     scenarios, deep = how.pop("scenarios", None), how.pop("deep", False)
     checks = _Work(deep=deep, parts=parts, merge=True).run(chosen_scenarios(layout, scenarios), **how)
-    return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
+    return _report(layout, checks, scenarios, root=root, deep=deep, **how)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,25 +145,20 @@ class _Work:
         return list(done.values())
 
 
-def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
-    """The scenarios of some tokens, None for all; raises TokenError."""
-    chosen = [folder for folder in layout.scenarios if scenarios is None or folder.token in scenarios]
-    unknown = sorted(set(scenarios or ()) - {folder.token for folder in chosen})
-    if unknown:
-        raise TokenError(
-            f"{layout.root}: has no scenario {unknown[0]!r}; its folders name {len(layout.scenarios)} others"
-        )
-    return chosen
-
-
 def _report(
-    layout: ReleaseLayout, checks: Sequence[ScenarioCheck], *, root: Dataroot, deep: bool, whole: bool
+    layout: ReleaseLayout,
+    checks: Sequence[ScenarioCheck],
+    scenarios: Collection[str] | None,
+    *,
+    root: Dataroot,
+    deep: bool,
+    **how: Any,
 ) -> ValidationReport:
     """What was found in scenarios, and in the release as a whole."""
-    splits, of_release = check_splits(layout)
+    readable, of_release = check_splits(layout)
     tokens = {check.token for check in checks}
     of_release = [finding for finding in of_release if finding.scenario is None or finding.scenario in tokens]
-    of_release += _strays(layout) if whole else ()
+    of_release += _strays(layout) if scenarios is None else ()
     return ValidationReport(
         dataroot=str(root),
         version=layout.version,
@@ -177,7 +166,7 @@ def _report(
         scenarios=len(checks),
         samples=sum(check.samples for check in checks),
         findings=worst_first([*of_release, *(finding for check in checks for finding in check.findings)]),
-        coverage=_coverage(layout.version, checks if whole else [], splits),
+        files=completeness(readable, scenarios, str(root), lenient=True, **how),
         velocity=total_fit([check.velocity for check in checks]),
         velocity_frames={check.token: check.velocity.best for check in checks},
     )
@@ -211,8 +200,6 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
     scan = scan_scenario(scenario)
     inventory, of_files = take_inventory(scenario, scan)
     found = [*scan.problems, *absences(scenario, scan), *of_files]
-    recordings = {*inventory.frames, *((agent, "calib") for agent in scan.agents)}
-    recordings |= {(agent, "label") for agent in scan.labelled}
     files, faults = (None, []) if scan.problems or not scan.agents else read_scenario(scenario, scan)
     found += faults
     velocity = NO_FIT
@@ -233,7 +220,6 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
         token=scenario.token,
         findings=tuple(found),
         samples=len(scan.agents) * scan.num_frames,
-        recordings=frozenset(recordings),
         velocity=velocity,
     )
 
@@ -247,23 +233,3 @@ def _strays(layout: ReleaseLayout) -> Iterator[Finding]:
             yield make_finding("link-leads-nowhere", None, str(path), "its end is not there, or is a folder above it")
         else:
             yield make_finding("folder-left-aside", None, str(path), f"is not read; it looks like {meant}")
-
-
-def _coverage(version: str, checks: Sequence[ScenarioCheck], splits: SplitAssignment) -> Coverage:
-    """Scenarios and recordings by split; the mini release counts as one; nothing where only some were looked at."""
-    if not checks:
-        return Coverage(scenarios={}, expected={}, recordings={})
-    mini = version == "v1-mini"
-    scenarios: dict[str, int] = {}
-    recordings: dict[str, dict[str, dict[str, int]]] = {}
-    for check in checks:
-        split = version if mini else splits.split_of.get(check.token, UNKNOWN_SPLIT)
-        scenarios[split] = scenarios.get(split, 0) + 1
-        counts = recordings.setdefault(split, empty_recordings())
-        for agent, kind in check.recordings:
-            counts[agent][kind] += 1
-    return Coverage(
-        scenarios=scenarios,
-        expected={version: EXPECTED_MINI_SCENARIOS} if mini else EXPECTED_SCENARIOS,
-        recordings=recordings,
-    )

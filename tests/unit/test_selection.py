@@ -177,13 +177,6 @@ def test_the_released_evaluations_groups(da: DeepAccident) -> None:
     assert [unknown[name] for name in names] == [None] * 6
 
 
-@pytest.mark.parametrize(("old", "new"), [("visibility", "accident_visibility"), ("junction", "road_type")])
-def test_old_names_warn(da: DeepAccident, old: str, new: str) -> None:
-    with pytest.warns(DeprecationWarning, match=f"the name '{old}' is deprecated .* use '{new}'") as told:
-        assert da.find(f"{old}=unknown") == da.find(f"{new}=unknown")
-    assert [each.filename for each in told] == [__file__]
-
-
 @pytest.mark.parametrize("field", ["weather=Wet", "length=5..7", "collision=true", "accident_type=1", "town=Town07"])
 def test_not_equal_finds_all_that_equal_leaves_out(da: DeepAccident, field: str) -> None:
     found = numbers(da, field)

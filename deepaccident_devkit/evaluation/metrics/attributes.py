@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.selection.fields import FIELDS, current_name, group_texts
+from deepaccident_devkit.selection.fields import FIELDS, full_name, group_texts
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import accident_visible
@@ -74,7 +74,7 @@ ATTRIBUTES: Final = (EVERYTHING, *(name for name, field in FIELDS.items() if fie
 
 def attribute_name(name: str) -> str:
     """The one of `ATTRIBUTES` that a name stands for, whatever its case; an old name warns. Raises ChoiceError."""
-    return choice("by", current_name(name), ATTRIBUTES)
+    return choice("by", full_name(name), ATTRIBUTES)
 
 
 def sample_attributes(dataset: Dataset, tokens: Iterable[str]) -> dict[str, SampleAttributes]:

@@ -72,7 +72,6 @@ def _context(request: Request, explorer: Explorer, report: ValidationReport) -> 
         "without_code": _address(severity=severity, code=""),
         "part": part_of(request, shown),
         "known": pages_of(explorer),
-        "to_download": [*report.coverage.to_download()],
     }
 
 

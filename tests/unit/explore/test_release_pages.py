@@ -263,8 +263,6 @@ def test_findings_are_those_of_validate(of_damaged: Reader, report: ValidationRe
         kind.code: str(kind.count) for kind in kinds_of(report.findings)
     }
     assert all(CODES[row[0]].meaning in row[3] for row in page.table("kind"))
-    for line in report.coverage.to_download():
-        assert line in page.text
     notes = report.counts["note"]
     assert notes
     assert f"{notes} note{'' if notes == 1 else 's'} not shown" in page.text

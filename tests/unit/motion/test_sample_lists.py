@@ -67,13 +67,6 @@ def test_training_samples_are_those_of_the_purpose_to_train(da_motion: DeepAccid
     tokens = samples(da_motion, every_scenario, "train")
     assert tokens
     assert training_samples(da_motion, every_scenario) == da_motion.training_samples(every_scenario) == tokens
-    advice = (
-        r"without a purpose.* since 0\.1 and gone in 0\.2; use training_samples\(split\) or samples\(split, \"train\"\)"
-    )
-    for call in (lambda: samples(da_motion, every_scenario), lambda: da_motion.samples(every_scenario)):
-        with pytest.warns(DeprecationWarning, match=advice) as told:
-            assert call() == tokens
-        assert told[0].filename == __file__
 
 
 def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:

@@ -1,4 +1,4 @@
-"""`info --missing`: what is here and what is missing is counted by split, agent and channel, from folders alone."""
+"""`validate --files`: what is here and what is missing is counted by split, agent and channel, from folders alone."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import DatarootError, SplitFileError, TokenError
 from deepaccident_devkit.release import ScenarioFolder, find_release, write_split_file
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CHANNEL_FORMAT, CHANNELS
-from deepaccident_devkit.validation import Completeness, FileCount, release_completeness
+from deepaccident_devkit.validation import Completeness, FileCount, release_completeness, validate_release
 
 ENDINGS = {"calib": "pkl", "label": "txt", **CHANNEL_FORMAT}
 TYPE = "type1_subtype1_accident"
@@ -27,7 +27,7 @@ SIZES = dict(zip(ENDINGS, range(10, 20), strict=True))
 
 
 def run(*words: object) -> Result:
-    return CliRunner().invoke(deepaccident, ["info", *map(str, words), "--missing"], catch_exceptions=False)
+    return CliRunner().invoke(deepaccident, ["validate", *map(str, words), "--files"], catch_exceptions=False)
 
 
 def files_of(root: Path, token: str, frames: int) -> Iterator[tuple[str, str, Path]]:
@@ -229,7 +229,7 @@ def test_what_cannot_be_listed_or_read_is_named(tmp_path: Path) -> None:
         release_completeness(tmp_path, workers=1)
 
 
-def test_info_prints_it_for_a_release_that_cannot_be_indexed(tmp_path: Path) -> None:
+def test_it_is_printed_for_a_release_that_cannot_be_indexed(tmp_path: Path) -> None:
     """No file can be read, and calib files are missing; no line is wider than 100 columns."""
     tokens = [ACCIDENT.replace("00014", f"{number:05}") for number in range(14, 26)]
     write_files(tmp_path, *tokens, frames=1)
@@ -241,7 +241,7 @@ def test_info_prints_it_for_a_release_that_cannot_be_indexed(tmp_path: Path) -> 
             shutil.rmtree(tmp_path / TYPE / agent / kind)
     result = run(tmp_path, "--on-error", "skip", "--workers", 1)
     assert result.exit_code == 0
-    assert result.stderr == "--on-error changes nothing with --missing without --where, as no index is read\n"
+    assert result.stderr == "--on-error changes nothing here: the command reads the files, not the index\n"
     assert f"12 scenarios here, 0 of them whole\n{12 * 27:,} of their {12 * 51} files are here" in result.stdout
     assert max(map(len, result.stdout.splitlines()[1:])) <= 100
     assert result.stdout.count("  … and 2 more (--json lists all)") == 2
@@ -249,7 +249,23 @@ def test_info_prints_it_for_a_release_that_cannot_be_indexed(tmp_path: Path) -> 
     assert not (tmp_path / ".deepaccident").exists()
 
 
-def test_info_counts_what_matches(release_root: Path) -> None:
-    found = json.loads(run(release_root, "--where", "designed_accident=true", "--json").stdout)
-    assert (found["selected"], found["scenarios"], found["whole"], found["not_here"]) == (True, 2, 2, {})
-    assert run(release_root, "--where", "length=1..2").exit_code == 0
+def test_some_scenarios_are_counted_alone(release_root: Path) -> None:
+    token = "/".join((release_root / "train.txt").read_text().split()[:2])
+    found = json.loads(run(release_root, "--scenario", token, "--json").stdout)
+    assert (found["selected"], found["scenarios"], found["whole"], found["not_here"]) == (True, 1, 1, {})
+    assert "--deep changes nothing with --files, which opens no file" in run(release_root, "--deep").stderr
+
+
+def test_validate_ends_with_it(own_release: Path) -> None:
+    """A split file and a folder that cannot be read are findings there, and no error."""
+    report = validate_release(own_release, workers=1)
+    assert report.files == release_completeness(own_release, workers=1)
+    assert report.files.section() in report.to_text()
+    assert json.loads(report.to_json())["files"] == asdict(report.files)
+    (own_release / "val.txt").write_text("three words here\n")
+    scenario = next(own_release.glob("train/*/ego_vehicle/calib/*"))
+    (scenario.parents[1] / "lidar01").mkdir()
+    (scenario.parents[1] / "lidar01" / scenario.name).symlink_to(scenario.name)
+    again = validate_release(own_release, workers=1)
+    assert {"split-file-unreadable", "folder-unreadable"} <= {each.code for each in again.findings}
+    assert again.files.total == report.files.total

@@ -52,17 +52,6 @@ def test_healthy_releases_are_clean(release_root: Path, release_root_b: Path) ->
         assert set(report.velocity_frames) == {f"{path.parts[-3]}/{path.stem}" for path in root.glob("**/meta/*.txt")}
 
 
-def test_the_whole_release_is_what_coverage_counts_against(release_root_b: Path) -> None:
-    report = validate_release(release_root_b)
-    assert sum(report.coverage.scenarios.values()) == len(list(release_root_b.glob("*/*/meta/*.txt")))
-    missing = list(report.coverage.to_download())
-    assert f"train: {483 - report.coverage.scenarios['train']} of 483 scenarios" in missing
-    (sensors,) = [line for line in missing if line.startswith("train: Camera_Front")]
-    assert sensors.endswith("lidar01, BEV_instance_camera of all agents")
-    (of_test,) = [line for line in missing if line.startswith("test: Camera_Front")]
-    assert "BEV_instance_camera" not in of_test  # the test split ships without
-
-
 def test_partial_downloads_are_notes(own_release: Path) -> None:
     for folder in own_release.glob("train/*/infrastructure"):
         shutil.rmtree(folder)
@@ -71,9 +60,8 @@ def test_partial_downloads_are_notes(own_release: Path) -> None:
     report = validate_release(own_release)
     assert report.is_good
     assert codes(report) == {"agent-missing", "unlabelled"}
-    missing = list(report.coverage.to_download())
-    assert any(line.startswith("train: calib, label of infrastructure in ") for line in missing)
-    assert not any(line.startswith("test: ") and "label" in line for line in missing)
+    assert report.files.splits["train"].absent_agents == {"infrastructure": report.files.splits["train"].scenarios}
+    assert not any(each.missing for each in report.files.splits["test"].files if each.channel == "label")
 
 
 def test_a_few_frames_of_a_sensor_are_listed(release_root: Path, tmp_path: Path) -> None:
@@ -102,12 +90,6 @@ def test_all_findings_are_listed_if_asked_for(own_release: Path) -> None:
     assert "  … and 2 more (--all lists all)" in short.stdout
     assert whole.stdout.count("label-unreadable: ") == 10
     assert "lists all)" not in whole.stdout
-
-
-def test_what_is_to_download_where_the_split_is_unknown(own_release: Path, tmp_path: Path) -> None:
-    shutil.copytree(own_release / "train", tmp_path / "flat")
-    missing = list(validate_release(tmp_path / "flat").coverage.to_download())
-    assert any(line.startswith("split unknown: Camera_Front, ") for line in missing)
 
 
 def write_velocities(root: Path, angle: Callable[[float, float], float]) -> dict[str, np.ndarray]:

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
 from deepaccident_devkit.evaluation.metrics.detection.protocols import DetectionProtocol, detection_protocol
 from deepaccident_devkit.geometry import SE3, Boxes
@@ -48,9 +47,9 @@ class DetectedBoxes(FrozenArrays):
         yaw: ArrayLike,
         scores: ArrayLike,
         *,
+        frame: str,
         category: ArrayLike | None = None,
         velocity: ArrayLike | None = None,
-        frame: str | None = None,
     ) -> DetectedBoxes:
         """Boxes that stand upright in `frame`, right-handed (x forward, y left).
 
@@ -59,19 +58,13 @@ class DetectedBoxes(FrozenArrays):
             size: (N, 3) full length, width, height, metres.
             yaw: (N,) radians, counter-clockwise.
             scores: (N,).
+            frame: what all of it is in: `lidar` for an evaluator, `world` for results files.
             category: (N,) indices or names; None for cars.
             velocity: (N, 2) or (N, 3) m/s over the ground; None for unknown.
-            frame: what all of it is in: `lidar` for an evaluator, `world` for results files. None is `lidar`, and is
-                deprecated.
 
         Raises:
             GeometryError: a shape or a number that cannot be.
         """
-        if frame is None:
-            what = "DetectedBoxes.from_arrays without a frame"
-            instead = "frame='lidar' (an evaluator's) or frame='world' (of results files)"
-            warn_deprecated(what, instead, since="0.1", gone_in="0.2")
-            frame = "lidar"
         columns: dict[str, Any] = {}
         if velocity is not None:
             given = as_numbers("velocity", velocity)

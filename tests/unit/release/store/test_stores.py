@@ -134,7 +134,7 @@ def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path) 
         (
             ["index", "--workers", "1"],
             ["info"],
-            ["info", "--missing", "--workers", "1"],
+            ["validate", "--files", "--workers", "1"],
             ["validate", "--workers", "1"],
             ["export", "opencood", "--out", str(tmp_path / "opencood"), "--workers", "1"],
             ["index", "info"],
@@ -142,7 +142,7 @@ def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path) 
     ):
         at = 2 if verb[0] == "export" or verb[:2] == ["index", "info"] else 1
         command = [*verb[:at], places[kind], *verb[at:]]
-        if verb[:1] != ["validate"] and "--missing" not in verb:
+        if verb[0] != "validate":
             command += ["--index-dir", str(tmp_path / "index")]
         result = CliRunner().invoke(deepaccident, command)
         assert result.exit_code == 0, (number, result.output)

@@ -35,9 +35,6 @@ def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
 
 def test_detected_boxes_say_their_frame_and_change_it() -> None:
     arrays = [[1.0, 2.0, 3.0]], [[4.0, 2.0, 1.5]], [0.5], [0.9]
-    with pytest.warns(DeprecationWarning, match=r"without a frame is .*; use frame='lidar' .* frame='world'"):
-        silent = DetectedBoxes.from_arrays(*arrays)
-    assert silent.boxes.frame == "lidar"
     moved = DetectedBoxes.from_arrays(*arrays, frame="lidar").transform(SE3.from_yaw(0, (10, 0, 0)), "world")
     assert (moved.boxes.frame, moved.boxes.center.tolist(), moved.scores.tolist()) == ("world", [[11, 2, 3]], [0.9])
 

@@ -1,4 +1,4 @@
-"""`python -m tests.campaign`: all cases and all stops; prints what fails and writes docs/reliability.md."""
+"""`PYTHONPATH=.ci/tools python -m campaign`: all cases and stops; prints what fails and writes docs/reliability.md."""
 
 import sys
 import tempfile
@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 EACH = 150
-_TOP = Path(__file__).parents[2]
-sys.path.insert(0, str(_TOP / "tests"))  # the tests' packages are found by their own names
+_TOP = Path(__file__).parents[3]
+sys.path.insert(0, str(_TOP / "tests"))  # for what it shares with the tests
 
 
 @click.command()

@@ -8,7 +8,7 @@ from random import Random
 
 from mutation.mutants import Mutant, changes
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "deepaccident_devkit"
 AREAS = ("geometry", "motion", "evaluation", "v2x", "splits.py")
 

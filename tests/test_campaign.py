@@ -1,23 +1,21 @@
 """Some cases of each kind in a test run; every way to fail is noticed; kills, full disks, the page of the last run."""
 
 import re
-from collections import Counter
 from pathlib import Path
 
 import pytest
-
 from campaign import planted
 from campaign.__main__ import EACH
 from campaign.healthy import make_healthy
 from campaign.kinds import KINDS
-from campaign.mutations import FORMS, GROUPS, MUTATIONS, fitting
-from campaign.page import numbers, page
-from campaign.pool import drawn, left_out, run
-from campaign.stops import VERBS, Stop, drawn_stops, files_in, run_stops
-from campaign.worker import Bench, Case, Outcome
+from campaign.page import numbers
+from campaign.pool import drawn, run
+from campaign.stops import VERBS, Stop, run_stops
+from campaign.worker import Case
+
 from deepaccident_devkit.reading import LIMITS
 
-TOP = Path(__file__).parents[2]
+TOP = Path(__file__).parents[1]
 PAGE = TOP / "docs" / "reliability.md"
 CASES = 12
 """Of each kind: of each group of mutations two."""
@@ -52,62 +50,14 @@ def test_every_way_to_fail_is_noticed(healthy: Path) -> None:
     assert {outcome.verdict for outcome in outcomes[1::2]} == {"read"}
 
 
-def test_a_case_depends_on_its_seed_alone(healthy: Path, tmp_path: Path) -> None:
-    bench = Bench(healthy, tmp_path / "home", KINDS)
-    before = files_in(healthy)
-
-    def changed(case: Case) -> dict[str, bytes]:
-        return files_in(bench.room(case).tree)
-
-    for name in ("bits_flipped", "number_replaced", "word_with_an_odd_name"):
-        first, other = Case("label", name, 3), Case("label", name, 4)
-        assert changed(first) == changed(first) != changed(other)
-    assert files_in(healthy) == before
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Duplicate name")  # it is what one of them makes
-def test_every_mutation_can_change_every_form(healthy: Path, tmp_path: Path) -> None:
-    bench = Bench(healthy, tmp_path / "home", KINDS)
-    one_of = {kind.form: kind.name for kind in KINDS.values()}
-    assert set(one_of) == set(FORMS)
-    here = {kind.form: kind.name for kind in KINDS.values() if kind.can_be_read}
-    for form, kind in here.items():
-        for group in GROUPS:
-            for name in fitting(form, group):
-                room = bench.room(Case(kind, name, 0))
-                assert room.tree.exists() or room.tree.is_symlink()
-
-
-def test_cases_are_of_every_kind_and_group() -> None:
-    cases = drawn(CASES, SEED)
-    assert Counter(case.kind for case in cases) == dict.fromkeys(HERE, CASES)
-    assert {MUTATIONS[case.mutation or ""].group for case in cases} == set(GROUPS)
-    assert cases == drawn(CASES, SEED) != drawn(CASES, SEED + 1)
-
-
-def test_a_kind_has_a_seed_of_its_own() -> None:
-    cases = drawn(CASES, SEED)
-    for kind in HERE:
-        assert drawn(CASES, SEED, [kind]) == [case for case in cases if case.kind == kind]
-    assert left_out().keys() == KINDS.keys() - set(HERE)
-
-
 @pytest.mark.slow
 def test_every_verb_is_killed_and_meets_a_full_disk(healthy: Path, tmp_path: Path) -> None:
     stops = [Stop(verb.name, kind, 0.6) for verb in VERBS for kind in ("kill", "full disk")]
     assert [stopped for stopped in run_stops(stops, healthy, tmp_path) if stopped.failed] == []
 
 
-def test_kills_are_of_every_verb() -> None:
-    stops = drawn_stops(100, SEED)
-    for kind in ("kill", "full disk"):
-        assert {stop.verb for stop in stops if stop.kind == kind} == {verb.name for verb in VERBS}
-    assert sum(stop.kind == "kill" for stop in stops) == 100
-
-
 def test_the_page_is_of_a_whole_run_without_a_failure() -> None:
-    """`python -m tests.campaign` brings it up to date."""
+    """`PYTHONPATH=.ci/tools python -m campaign` brings it up to date."""
     text = PAGE.read_text(encoding="utf-8")
     rows = numbers(text)
     assert set(rows) >= {*KINDS, *(f"`{verb.name}`" for verb in VERBS), "all"}
@@ -128,13 +78,6 @@ def test_the_page_is_of_a_whole_run_without_a_failure() -> None:
         0,
         0,
     ]
-
-
-def test_a_page_counts_what_failed() -> None:
-    outcomes = [Outcome(Case("label", "emptied", 0), verdict) for verdict in ("read", "wrong", "hang", "refused")]
-    text = page(outcomes, [], "nothing")
-    assert "2 failed" in text
-    assert numbers(text)["label"][0] == numbers(text)["label"][-1] == [1, 1, 2]
 
 
 def test_the_limits_of_the_security_page_are_those_of_the_code() -> None:

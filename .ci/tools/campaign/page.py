@@ -56,13 +56,13 @@ limit on the size of files). Then the same command ran again.
 _END = """
 ## Run it again
 
-    python -m tests.campaign
+    PYTHONPATH=.ci/tools python -m campaign
 
 at the top of a checkout repeats all of it and writes this page, which is of {command}. The same seed makes the
 same cases; `--count` is how many a kind has, and `--kinds "weights,zip of a release"` runs these alone. Weights and
-training states need the extra `torch`, and are left out where it is not installed. `pytest tests/campaign` tries
-others, a few of each kind; a test compares the numbers of this page with each other and with the kinds of files. What
-fails is printed with its kind, mutation and seed.
+training states need the extra `torch`, and are left out where it is not installed.
+`pytest -m "" tests/test_campaign.py` tries others, a few of each kind; a test compares the numbers of this page with
+each other and with the kinds of files. What fails is printed with its kind, mutation and seed.
 """
 
 

@@ -24,7 +24,8 @@ WORKERS = 2
 KINDS_MODULE = "campaign.kinds"
 _CONNECT = "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"
 """How long dask tries to reach a scheduler."""
-_TESTS = Path(__file__).parents[1]
+_TOOLS = Path(__file__).parents[1]
+_TOP = _TOOLS.parents[1]
 
 
 def drawn(count: int, seed: int, kinds: Collection[str] = tuple(KINDS)) -> list[Case]:
@@ -98,7 +99,7 @@ def _server(healthy: Path, number: int, kinds: str) -> Iterator[tuple[IO[str], I
     """A process that answers cases, with its input and its output."""
     home = healthy.with_name(f"{healthy.name} of worker {number}")
     command = [sys.executable, "-W", "ignore", worker.__file__, str(healthy), str(home), kinds]
-    paths = os.pathsep.join([str(_TESTS), str(_TESTS.parent), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(_TOOLS), str(_TOP / "tests"), str(_TOP), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", _CONNECT: "1s"}
     environment.pop("DEEPACCIDENT_LIMITS", None)
     pipe = subprocess.PIPE

@@ -7,10 +7,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-
 from mutation.mutants import changes, mutated
 from mutation.planting import plant
-from mutation.sample import drawn
 
 SOURCE = '''
 """A text of 3 words, which is left alone."""
@@ -74,12 +72,3 @@ def test_a_mutant_is_planted_wherever_it_is_held(tmp_path: Path, monkeypatch, be
     assert (near.__wrapped__(2), *limits()) == (False, 2, 4, 5, (3,))
     assert plant(module, ast.parse(SOURCE.replace(before, after)))
     assert (near.__wrapped__(2), *limits()) == found
-
-
-@pytest.mark.slow
-def test_fewer_mutants_are_the_first_of_more() -> None:
-    many = drawn(400, 17)
-    assert drawn(50, 17) == many[:50]
-    assert drawn(50, 18) != many[:50]
-    areas = Counter(mutant.path.split("/")[0] for mutant in many)
-    assert areas["evaluation"] > areas["motion"] > areas["geometry"] > areas["splits.py"] > 0

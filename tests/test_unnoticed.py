@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from campaign.healthy import AGENTS, CHANNELS, EXPORT, make_healthy, opened
+
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.validation import validate_release
 
-PAGE = Path(__file__).parents[2] / "SECURITY.md"
+PAGE = Path(__file__).parents[1] / "SECURITY.md"
 
 
 @pytest.fixture

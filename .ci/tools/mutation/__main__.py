@@ -1,4 +1,4 @@
-"""`PYTHONPATH=tests python -m mutation`: plant mutants in the package, and see which of them the tests notice."""
+"""`PYTHONPATH=.ci/tools:tests python -m mutation`: plant mutants in the package, and see which the tests notice."""
 
 import json
 from collections import Counter

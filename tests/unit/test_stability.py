@@ -1,0 +1,31 @@
+"""The page of what is stable has the versions there are, and packages say what is public."""
+
+import re
+from importlib import import_module
+from pathlib import Path
+
+from deepaccident_devkit.evaluation.results import FORMAT_VERSION
+from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_VERSION
+from deepaccident_devkit.motion import label_folder
+from deepaccident_devkit.tables.manifest import SCHEMA_VERSION
+
+TOP = Path(__file__).parents[2]
+PAGE = (TOP / "docs" / "stability.md").read_text(encoding="utf-8")
+
+
+def test_the_page_has_the_versions_of_files_and_pythons() -> None:
+    versions = re.findall(r"^\| [^|]+ \| (\d) \| ", PAGE, re.MULTILINE)
+    assert versions == [
+        str(each) for each in (SCHEMA_VERSION, label_folder.FORMAT_VERSION, FORMAT_VERSION, SUMMARY_VERSION)
+    ]
+    pythons = re.findall(r"Python :: (3\.\d+)", (TOP / "pyproject.toml").read_text(encoding="utf-8"))
+    assert f"Python {', '.join(pythons[:-1])} and {pythons[-1]}" in PAGE
+
+
+def test_every_package_of_the_reference_says_what_is_public() -> None:
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in (TOP / "docs" / "api").glob("*.md"))
+    need_torch = {"deepaccident_devkit.export.torch", "deepaccident_devkit.model"}
+    names = set(re.findall(r"^\.\. automodule:: (\S+)", pages, re.MULTILINE)) - need_torch
+    packages = [import_module(name) for name in ("deepaccident_devkit", *sorted(names))]
+    silent = [each.__name__ for each in packages if hasattr(each, "__path__") and not hasattr(each, "__all__")]
+    assert (len(packages) > 20, silent) == (True, [])
