@@ -18,6 +18,7 @@ from deepaccident_devkit.parallel.shard import (
     part_of,
     unfinished_folder,
 )
+from deepaccident_devkit.parallel.store import Store, Turn
 
 __all__ = [
     "MERGE",
@@ -27,7 +28,9 @@ __all__ = [
     "Progress",
     "Shard",
     "ShardFiles",
+    "Store",
     "Tried",
+    "Turn",
     "check_failures",
     "check_whole",
     "cluster_executor",
