@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.parallel import Failure, Store
+from deepaccident_devkit.parallel import Store
 
 ITEMS = tuple(f"type/{number:02d}" for number in range(12))
 
@@ -40,10 +40,10 @@ class Work:
 
 
 def store_in(folder: Path) -> Store:
-    return Store(folder / "out.unfinished", "doubles")
+    return Store(folder / "out.unfinished", folder / "out", "doubles", ConfigError)
 
 
-def made(folder: Path, workers: int = 1, **how: object) -> dict[str, bytes | Failure]:
+def made(folder: Path, workers: int = 1, **how: object) -> dict[str, bytes]:
     """Make all items, then write the whole of them as `out`, if nobody else has."""
     (folder / "marks").mkdir(parents=True, exist_ok=True)
     store = store_in(folder)
@@ -53,10 +53,10 @@ def made(folder: Path, workers: int = 1, **how: object) -> dict[str, bytes | Fai
             dict(zip(ITEMS, ITEMS, strict=True)),
             workers=workers,
         )
-        if turn.alone() and not any(isinstance(each, Failure) for each in results.values()):
+        if turn.alone():
             (folder / "wholes").mkdir(exist_ok=True)
             (folder / "wholes" / str(os.getpid())).touch()
-            (folder / "out").write_bytes(b"\n".join(results.values()))  # type: ignore[arg-type]
+            (folder / "out").write_bytes(b"\n".join(results.values()))
             store.remove()
     return results
 

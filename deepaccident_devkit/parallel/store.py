@@ -24,9 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
+from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.files import place_in, remove_in, say_waiting, write_bytes
 from deepaccident_devkit.parallel.batches import run_batch
-from deepaccident_devkit.parallel.failures import Failure, Tried
+from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
 from deepaccident_devkit.reading import FileKind, read_bytes
 
 Item = TypeVar("Item")
@@ -42,11 +43,15 @@ class Store:
 
     Attributes:
         folder: it need not exist. The caller has checked that no link leads there; below it none is followed.
+        out: the place of what is made, for messages.
         task: what those who hold its lock do, such as `writes labels`, for who waits for them.
+        error: raised if something cannot be written.
     """
 
     folder: Path
+    out: Path
     task: str
+    error: type[DeepAccidentError]
 
     def kept(self, name: str, key: str, kind: FileKind = "bundle") -> bytes | None:
         """A result; None if there is none that was made from what `key` says, or it is damaged.
@@ -89,16 +94,22 @@ class Store:
 
         Raises:
             OutputFolderError: the folder or its lock is a link.
-            OSError: the folder cannot be made or written to, or its file system has no locks.
+            DeepAccidentError: of the kind `error`, for any OSError: the folder cannot be made or written to, its file
+                system has no locks, the disk is full.
         """
         turn = Turn(self)
         try:
             turn.join(begin)
             yield turn
+        except DeepAccidentError:
+            raise
+        except OSError as error:
+            remedy = "make room there, or choose another folder, and run it again"
+            raise self.error(f"{self.out}: cannot be written ({error}); {remedy}") from error
         finally:
             turn.end()
 
-    def run(self, work: Callable[[Item], Result], items: Mapping[str, Item], **how: Any) -> dict[str, Result | Failure]:
+    def run(self, work: Callable[[Item], Result], items: Mapping[str, Item], **how: Any) -> dict[str, Result]:
         """Apply `work` to every item that no other process has at hand; then to those, once they have been let go.
 
         Args:
@@ -108,22 +119,23 @@ class Store:
             **how: of `run_batch`: `workers`, `executor`, `label`, `progress`, `places`.
 
         Returns:
-            Name → result, or what failed, as `Tried` has it; in the order of the items.
+            Name → result, in the order of the items.
 
         Raises:
+            SomeFailedError: some items failed, as `Tried` has it; the others are done.
             OSError: an item cannot be locked, or its result cannot be written.
             ChoiceError, WorkerError: as of `run_batch`.
         """
-        results: dict[str, Result | Failure] = {}
+        results: dict[str, Result | Failure | _AtHand] = {}
         left = list(items.items())
         for wait in (False, True):
             if wait and left:
-                say_waiting(self.folder, self.task)
+                say_waiting(self.out, self.task)
             done = run_batch(Tried(_Alone(self, work, wait=wait)), left, **how) if left else []
-            named = zip([name for name, _ in left], done, strict=True)
-            results |= {name: result for name, result in named if not isinstance(result, _AtHand)}
-            left = [each for each in left if each[0] not in results]
-        return {name: results[name] for name in items}
+            results |= {name: result for (name, _), result in zip(left, done, strict=True)}
+            left = [each for each in left if isinstance(results[each[0]], _AtHand)]
+        check_failures(results.items(), str(self.out))
+        return {name: each for name, each in results.items() if not isinstance(each, Failure | _AtHand)}
 
     def lock_path(self, name: str) -> Path:
         """The lock of an item; raises OutputFolderError if a link leads there."""
@@ -178,7 +190,7 @@ class Turn:
         try:
             fcntl.flock(self._file, kind | fcntl.LOCK_NB)
         except BlockingIOError:
-            say_waiting(self._store.folder, self._store.task)
+            say_waiting(self._store.out, self._store.task)
             fcntl.flock(self._file, kind)
 
     def _is_there(self) -> bool:
@@ -216,6 +228,12 @@ class _Alone(Generic[Item, Result]):
             return self.work(item)
         finally:
             os.close(file)
+
+
+def unfinished_folder(out: Path) -> Path:
+    """The folder beside `out` for what is not finished; raises OutputFolderError if it is a link."""
+    place = out.absolute()
+    return place_in(place.parent, f"{place.name}.unfinished", opened=True)
 
 
 def _opened(lock: Path) -> int:

@@ -5,12 +5,12 @@ says which differences of two are real.
 """
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
-from deepaccident_devkit.evaluation.runs.checkpoints import explanation_checkpoint
+from deepaccident_devkit.evaluation.runs.checkpoints import evaluation_store, explanation_checkpoint
 from deepaccident_devkit.evaluation.runs.compare import compare_bundles
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
 from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
 from deepaccident_devkit.evaluation.runs.differences import Difference
-from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results, evaluate_shard
+from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
     BREAKDOWNS,
     EvaluationRun,
@@ -46,7 +46,7 @@ __all__ = [
     "coverage",
     "default_selection",
     "evaluate_results",
-    "evaluate_shard",
+    "evaluation_store",
     "explanation_checkpoint",
     "prevented_accidents",
     "read_bundle",

@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stored import ITEMS, Work, made, process, store_in
 
-from deepaccident_devkit.errors import OutputFolderError
-from deepaccident_devkit.parallel import Failure, Store
+from deepaccident_devkit.errors import ConfigError, OutputFolderError, SomeFailedError
+from deepaccident_devkit.parallel import Store
 
 WHOLE = b"\n".join(f"{name} {name} settings".encode() for name in ITEMS)
 
@@ -68,7 +68,7 @@ def test_other_settings_are_made_again(tmp_path: Path) -> None:
 @given(content=st.binary(max_size=40), at=st.integers(0, 60), byte=st.integers(1, 255), cut=st.booleans())
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_damaged_result_is_none(tmp_path: Path, content: bytes, at: int, byte: int, cut: bool) -> None:
-    store = Store(tmp_path / "store", "tests")
+    store = Store(tmp_path / "store", tmp_path, "tests", ConfigError)
     store.keep("a/b", "key", content)
     assert store.kept("a/b", "key") == content
     assert store.kept("a/b", "other") is store.kept("a/c", "key") is None
@@ -83,19 +83,12 @@ def test_a_damaged_result_is_none(tmp_path: Path, content: bytes, at: int, byte:
 
 
 def test_a_failure_hides_no_result(tmp_path: Path) -> None:
-    results = made(tmp_path, broken=ITEMS[2:4])
-    assert [name for name, each in results.items() if isinstance(each, Failure)] == list(ITEMS[2:4])
+    with pytest.raises(SomeFailedError, match=r"out: 2 of 12 failed:\n  type/02: type/02: broken\n  type/03: type/03"):
+        made(tmp_path, broken=ITEMS[2:4])
     assert not (tmp_path / "out").exists()
     made(tmp_path)
     assert (tmp_path / "out").read_bytes() == WHOLE
     assert len(marks(tmp_path)) == len(ITEMS)  # of this process; the marks of failures are the same files
-
-
-def made_all(folder: Path) -> None:
-    """Make all; the first failure is raised."""
-    for each in made(folder).values():
-        if isinstance(each, Failure):
-            raise OutputFolderError(each.message)
 
 
 @pytest.mark.parametrize("place", ["locks", "locks/type", f"locks/{ITEMS[1]}", "kept", "kept/type", ".lock"])
@@ -108,7 +101,7 @@ def test_no_link_is_followed(tmp_path: Path, place: str) -> None:
     link.symlink_to(outside / "precious" if place.endswith(("lock", ITEMS[1])) else outside)
     before = (outside / "precious").stat()
     with pytest.raises(OutputFolderError, match="a symbolic link, which no devkit makes; remove it"):
-        made_all(tmp_path)
+        made(tmp_path)
     assert [each.name for each in outside.iterdir()] == ["precious"]
     assert (outside / "precious").stat() == before
 
