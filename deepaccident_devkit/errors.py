@@ -153,9 +153,5 @@ class SomeFailedError(DeepAccidentError, RuntimeError):
     _is_list = True
 
 
-class UnfinishedError(DeepAccidentError, RuntimeError):
-    """Shards of bulk work cannot be merged, since some are not done."""
-
-
 class MissingExtraError(DeepAccidentError, ImportError):
     """An optional dependency is needed and not installed."""

@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import Baseline, conditions, figures
+from deepaccident_devkit.baselines import Baseline, conditions
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import NotAvailableError, ResultsError, UnfinishedError
+from deepaccident_devkit.errors import NotAvailableError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.splits import save_selection
 from deepaccident_devkit.v2x import Link
@@ -114,20 +114,6 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_parts_of_the_predictions_make_the_same_files(da_motion: DeepAccident, tmp_path: Path) -> None:
-    words = ("predict", da_motion.dataroot, "--split", "train", "--scope", "all", "--agents", "all", "--workers", 1)
-    run(*words, "--out", tmp_path / "whole")
-    out = tmp_path / "parts"
-    told = "part 1/3: 20 samples of 1 scenarios, motion, accident, detection; next: the same with --merge\n"
-    assert told in run(*words, "--out", out, "--shard", "1/3")
-    with pytest.raises(UnfinishedError, match="20 of 40 are not done"):
-        run(*words, "--out", out, "--merge")
-    run(*words, "--out", out, "--shard", "2/3")
-    assert "part 3/3: 0 samples of 0 scenarios" in run(*words, "--out", out, "--shard", "3/3")
-    assert f"motion: 40 samples in {out / 'motion'}\n" in run(*words, "--out", out, "--merge")
-    assert contents(out) == contents(tmp_path / "whole")
-
-
 def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, tmp_path: Path) -> None:
     words = ("predict", da_motion.dataroot, "--split", "train", "--workers", 1, "--out", tmp_path)
     run(*words, "--task", "accident")
@@ -141,28 +127,6 @@ def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, t
         run(*words, "--task", "accident", "--agents", "all")
 
 
-def test_parts_of_the_study_make_the_same_files(
-    da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(conditions, "_QUICK_HORIZONS", (2.0,))
-    monkeypatch.setattr(conditions, "_QUICK_STEPS", (0.0,))
-    monkeypatch.setattr(figures, "save_panels", lambda _, title, path: path.write_text(title))
-    words = ("v2x", da_motion.dataroot, "--split", "train", "--scope", "all", "--quick", "--workers", 1)
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    printed = run(*words, "--out", whole)
-    told = "part 2/2: 4 samples; next: the same with --merge\n"
-    assert told in run(*words, "--out", parts, "--shard", "2/2")
-    with pytest.raises(UnfinishedError, match="4 of 8 are not done"):
-        run(*words, "--out", parts, "--merge")
-    run(*words, "--out", parts, "--shard", "1/2")
-    tables = [
-        text[text.index("V2X") : text.index("written:")] for text in (printed, run(*words, "--out", parts, "--merge"))
-    ]
-    assert tables[0] == tables[1]
-    assert contents(parts) == contents(whole)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["parts", "whole"]
-
-
 @pytest.mark.parametrize("verb", ["predict", "v2x"])
 def test_the_verbs_have_the_grammar_of_all_others(verb: str) -> None:
     text = CliRunner().invoke(deepaccident, ["baseline", verb, "--help"]).output
@@ -173,7 +137,5 @@ def test_the_verbs_have_the_grammar_of_all_others(verb: str) -> None:
         "--workers",
         "--on-error",
         "--out DIR",
-        "--shard K/N",
-        "--merge",
     ):
         assert word in text

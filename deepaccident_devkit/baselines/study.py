@@ -33,7 +33,6 @@ def v2x_study(
     """Compare what seven sets of agents foresee: overall, by visibility and time, and with noisy and late data.
 
     All rows of a horizon are of the same samples. Intervals are over clusters (an accident and its twin are one).
-    `study_parts.StudyInParts` makes the same study in parts.
 
     Args:
         dataset: the release.

@@ -4,10 +4,9 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results
+from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results, v2x_study
 from deepaccident_devkit.baselines.figures import save_study
-from deepaccident_devkit.baselines.predict_results import is_predicted, samples_by_scenario
-from deepaccident_devkit.baselines.study_parts import StudyInParts
+from deepaccident_devkit.baselines.predict_results import is_predicted
 from deepaccident_devkit.cli.evaluate_options import purpose_parameter, resamples_parameter, scope_parameter
 from deepaccident_devkit.cli.options import (
     LINK_OPTIONS,
@@ -17,10 +16,8 @@ from deepaccident_devkit.cli.options import (
     link_of,
     link_parameters,
     names_or_configuration,
-    part_parameters,
     refuse_unused,
     release_parameters,
-    say_part_done,
     write_report,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -30,7 +27,6 @@ from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
-from deepaccident_devkit.parallel import Part, Shard, mine
 from deepaccident_devkit.taxonomy import AGENTS
 
 _ALONE = "single"
@@ -53,7 +49,6 @@ def baseline() -> None:
 
 @baseline.command()
 @release_parameters
-@part_parameters
 @_SPLIT
 @click.option(
     "--task",
@@ -86,7 +81,6 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
         refuse_unused("without --pose-noise or --packet-loss", "seed")
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
-    part: Part = options.pop("part")
     chosen = Baseline(link=link, **{name: options.pop(name) for name in ("agents", "model", "horizon")})
     folder = writable_folder(out)
     dataset = DeepAccident(**options)
@@ -94,22 +88,17 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     tokens = dataset.samples(split, purpose, "released" if released else "paper", horizon=chosen.horizon, scope=scope)
     if not tokens:
         raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
-    run = {**engine_of(options), "part": part, "progress": True}
+    run = {**engine_of(options), "progress": True}
     wanted = [task for task in get_args(ResultsTask) if task in tasks or "all" in tasks]
     for task in wanted:
         path = folder / RESULTS_NAMES[task]
         kept = is_predicted(dataset, task, tokens, path, chosen)
         predict_results(dataset, task, tokens, path, chosen, **run)
-        if kept or not isinstance(part, Shard):
-            click.echo(f"{task}: {len(tokens):,} samples in {path}{', which were there already' if kept else ''}")
-    if isinstance(part, Shard):
-        own = mine(part, samples_by_scenario(tokens))
-        say_part_done(part, f"{sum(map(len, own)):,} samples of {len(own):,} scenarios, {', '.join(wanted)}")
+        click.echo(f"{task}: {len(tokens):,} samples in {path}{', which were there already' if kept else ''}")
 
 
 @baseline.command()
 @release_parameters
-@part_parameters
 @_SPLIT
 @_MODEL
 @click.option(
@@ -140,22 +129,14 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
 def v2x(split: str, egos: tuple[str, ...], seeds: tuple[int, ...], resamples: int, out: str, **options: Any) -> None:
     """Compare how well seven sets of agents predict the accidents of the release in DATAROOT.
 
-    Print the tables, and write one CSV file and one picture per table. If the command is interrupted, the same command
-    continues.
+    Print the tables, and write one CSV file and one picture per table.
     """
-    part: Part = options.pop("part")
     how = {name: options.pop(name) for name in ("model", "scope", "protocol", "quick")}
     usual = StudyConfig()
     how |= {"egos": egos or usual.egos, "seeds": seeds or usual.seeds, "resampling": Resampling(resamples=resamples)}
     config = StudyConfig(**how)
     folder = writable_folder(out)
-    work = StudyInParts(DeepAccident(**options), folder, split, config)
-    samples = work.count(part, **engine_of(options), progress=True)
-    if isinstance(part, Shard):
-        say_part_done(part, f"{samples:,} samples")
-        return
-    study = work.result()
+    study = v2x_study(DeepAccident(**options), split, config, **engine_of(options), progress=True)
     written = [*write_report(study, folder, "v2x_study.json"), *save_study(study, folder)]
-    work.remove()
     click.echo(study.to_text())
     click.echo(f"written: {len(written)} files in {folder}")

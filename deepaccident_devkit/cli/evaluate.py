@@ -46,6 +46,7 @@ from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_thres
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
+from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.render.evaluation import save_report
 
 _HELP = {
@@ -175,8 +176,11 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})
-    store = None if out is None else evaluation_store(out)
-    with nullcontext() if store is None else store.shared() as turn:
+    asked = {name: str(each) for name, each in options.items() if name not in ("workers", "executor")}
+    command = digest_of({"setup": setup.as_dict(), "results": opened.fingerprint, "by": by, "options": asked})
+    with nullcontext() if out is None else evaluation_store(out, command).shared() as turn:
+        if out is not None:
+            checked_target(out, overwrite=options["overwrite"])  # of another process, which has just ended
         how = {**engine_of(options), "allow_partial": options["allow_partial"], "out": out, "progress": True}
         run = evaluate_results(dataset, opened, setup, selection, **how)
         if turn is None or out is None or turn.alone():

@@ -15,11 +15,9 @@ from deepaccident_devkit.cli.options import (
     agent_names,
     agents_parameter,
     engine_of,
-    part_parameters,
     reader_parameters,
     refuse_unused,
     release_parameters,
-    say_part_done,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
@@ -31,7 +29,6 @@ from deepaccident_devkit.motion.label_folder import Manifest, folder_path
 from deepaccident_devkit.motion.protocols import slip_names
 from deepaccident_devkit.motion.sample_lists import Purpose
 from deepaccident_devkit.motion.warps.warping import WarpMode
-from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.v2x import AGENT_SETS
 
 _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "only_vehicle")
@@ -68,7 +65,6 @@ def _config_parameters(verb: Verb) -> Verb:
 
 @click.group(cls=VerbGroup)
 @release_parameters
-@part_parameters
 @click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (.txt).")
 @click.option(
     "--out",
@@ -105,7 +101,6 @@ def labels(
     config = _config(options)
     chosen = agent_names(agents)
     Manifest.of(folder_path(out), config, names)  # before the release is indexed
-    part: Part = options.pop("part")
     dataset = DeepAccident(**options)
     tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
     if not tokens:
@@ -117,14 +112,9 @@ def labels(
         config,
         names=names,
         **engine_of(options),
-        part=part,
         progress=True,
     )
-    told = f"{done.samples:,} samples in {out}: {done.written} files written, {done.kept} were there already"
-    if isinstance(part, Shard):
-        say_part_done(part, told)
-    else:
-        click.echo(told)
+    click.echo(f"{done.samples:,} samples in {out}: {done.written} files written, {done.kept} were there already")
 
 
 def _cell(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, int, int]:

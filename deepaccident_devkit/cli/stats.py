@@ -7,28 +7,19 @@ import click
 from deepaccident_devkit.cli.options import (
     WordChoice,
     engine_of,
-    part_parameters,
     release_parameters,
-    say_part_done,
     say_report,
     where_parameter,
     write_report,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.files import writable_folder
-from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.render.statistics import PictureFormat, save_statistics
-from deepaccident_devkit.statistics import (
-    dataset_statistics,
-    merged_statistics,
-    remove_shards,
-    statistics_shard,
-)
+from deepaccident_devkit.statistics import dataset_statistics
 
 
 @click.command()
 @release_parameters
-@part_parameters
 @where_parameter
 @click.option("--interactions", is_flag=True, help="Also count how soon moving pairs would collide.")
 @click.option(
@@ -48,7 +39,6 @@ def stats(
     out: str | None,
     formats: tuple[PictureFormat, ...],
     as_json: bool,
-    part: Part,
     **release: Any,
 ) -> None:
     """Print the paper's statistics of the release in DATAROOT by split: scenarios and their ends, actors, boxes.
@@ -57,24 +47,13 @@ def stats(
     """
     if formats and out is None:
         raise click.UsageError("--format is for figures; give --out FOLDER too")
-    if part is not None and out is None:
-        raise click.UsageError("--shard and --merge need a folder, beside which the parts lie; give --out FOLDER too")
     dataset = DeepAccident(**release)
-    how = engine_of(release)
     chosen = dataset.find(*where) if where else None
     if out is not None and chosen == []:
         raise click.UsageError("no scenario matches --where, so there is nothing to write; change it or omit --out")
     folder = None if out is None else writable_folder(out)
-    if folder and isinstance(part, Shard):
-        count = statistics_shard(dataset, part, folder, chosen, interactions=interactions, **how)
-        say_part_done(part, f"{count} scenarios")
-        return
-    if folder and part is not None:
-        statistics = merged_statistics(dataset, folder, chosen, interactions=interactions)
-    else:
-        statistics = dataset_statistics(dataset, chosen, interactions=interactions, **how)
+    statistics = dataset_statistics(dataset, chosen, interactions=interactions, **engine_of(release))
     written = write_report(statistics, folder, "statistics.json")
     if folder:
         written += save_statistics(statistics, folder, formats or get_args(PictureFormat))
-        remove_shards(dataset, folder, chosen, interactions=interactions)
     say_report(statistics, written, folder, as_json=as_json)

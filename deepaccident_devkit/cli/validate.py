@@ -6,22 +6,20 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import files_parameters, part_parameters, refuse_unused, say_part_done
-from deepaccident_devkit.parallel import Part, Shard
+from deepaccident_devkit.cli.options import files_parameters, refuse_unused
 from deepaccident_devkit.release.store import Dataroot
-from deepaccident_devkit.validation import merged_validation, validate_release, validation_shard
+from deepaccident_devkit.validation import validate_release
 
 _FINDINGS_STATUS = 1
 
 
 @click.command()
 @files_parameters
-@part_parameters
 @click.option(
     "--parts",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Folder to keep what is found in each scenario: the same command then goes on, and shards meet there.",
+    help="Folder to keep what is found in each scenario: the same command then goes on, and several share the work.",
 )
 @click.option("--deep", is_flag=True, help="Also decode each image and array, and compare them with the labels.")
 @click.option(
@@ -37,8 +35,6 @@ def validate(
     notes: bool,
     whole: bool,
     as_json: bool,
-    part: Part,
-    parts: Path | None,
     **how: Any,
 ) -> None:
     """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
@@ -50,16 +46,7 @@ def validate(
     if as_json:
         refuse_unused("with --json, which has all findings and notes", "notes", "whole")
     how |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
-    if part is None:
-        report = validate_release(dataroot, version, parts=parts, **how)
-    elif parts is None:
-        raise click.UsageError("--shard and --merge need a folder, in which the parts lie; give --parts FOLDER too")
-    elif isinstance(part, Shard):
-        done = validation_shard(dataroot, part, parts, version, **how)
-        say_part_done(part, f"{len(done)} scenarios")
-        return
-    else:
-        report = merged_validation(dataroot, parts, version, **how)
+    report = validate_release(dataroot, version, **how)
     click.echo(report.to_json() if as_json else report.to_text(notes=notes, whole=whole))
     if not report.is_good:
         sys.exit(_FINDINGS_STATUS)

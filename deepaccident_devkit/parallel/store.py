@@ -2,11 +2,12 @@
 
 Processes, also on several hosts, that are given the same command and the same folder share its items. Each makes what
 nobody else is making; one that finds no such item waits for the others; then one of them after the other has the folder
-alone. The first writes what spans the items; the others see that it is there.
+alone. The first writes what spans the items; the others see that it is there. Another command waits for its turn.
 
 The folder is the devkit's own, and hidden from whoever uses what is made:
 
-    .lock         held together while items are made, and by one alone before and after that
+    .lock         held together by all that take part, and by one alone before that; says for which command
+    .making       held together while items are made, and by one alone after that
     locks/NAME    held while an item is made
     kept/NAME     a result: its bytes, and a seal of these and of a key, which says what it was made from
 
@@ -34,7 +35,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 _SEAL: Final = 16
 """Bytes after a result."""
-_LOCK: Final = ".lock"
+_LOCKS: Final = (".lock", ".making")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +47,18 @@ class Store:
         out: the place of what is made, for messages.
         task: what those who hold its lock do, such as `writes labels`, for who waits for them.
         error: raised if something cannot be written.
+        command: a digest of what is made. Only those who make the same share the folder.
     """
 
     folder: Path
     out: Path
     task: str
     error: type[DeepAccidentError]
+    command: str = ""
+
+    def path(self, name: str) -> Path:
+        """Where the result of an item lies; raises OutputFolderError if a link leads there, or it is one."""
+        return place_in(self.folder, f"kept/{name}", opened=True)
 
     def kept(self, name: str, key: str, kind: FileKind = "bundle") -> bytes | None:
         """A result; None if there is none that was made from what `key` says, or it is damaged.
@@ -65,32 +72,40 @@ class Store:
             OutputFolderError: a link leads there.
         """
         try:
-            content = read_bytes(place_in(self.folder, f"kept/{name}", opened=True), kind)
+            content = read_bytes(self.path(name), kind)
         except OSError:
             return None
         return content[:-_SEAL] if content[-_SEAL:] == _seal(key, content[:-_SEAL]) else None
 
     def keep(self, name: str, key: str, content: bytes) -> None:
         """Keep a result in place of an earlier one of this name; raises OSError or OutputFolderError."""
-        write_bytes(place_in(self.folder, f"kept/{name}"), content + _seal(key, content))
+        write_bytes(self.path(name), content + _seal(key, content))
 
     def drop(self, name: str) -> None:
         """Remove a result, if it is there; raises OSError or OutputFolderError."""
         remove_in(self.folder, f"kept/{name}")
 
-    def remove(self) -> None:
-        """Remove all of it, once what it was for is written; whoever waits for its lock sees that it is gone."""
-        for name in ("kept", "locks", _LOCK):
+    def remove(self, *, keep: bool = False) -> None:
+        """Remove all of it, or all but results, once the whole is written; who waits for its locks sees that.
+
+        Raises:
+            OSError, OutputFolderError: something cannot be removed, or there is a link on the way.
+        """
+        for name in ("locks", *_LOCKS, *(() if keep else ("kept",))):
             remove_in(self.folder, name)
         with suppress(OSError):  # something else is there, or another process has begun again
             self.folder.rmdir()
 
     @contextmanager
-    def shared(self, begin: Callable[[], object] = lambda: None) -> Iterator[Turn]:
+    def shared(
+        self, begin: Callable[[], object] = lambda: None, *, tidy: Callable[[], object] = lambda: None
+    ) -> Iterator[Turn]:
         """Take part in the work on the items, together with others, while the block runs.
 
         Args:
-            begin: called before, if nobody else takes part: what removes the files of killed processes.
+            begin: called before that, if nobody else takes part.
+            tidy: removes what killed processes left; called before `begin`, and after an error, if nobody else makes
+                items.
 
         Raises:
             OutputFolderError: the folder or its lock is a link.
@@ -99,14 +114,18 @@ class Store:
         """
         turn = Turn(self)
         try:
-            turn.join(begin)
+            turn.join(lambda: (tidy(), begin()))
             yield turn
-        except DeepAccidentError:
-            raise
-        except OSError as error:
+        except BaseException as error:
+            with suppress(OSError):
+                if turn.alone(wait=False):
+                    tidy()
+            if isinstance(error, DeepAccidentError) or not isinstance(error, OSError):
+                raise
             remedy = "make room there, or choose another folder, and run it again"
             raise self.error(f"{self.out}: cannot be written ({error}); {remedy}") from error
         finally:
+            turn.tidy()
             turn.end()
 
     def run(self, work: Callable[[Item], Result], items: Mapping[str, Item], **how: Any) -> dict[str, Result]:
@@ -148,55 +167,71 @@ class Turn:
     def __init__(self, store: Store) -> None:
         """Hold nothing yet."""
         self._store = store
-        self._file = -1
+        self._lock = self._making = -1
 
     def join(self, begin: Callable[[], object]) -> None:
-        """Take the lock together with others; as of `Store.shared`."""
+        """Take part together with others who make the same; as of `Store.shared`."""
         import fcntl
 
+        command, others = self._store.command.encode(), False
         while True:
             self.end()
-            self._file = _opened(self._path)
-            with suppress(BlockingIOError):
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if self._is_there():
-                    begin()
-                fcntl.flock(self._file, fcntl.LOCK_UN)
-            self._take(fcntl.LOCK_SH)
-            if self._is_there():  # else another process has finished just now
-                return
+            self._lock, self._making = (_opened(place_in(self._store.folder, name, opened=True)) for name in _LOCKS)
+            if self._take(self._lock, fcntl.LOCK_EX, wait=others) and self._is_there():
+                begin()
+                os.ftruncate(self._lock, 0)
+                os.pwrite(self._lock, command, 0)
+            fcntl.flock(self._lock, fcntl.LOCK_UN)
+            self._take(self._lock, fcntl.LOCK_SH)
+            others = os.pread(self._lock, len(command) + 1, 0) != command
+            if not others and self._take(self._making, fcntl.LOCK_SH) and self._is_there():
+                return  # else another process has finished just now, or makes something else
 
-    def alone(self) -> bool:
-        """Wait until no other process takes part; whether the store is there still, so that nobody has finished."""
+    def alone(self, *, wait: bool = True) -> bool:
+        """Wait until no other process makes items; no, if one of them has finished meanwhile and removed the store.
+
+        If this process does not wait, and others make items, the answer is no too.
+        """
         import fcntl
 
-        fcntl.flock(self._file, fcntl.LOCK_UN)  # NFS: two that hold it together would wait for each other
-        self._take(fcntl.LOCK_EX)
-        return self._is_there()
+        if self._making < 0:  # it could not join
+            return False
+        fcntl.flock(self._making, fcntl.LOCK_UN)  # NFS: two that hold it together would wait for each other
+        return self._take(self._making, fcntl.LOCK_EX, wait=wait) and self._is_there()
+
+    def tidy(self) -> None:
+        """Remove the store if nothing is kept and nobody makes items, nor a worker whose caller was stopped."""
+        folder = self._store.folder
+        with suppress(OSError):
+            if not self.alone(wait=False) or any(folder.glob("kept/*")):
+                return
+            if not any(_is_held(path) for path in folder.glob("locks/**/*") if path.is_file()):
+                self._store.remove()
 
     def end(self) -> None:
-        """Give the lock back, if it is held."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
+        """Give the locks back that are held."""
+        for file in (self._making, self._lock):
+            if file >= 0:
+                os.close(file)
+        self._lock = self._making = -1
 
-    @property
-    def _path(self) -> Path:
-        return place_in(self._store.folder, _LOCK, opened=True)
-
-    def _take(self, kind: int) -> None:
+    def _take(self, file: int, kind: int, *, wait: bool = True) -> bool:
+        """Take the lock of an open file; false if another process holds it and this one does not wait."""
         import fcntl
 
         try:
-            fcntl.flock(self._file, kind | fcntl.LOCK_NB)
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
         except BlockingIOError:
+            if not wait:
+                return False
             say_waiting(self._store.out, self._store.task)
-            fcntl.flock(self._file, kind)
+            fcntl.flock(file, kind)
+        return True
 
     def _is_there(self) -> bool:
         """Whether the lock that is held is the one that others find by its name."""
         try:
-            found, held = os.stat(self._path, follow_symlinks=False), os.fstat(self._file)  # noqa: PTH116
+            found, held = (self._store.folder / _LOCKS[0]).lstat(), os.fstat(self._lock)
         except OSError:
             return False
         return (found.st_dev, found.st_ino) == (held.st_dev, held.st_ino)
@@ -242,6 +277,20 @@ def _opened(lock: Path) -> int:
         lock.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # another process has just removed the folder
             return os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+
+
+def _is_held(lock: Path) -> bool:
+    """Whether a process has an item."""
+    import fcntl
+
+    file = _opened(lock)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(file)
+    return False
 
 
 def _seal(key: str, content: bytes) -> bytes:

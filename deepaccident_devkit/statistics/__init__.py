@@ -14,7 +14,6 @@ from deepaccident_devkit.statistics.results import (
     QuantileRow,
     QuantileTable,
 )
-from deepaccident_devkit.statistics.shards import merged_statistics, remove_shards, statistics_shard
 
 __all__ = [
     "ENDS",
@@ -28,8 +27,5 @@ __all__ = [
     "QuantileRow",
     "QuantileTable",
     "dataset_statistics",
-    "merged_statistics",
-    "remove_shards",
-    "statistics_shard",
     "writable_folder",
 ]

@@ -20,9 +20,12 @@ if TYPE_CHECKING:
 _COUNTS = "counts"
 
 
-def evaluation_store(out: str | os.PathLike[str]) -> Store:
-    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted."""
-    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError)
+def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
+    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
+
+    `command` says which evaluation that is.
+    """
+    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
 
 
 def checkpoint_path(

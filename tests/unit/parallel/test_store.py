@@ -3,6 +3,7 @@
 import os
 import subprocess
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -78,8 +79,6 @@ def test_a_damaged_result_is_none(tmp_path: Path, content: bytes, at: int, byte:
     damaged[at] ^= byte
     path.write_bytes(damaged[:at] if cut else damaged)
     assert store.kept("a/b", "key") is None
-    store.drop("a/b")
-    assert not path.exists()
 
 
 def test_a_failure_hides_no_result(tmp_path: Path) -> None:
@@ -91,14 +90,14 @@ def test_a_failure_hides_no_result(tmp_path: Path) -> None:
     assert len(marks(tmp_path)) == len(ITEMS)  # of this process; the marks of failures are the same files
 
 
-@pytest.mark.parametrize("place", ["locks", "locks/type", f"locks/{ITEMS[1]}", "kept", "kept/type", ".lock"])
+@pytest.mark.parametrize("place", ["locks", "locks/type", f"locks/{ITEMS[1]}", "kept", "kept/type", ".lock", ".making"])
 def test_no_link_is_followed(tmp_path: Path, place: str) -> None:
     folder, outside = tmp_path / "out.unfinished", tmp_path / "outside"
     outside.mkdir()
     (outside / "precious").touch()
     link = folder / place
     link.parent.mkdir(parents=True, exist_ok=True)
-    link.symlink_to(outside / "precious" if place.endswith(("lock", ITEMS[1])) else outside)
+    link.symlink_to(outside / "precious" if place.endswith(("lock", "making", ITEMS[1])) else outside)
     before = (outside / "precious").stat()
     with pytest.raises(OutputFolderError, match="a symbolic link, which no devkit makes; remove it"):
         made(tmp_path)
@@ -141,6 +140,10 @@ def test_begin_is_called_if_nobody_else_takes_part(tmp_path: Path) -> None:
         with store.shared(lambda: called.append(3)) as other:
             other.end()
     assert called == [1]
+    with pytest.raises(ZeroDivisionError), store.shared(tidy=lambda: called.append(0)):
+        called.append(1 // 0)
+    assert called == [1, 0, 0]
+    del called[1:]
     with store.shared(lambda: called.append(4)) as turn:
         assert turn.alone()
         store.remove()
@@ -157,3 +160,28 @@ def test_who_comes_after_the_end_finds_a_new_folder(tmp_path: Path) -> None:
         with store.shared() as third:
             assert third.alone()
         assert not first.alone()
+
+
+def test_another_command_waits_for_its_turn(tmp_path: Path) -> None:
+    one, other = (Store(tmp_path / "store", tmp_path, "tests", ConfigError, name) for name in ("one", "other"))
+    begun = list[str]()
+    with ThreadPoolExecutor(1) as threads:
+        with one.shared(lambda: begun.append("one")):
+            waiting = threads.submit(lambda: other.shared(lambda: begun.append("other")).__enter__())
+            time.sleep(0.2)
+            assert not waiting.done()
+            with one.shared(lambda: begun.append("one again")):
+                pass
+        waiting.result(20).end()
+    assert begun == ["one", "other"]
+
+
+def test_what_cannot_be_written_is_an_error_of_the_caller(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"out: cannot be written \(no room\); make room there, or choose another"):  # noqa: SIM117
+        with store_in(tmp_path).shared():
+            raise OSError("no room")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"file/out: cannot be written .*; make room there"):  # noqa: SIM117
+        with store_in(tmp_path / "file").shared():
+            pytest.fail("entered")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

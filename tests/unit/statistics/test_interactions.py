@@ -1,15 +1,11 @@
-"""Statistics of interactions: as `da.interactions` has them, in shards too, and only if asked for."""
-
-from pathlib import Path
+"""Statistics of interactions: as `da.interactions` has them, and only if asked for."""
 
 import numpy as np
-import pytest
 from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.parallel import Shard
-from deepaccident_devkit.statistics import compute, dataset_statistics, merged_statistics, statistics_shard
+from deepaccident_devkit.statistics import dataset_statistics
 
 EDGES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0)
 
@@ -32,16 +28,6 @@ def test_pairs_and_scenarios_are_in_their_bins(da_b: DeepAccident) -> None:
     line = next(line for line in made.to_text().splitlines() if line.startswith("below 1.5 s"))
     assert f" {below} ({round(100 * below / len(least)):>3} %)" in line
     assert "below 1.5 s" not in plain.to_text()
-
-
-def test_shards_count_them_if_asked_for(da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compute, "RUN_LENGTH", 2)
-    for number in (1, 2):
-        statistics_shard(da_b, Shard.parse(f"{number}/2"), tmp_path / "out", interactions=True)
-        statistics_shard(da_b, Shard.parse(f"{number}/2"), tmp_path / "out")
-    for interactions in (False, True):
-        merged = merged_statistics(da_b, tmp_path / "out", interactions=interactions)
-        assert merged == dataset_statistics(da_b, interactions=interactions)
 
 
 def test_the_verb_counts_them(da_b: DeepAccident) -> None:
