@@ -165,9 +165,5 @@ class SomeFailedError(UnavailableError, RuntimeError):
     _is_list = True
 
 
-class UnfinishedError(UnavailableError, RuntimeError):
-    """Shards of bulk work cannot be merged, since some are not done."""
-
-
 class MissingExtraError(UnavailableError, ImportError):
     """An optional dependency is needed and not installed."""

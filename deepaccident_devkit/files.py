@@ -23,13 +23,10 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, OutputFolderError
 from deepaccident_devkit.reading import shortened
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 logger = logging.getLogger(__name__)
 
@@ -163,58 +160,6 @@ def _start(process: int) -> str | None:
         return None
     state, *facts = status.rpartition(")")[2].split()  # after its name, which may have brackets itself
     return "" if state in "ZX" else facts[18]  # a killed process whose parent does not ask for it is there still
-
-
-class SharedLock:
-    """A file's lock, held together with others who share it, and never while somebody has it alone (`held_lock`)."""
-
-    def __init__(self, path: Path, task: str, *, wait: bool) -> None:
-        """Take it, waiting as `held_lock` does; raises OSError."""
-        import fcntl
-
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if not wait:
-                self.release()
-                raise
-            say_waiting(path.parent, task)
-            fcntl.flock(self._file, fcntl.LOCK_SH)
-
-    def release(self) -> None:
-        """Give it back."""
-        os.close(self._file)
-
-
-def held_lock(path: Path, task: str, *, shared: bool = False, wait: bool = True) -> BaseFileLock | SharedLock:
-    """The lock of a file, held until it is released or the process ends, however; its folder is made.
-
-    Args:
-        path: the file, which stays.
-        task: what that process does, such as `writes labels`.
-        shared: whether others may hold it too, but nobody alone.
-        wait: whether to wait, saying so, while another process holds it.
-
-    Raises:
-        OutputFolderError: the file is a link, whose target would be opened.
-        BlockingIOError: another process holds it, and `wait` is false.
-        OSError, NotImplementedError: the folder cannot be made or written to, or its file system has no locks.
-    """
-    from filelock import FileLock, Timeout
-
-    place_in(path.parent, path.name, opened=True).parent.mkdir(parents=True, exist_ok=True)
-    if shared:
-        return SharedLock(path, task, wait=wait)
-    lock = FileLock(path)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        if not wait:
-            raise BlockingIOError(f"{path}: another process {task}") from error
-        say_waiting(path.parent, task)
-        lock.acquire()
-    return lock
 
 
 def say_waiting(folder: Path, task: str) -> None:

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import NotAvailableError, ResultsError, UnfinishedError
+from deepaccident_devkit.errors import NotAvailableError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.splits import save_selection
 from deepaccident_devkit.v2x import Link
@@ -90,20 +90,6 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_parts_of_the_predictions_make_the_same_files(da_motion: DeepAccident, tmp_path: Path) -> None:
-    words = ("predict", da_motion.dataroot, "--split", "train", "--scope", "all", "--agents", "all", "--workers", 1)
-    run(*words, "--out", tmp_path / "whole")
-    out = tmp_path / "parts"
-    told = "part 1/3: 20 samples of 1 scenarios, motion, accident, detection; next: the same with --merge\n"
-    assert told in run(*words, "--out", out, "--shard", "1/3")
-    with pytest.raises(UnfinishedError, match="20 of 40 are not done"):
-        run(*words, "--out", out, "--merge")
-    run(*words, "--out", out, "--shard", "2/3")
-    assert "part 3/3: 0 samples of 0 scenarios" in run(*words, "--out", out, "--shard", "3/3")
-    assert f"motion: 40 samples in {out / 'motion'}\n" in run(*words, "--out", out, "--merge")
-    assert contents(out) == contents(tmp_path / "whole")
-
-
 def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, tmp_path: Path) -> None:
     words = ("predict", da_motion.dataroot, "--split", "train", "--workers", 1, "--out", tmp_path)
     run(*words, "--task", "accident")
@@ -126,7 +112,5 @@ def test_predict_has_the_grammar_of_all_other_verbs() -> None:
         "--workers",
         "--on-error",
         "--out DIR",
-        "--shard K/N",
-        "--merge",
     ):
         assert word in text

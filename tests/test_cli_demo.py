@@ -109,7 +109,7 @@ def test_an_interrupted_demo_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
             demo._make_release(tmp_path, 1, bar)
     assert sum(shares) == demo._STEPS["recording"]
     assert not (tmp_path / "release").exists()
-    recorded = times(tmp_path / ".release.unfinished" / "release")
+    recorded = times(tmp_path / ".release.unfinished" / "parts")
     assert recorded
     with tqdm(disable=True) as bar:
         demo._claim(tmp_path)

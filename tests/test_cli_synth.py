@@ -39,19 +39,6 @@ def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
     assert find_release(out).layout == "B"
 
 
-def test_verb_records_shards_and_merges_them(tmp_path):
-    words = [str(tmp_path / "out"), "--scenarios", "1", "--frames", "1", "--sensors", "none"]
-    for part, said in {
-        "--shard 1/2": "part 1/2: 1 of 1 scenarios; next: the same with --merge\n",
-        "--shard 2/2": "part 2/2: 0 of 1 scenarios; next: the same with --merge\n",
-        "--merge": f"{tmp_path / 'out'}: 1 scenario of 1 frame with five agents, layout A\n",
-    }.items():
-        result = CliRunner().invoke(synth, [*words, *part.split()])
-        assert result.exit_code == 0, result.output
-        assert result.stdout.startswith(said)
-    assert find_release(tmp_path / "out").layout == "A"
-
-
 @pytest.mark.parametrize("size", ["480", "480x", "axb", "480x270x3"])
 def test_bad_image_size_is_a_usage_error(tmp_path, size):
     result = CliRunner().invoke(synth, [str(tmp_path / "out"), "--size", size])

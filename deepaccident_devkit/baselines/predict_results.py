@@ -1,16 +1,14 @@
 """Results files of the baselines: predictions of many samples, written like those of a model.
 
 Each scenario's samples are results of their own at first, beside the whole: a killed run loses the scenarios at hand
-alone, and shards may be made anywhere.
+alone, and several processes share the scenarios.
 """
 
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import chain, groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -18,24 +16,12 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.baselines.outlook import MotionModel
 from deepaccident_devkit.baselines.predict import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ResultsError
+from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, read_results
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.parallel import (
-    MERGE,
-    Failure,
-    Part,
-    Places,
-    Shard,
-    ShardFiles,
-    check_failures,
-    check_whole,
-    mine,
-    part_of,
-    run_batch,
-)
+from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice, settle_choices
@@ -97,7 +83,7 @@ class Baseline:
         }
 
 
-def predict_results(  # noqa: PLR0913 - what, where, and on what
+def predict_results(
     dataset: Dataset,
     task: ResultsTask,
     tokens: Sequence[str],
@@ -106,13 +92,13 @@ def predict_results(  # noqa: PLR0913 - what, where, and on what
     *,
     workers: int | None = None,
     executor: Executor | None = None,
-    part: Part | str = None,
     progress: bool = False,
 ) -> Path:
     """Write a baseline's predictions of samples to a results file (of motion, a folder); returns its path.
 
-    The bytes do not depend on workers or parts. If a call is interrupted, the same call continues it: only the
-    scenarios at hand are lost. Complete results of the same samples and settings are left as they are.
+    The bytes do not depend on workers. If a call is interrupted, the same call continues it: only the scenarios at hand
+    are lost. Several processes that are given the same `out` share the scenarios. Complete results of the same samples
+    and settings are left as they are.
 
     Args:
         dataset: the release.
@@ -122,35 +108,35 @@ def predict_results(  # noqa: PLR0913 - what, where, and on what
         baseline: None for a single vehicle and constant velocity.
         workers: processes; None takes what the work is worth.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        part: `3/8` for the third of eight parts of the scenarios; `merge` to write the whole once all are there.
         progress: whether to show a bar.
 
     Raises:
-        ChoiceError: no such task or part.
+        ChoiceError: no such task.
         NotAvailableError: an agent that cooperates is not in this (partial) release.
         ResultsError: a token comes twice, something else stands at `out`, or nothing can be written.
         SomeFailedError: samples of some scenarios cannot be predicted; the others are done.
-        UnfinishedError: `part` is `merge`, and some samples are not predicted.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    part = part_of(part)
     work = _Work(dataset, choice("task", task, get_args(ResultsTask)), baseline or Baseline())
     path = path_of(out).absolute()
-    files, jobs = work.jobs(path, tokens)
-    if not work.is_done(path, tokens):
-        whole = work.writer(path)  # refuses what stands there
-        if part != MERGE:
-            own = mine(part, jobs)
-            for job in own:
-                cooperating_agents(dataset, job.tokens[0], work.baseline.agents)  # fails now, and not in every worker
-            places = Places(reads=dataset.places, writes=(files.folder,))
-            how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
-            results = run_batch(_predict, own, label=work.task, places=places, **how)
-            check_failures([(job.scenario, result) for job, result in zip(own, results, strict=True)], str(path))
-        if isinstance(part, Shard):
-            return files.folder
-        _join(whole, jobs)
-    files.remove()
+    scenarios = samples_by_scenario(path, tokens)
+    name = work.digest(tokens)
+    store = Store(unfinished_folder(path), path, "predicts for it", ResultsError, name)
+    if work.is_done(path, tokens):
+        store.remove()  # of a process that was killed just before
+        return path
+    work.writer(path)  # refuses what stands there
+    for own in scenarios.values():
+        cooperating_agents(dataset, own[0], work.baseline.agents)  # fails now, and not in every worker
+    jobs = {scenario: _Job(work, own, store, f"{name}/{scenario}") for scenario, own in scenarios.items()}
+    places = Places(reads=dataset.places, writes=(store.folder,))
+    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
+    with store.shared() as turn:
+        if not work.is_done(path, tokens):  # by another process meanwhile
+            store.run(_predict, jobs, label=work.task, places=places, **how)
+        if turn.alone() and not work.is_done(path, tokens):
+            _join(work.writer(path), jobs, tokens)
+            store.remove()
     return path
 
 
@@ -165,9 +151,15 @@ def is_predicted(
     return _Work(dataset, task, baseline or Baseline()).is_done(path_of(out).absolute(), tokens)
 
 
-def samples_by_scenario(tokens: Sequence[str]) -> list[tuple[str, ...]]:
-    """The samples of each scenario, in the given order; of lists in another order than a release's, runs of them."""
-    return [tuple(run) for _, run in groupby(tokens, lambda token: token.rsplit("/", 2)[0])]
+def samples_by_scenario(path: Path, tokens: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The samples of each scenario, in the given order; raises ResultsError, which names `path`, if one comes twice."""
+    found: dict[str, dict[str, None]] = {}
+    for token in tokens:
+        own = found.setdefault(token.rsplit("/", 2)[0], {})
+        if token in own:
+            raise ResultsError(f"{path}: {token}: comes twice; give each sample once")
+        own[token] = None
+    return {scenario: tuple(own) for scenario, own in found.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,16 +176,11 @@ class _Work:
         release = {"version": self.dataset.version, "index": self.dataset.tables_folder.name}
         return {**self.baseline.meta(), "release": release, "devkit": __version__}
 
-    def jobs(self, path: Path, tokens: Sequence[str]) -> tuple[ShardFiles, list[_Job]]:
-        """One for each scenario, and the files that they write; raises ResultsError if a token comes twice."""
-        if len(set(tokens)) < len(tokens):
-            twice = next(token for token, often in Counter(tokens).items() if often > 1)
-            raise ResultsError(f"{path}: {twice}: comes twice; give each sample once")
-        scenarios = samples_by_scenario(tokens)
-        decisive = {"baseline": repr(self.baseline), "task": self.task, "tokens": list(tokens), "meta": self.meta}
-        files = ShardFiles(path, digest_of(decisive), "" if self.task == "motion" else ".json")
-        places = [files.path(Shard(number, len(scenarios))) for number in range(1, len(scenarios) + 1)]
-        return files, [_Job(self, each, place) for each, place in zip(scenarios, places, strict=True)]
+    def digest(self, tokens: Sequence[str]) -> str:
+        """Of all that decides the results of these samples."""
+        return digest_of(
+            {"baseline": repr(self.baseline), "task": self.task, "tokens": list(tokens), "meta": self.meta}
+        )
 
     def is_done(self, path: Path, tokens: Sequence[str]) -> bool:
         """Whether its results of these samples are there."""
@@ -218,36 +205,32 @@ class _Job:
 
     work: _Work
     tokens: tuple[str, ...]
-    path: Path
+    store: Store
+    name: str
 
     @property
-    def scenario(self) -> str:
-        return self.tokens[0].rsplit("/", 2)[0]
+    def path(self) -> Path:
+        return self.store.path(self.name if self.work.task == "motion" else f"{self.name}.json")
 
 
-def _predict(job: _Job) -> Failure | None:
+def _predict(job: _Job) -> None:
     """Write the results of a scenario, unless they are there; what cannot be written ends it all."""
     work = job.work
     if job.path.exists():
-        return None
+        return
     try:
         with work.writer(job.path) as writer:
             for token in job.tokens:
                 writer.add(token, work.baseline.predict(work.dataset, work.task, token))
-    except ResultsError:
-        if not job.path.exists():  # else another process has just written the same
-            raise
-    except DeepAccidentError as error:
-        return Failure(str(error))
-    return None
+    except ResultsError as error:
+        if isinstance(error.__cause__, OSError):
+            raise error.__cause__ from None
+        raise
 
 
-def _join(whole: ResultsWriter, jobs: Sequence[_Job]) -> None:
-    """Write the results of all scenarios as one; raises UnfinishedError if some are missing."""
-    there = chain.from_iterable(job.tokens for job in jobs if job.path.exists())
-    check_whole(list(chain.from_iterable(job.tokens for job in jobs)), set(there), whole.path)
+def _join(whole: ResultsWriter, jobs: Mapping[str, _Job], tokens: Sequence[str]) -> None:
+    """Write the results of all scenarios as one."""
+    kept = {scenario: read_results(job.path) for scenario, job in jobs.items()}
     with whole:
-        for job in jobs:
-            results = read_results(job.path)
-            for token in job.tokens:
-                whole.add(token, results.prediction(token))
+        for token in tokens:
+            whole.add(token, kept[token.rsplit("/", 2)[0]].prediction(token))

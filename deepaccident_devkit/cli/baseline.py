@@ -5,7 +5,7 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, predict_results
-from deepaccident_devkit.baselines.predict_results import is_predicted, samples_by_scenario
+from deepaccident_devkit.baselines.predict_results import is_predicted
 from deepaccident_devkit.cli.evaluate_options import purpose_parameter, scope_parameter
 from deepaccident_devkit.cli.options import (
     LINK_OPTIONS,
@@ -15,17 +15,14 @@ from deepaccident_devkit.cli.options import (
     link_of,
     link_parameters,
     names_or_configuration,
-    part_parameters,
     refuse_unused,
     release_parameters,
-    say_part_done,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
-from deepaccident_devkit.parallel import Part, Shard, mine
 
 _ALONE = "single"
 _RELEASED_HORIZON = Baseline().horizon
@@ -38,7 +35,6 @@ def baseline() -> None:
 
 @baseline.command()
 @release_parameters
-@part_parameters
 @click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
 @click.option(
     "--task",
@@ -77,7 +73,6 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
         refuse_unused("without --pose-noise or --packet-loss", "seed")
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
-    part: Part = options.pop("part")
     chosen = Baseline(link=link, **{name: options.pop(name) for name in ("agents", "model", "horizon")})
     folder = writable_folder(out)
     dataset = DeepAccident(**options)
@@ -85,14 +80,10 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     tokens = dataset.samples(split, purpose, "released" if released else "paper", horizon=chosen.horizon, scope=scope)
     if not tokens:
         raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
-    run = {**engine_of(options), "part": part, "progress": True}
+    run = {**engine_of(options), "progress": True}
     wanted = [task for task in get_args(ResultsTask) if task in tasks or "all" in tasks]
     for task in wanted:
         path = folder / RESULTS_NAMES[task]
         kept = is_predicted(dataset, task, tokens, path, chosen)
         predict_results(dataset, task, tokens, path, chosen, **run)
-        if kept or not isinstance(part, Shard):
-            click.echo(f"{task}: {len(tokens):,} samples in {path}{', which were there already' if kept else ''}")
-    if isinstance(part, Shard):
-        own = mine(part, samples_by_scenario(tokens))
-        say_part_done(part, f"{sum(map(len, own)):,} samples of {len(own):,} scenarios, {', '.join(wanted)}")
+        click.echo(f"{task}: {len(tokens):,} samples in {path}{', which were there already' if kept else ''}")

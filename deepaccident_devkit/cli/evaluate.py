@@ -1,7 +1,8 @@
 """`deepaccident evaluate motion|accident|detection|warning`: the metrics of a results file, on a release."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,8 @@ from deepaccident_devkit.cli.evaluate_options import (
 from deepaccident_devkit.cli.options import (
     WordChoice,
     engine_of,
-    part_parameters,
     refuse_unused,
     release_parameters,
-    say_part_done,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -35,7 +34,8 @@ from deepaccident_devkit.evaluation.runs import (
     breakdowns_of,
     checked_target,
     evaluate_results,
-    evaluate_shard,
+    evaluation_store,
+    read_bundle,
     save_run,
     summary_text,
     with_prevented,
@@ -44,7 +44,7 @@ from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_thres
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
-from deepaccident_devkit.parallel import MERGE, Part, Shard
+from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.render.evaluation import save_report
 
 _HELP = {
@@ -106,7 +106,6 @@ def _task_verb(task: TaskName) -> click.Command:
         task, help=f"{_HELP[task]}\n\nThe predictions are compared with the labels of the release in DATAROOT."
     )
     @release_parameters
-    @part_parameters
     @click.option(
         "--results", required=True, type=click.Path(path_type=Path), help="Results file or folder with the predictions."
     )
@@ -161,11 +160,9 @@ def _task_verb(task: TaskName) -> click.Command:
     return verb
 
 
-def _evaluate(
-    setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, part: Part, **options: Any
-) -> None:
+def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any) -> None:
     out: Path | None = options["out"]
-    _refuse_unused(setup, options, part)
+    _refuse_unused(setup, options)
     if out is not None:
         checked_target(out, overwrite=options["overwrite"])  # before the release is indexed
     opened = read_results(results)
@@ -174,36 +171,45 @@ def _evaluate(
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})
-    engine = engine_of(options)
-    how = {**engine, "allow_partial": options["allow_partial"], "out": out, "progress": True}
-    if isinstance(part, Shard):
-        counted = evaluate_shard(dataset, opened, setup, selection, part, **how)
-        say_part_done(part, f"{len(counted)} samples", err=as_json)
-        return
-    run = evaluate_results(dataset, opened, setup, selection, merge=part == MERGE, **how)
-    resampling = Resampling(resamples=options["resamples"])
-    run = run.broken_down((EVERYTHING, *(by or breakdowns_of(setup.task))), resampling, **engine)
-    if options.get("prevented"):
-        run = with_prevented(run, dataset, resampling, progress=True, **engine)
-    text = ""
-    if options["sanity"]:
-        run, text = _with_sanity(run, dataset, opened, options)
-    if out is not None:
-        report = partial(save_report, run, dataset=dataset, results=opened)
-        kept = {name: options[name] for name in ("include_results", "overwrite")}
-        out = save_run(run, out, **kept, extras=[report])
-    summary = run.summary()
+    asked = {name: str(each) for name, each in options.items() if name not in ("workers", "executor")}
+    command = digest_of({"setup": setup.as_dict(), "results": opened.fingerprint, "by": by, "options": asked})
+    with nullcontext() if out is None else evaluation_store(out, command).shared() as turn:
+        if out is not None:
+            checked_target(out, overwrite=options["overwrite"])  # of another process, which has just ended
+        how = {**engine_of(options), "allow_partial": options["allow_partial"], "out": out, "progress": True}
+        run = evaluate_results(dataset, opened, setup, selection, **how)
+        if turn is None or out is None or turn.alone():
+            summary, text = _written(run, dataset, opened, by, options)
+        else:  # another process with the same command has written it
+            summary, text = read_bundle(out).summary, ""
     shown = summary_text(summary, by or SHOWN_BREAKDOWNS)
     click.echo(json.dumps(summary, indent=1) if as_json else f"{shown}\n\n{text}".strip())
     if out is not None:
         click.echo(f"written: {out}", err=as_json)
 
 
-def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any], part: Part) -> None:
+def _written(
+    run: EvaluationRun, dataset: DeepAccident, results: Results, by: tuple[str, ...], options: dict[str, Any]
+) -> tuple[Mapping[str, Any], str]:
+    """Complete a run, and save it where that is asked for; its summary, and the text of the sanity check."""
+    engine = engine_of(options)
+    resampling = Resampling(resamples=options["resamples"])
+    run = run.broken_down((EVERYTHING, *(by or breakdowns_of(run.setup.task))), resampling, **engine)
+    if options.get("prevented"):
+        run = with_prevented(run, dataset, resampling, progress=True, **engine)
+    text = ""
+    if options["sanity"]:
+        run, text = _with_sanity(run, dataset, results, options)
+    if options["out"] is not None:
+        report = partial(save_report, run, dataset=dataset, results=results)
+        kept = {name: options[name] for name in ("include_results", "overwrite")}
+        save_run(run, options["out"], **kept, extras=[report])
+    return run.summary(), text
+
+
+def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
     """End with a usage error if an option was given that changes nothing in this evaluation, or lacks another."""
     if options["out"] is None:
-        if part is not None:
-            raise click.UsageError("--shard and --merge keep their counts beside the folder --out; give it")
         refuse_unused("without --out", "overwrite", "include_results")
     if options.get("threshold_from") is None:
         refuse_unused("without --threshold-from", "threshold_by")

@@ -11,13 +11,11 @@ from deepaccident_devkit.cli.options import (
     agent_names,
     agents_parameter,
     engine_of,
-    part_parameters,
     release_parameters,
     where_parameter,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.export.bulk import Exported, Format, Link, Plan, export_release
-from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.text import size_text
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
@@ -39,13 +37,13 @@ _LINK = click.option(
 
 
 def bulk_parameters(verb: Verb, agents: Callable[[Verb], Verb] = agents_parameter) -> Verb:
-    """Give a verb the arguments of a release and of parts, --out, --split, --where, --agents and --dry-run.
+    """Give a verb the arguments of a release, --out, --split, --where, --agents and --dry-run.
 
     `agents` gives the verb --agents, if it means something of its own.
     """
     for option in reversed((*_OPTIONS, agents, _DRY_RUN)):
         verb = option(verb)
-    return release_parameters(part_parameters(verb))
+    return release_parameters(verb)
 
 
 def export_parameters(verb: Verb) -> Verb:
@@ -66,14 +64,12 @@ def run_export(
     **options: Any,
 ) -> Exported:
     """Export in a format with its `own` settings; says how much it will be, then what was written and left out."""
-    part: Part = options.pop("part")
     form = kind(split=split, where=where, agents=agent_names(agents), link=link, **own)  # before the release is indexed
     done = export_release(
         DeepAccident(**options),
         out,
         form,
         **engine_of(options),
-        part=part,
         progress=True,
         dry_run=dry_run,
         on_plan=_say_plan,
@@ -82,9 +78,8 @@ def run_export(
         return done
     tally = done.tally
     linked = ", ".join(f"{count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
-    whose = f"part {part} of " if isinstance(part, Shard) else ""
     click.echo(
-        f"{whose}{done.folder}: {tally.files:,} files written ({size_text(tally.bytes)})"
+        f"{done.folder}: {tally.files:,} files written ({size_text(tally.bytes)})"
         f"{f', {linked}' if linked else ''}; {done.written} written now, {done.kept} were there already"
     )
     for what, count in sorted(tally.left_out.items()):

@@ -68,7 +68,7 @@ def mmdet3d(style: str, root_prefix: str, *, drop_empty: bool, **options: Any) -
         run_export(ReleasedInfos, {"root_prefix": root_prefix, "drop_empty": drop_empty}, **options)
         return
     refuse_unused("without --style released", "root_prefix", "drop_empty")
-    for kind in (NuScenes, Mmdet3d) if options["part"] is None else (Mmdet3d,):
+    for kind in (NuScenes, Mmdet3d):
         run_export(kind, own, **options)
 
 

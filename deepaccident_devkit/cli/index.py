@@ -6,18 +6,10 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli.groups import VerbGroup
-from deepaccident_devkit.cli.options import (
-    DATAROOT,
-    WordChoice,
-    engine_of,
-    part_parameters,
-    release_parameters,
-    say_part_done,
-)
-from deepaccident_devkit.parallel import Part, Shard
+from deepaccident_devkit.cli.options import DATAROOT, WordChoice, engine_of, release_parameters
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
-from deepaccident_devkit.tables import Tables, clear_index, index_report, index_shard, open_index, open_merged_index
+from deepaccident_devkit.tables import Tables, clear_index, index_report, open_index
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
 
 _check = click.option(
@@ -27,19 +19,12 @@ _check = click.option(
 
 @click.group(cls=VerbGroup)
 @release_parameters
-@part_parameters
 @_check
-def index(dataroot: Dataroot, version: str, on_error: OnError, check: bool, part: Part, **options: Any) -> None:
+def index(dataroot: Dataroot, version: str, on_error: OnError, check: bool, **options: Any) -> None:
     """Make or update the index of the release in DATAROOT, and print where it is."""
     engine = {**engine_of(options), "progress": True}
     layout = find_release(open_dataroot(dataroot, options["index_dir"], refresh=True, **engine), version)
-    how = {**options, "check_files": check, "progress": True}
-    if isinstance(part, Shard):
-        done = index_shard(layout, part, **how)
-        broken = sum(bool(each.messages) for each in done)
-        say_part_done(part, f"{len(done)} scenarios, {broken} of them broken")
-        return
-    made = (open_index if part is None else open_merged_index)(layout, on_error=on_error, **how)
+    made = open_index(layout, on_error=on_error, check_files=check, progress=True, **options)
     tables = Tables(made.tables_folder)
     counts = ", ".join(f"{len(tables.table(name)):,} {name}s" for name in ("scenario", "sample", "annotation"))
     click.echo(f"{made.tables_folder}: {counts}")

@@ -10,10 +10,8 @@ from deepaccident_devkit.cli.options import (
     agent_names,
     agents_parameter,
     engine_of,
-    part_parameters,
     refuse_unused,
     release_parameters,
-    say_part_done,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
@@ -23,7 +21,6 @@ from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.label_folder import Manifest, folder_path
 from deepaccident_devkit.motion.protocols import slip_names
 from deepaccident_devkit.motion.sample_lists import Purpose
-from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.v2x import AGENT_SETS
 
 _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "only_vehicle")
@@ -31,7 +28,6 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
 
 @click.command()
 @release_parameters
-@part_parameters
 @click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (.txt).")
 @click.option(
     "--out",
@@ -87,7 +83,6 @@ def labels(
     config = _config(options)
     chosen = agent_names(agents)
     Manifest.of(folder_path(out), config, names)  # before the release is indexed
-    part: Part = options.pop("part")
     dataset = DeepAccident(**options)
     tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
     if not tokens:
@@ -99,14 +94,9 @@ def labels(
         config,
         names=names,
         **engine_of(options),
-        part=part,
         progress=True,
     )
-    told = f"{done.samples:,} samples in {out}: {done.written} files written, {done.kept} were there already"
-    if isinstance(part, Shard):
-        say_part_done(part, told)
-    else:
-        click.echo(told)
+    click.echo(f"{done.samples:,} samples in {out}: {done.written} files written, {done.kept} were there already")
 
 
 def _config(options: dict[str, Any]) -> MotionLabelConfig:

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import click
 from click.core import ParameterSource
 
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.parallel import MERGE, Part, Shard, cluster_executor
+from deepaccident_devkit.parallel import cluster_executor
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
 from deepaccident_devkit.text import choice, meant_text
 from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE, Link
@@ -138,37 +137,9 @@ def engine_parameters(verb: Verb) -> Verb:
     return cast("Verb", run)
 
 
-def part_parameters(verb: Verb) -> Verb:
-    """Give a verb `part`: what --shard and --merge ask for (`parallel.Part`)."""
-
-    @functools.wraps(verb)
-    def run(*arguments: Any, shard: Part, merge: bool, **options: Any) -> Any:
-        if merge and shard is not None:
-            raise click.UsageError("--merge puts all shards together; leave --shard out")
-        return verb(*arguments, part=MERGE if merge else shard, **options)
-
-    options = (
-        click.option(
-            "--shard",
-            callback=_shard,
-            metavar="K/N",
-            help="Do part K of N, for job arrays: run all N, then the same command with --merge.",
-        ),
-        click.option("--merge", is_flag=True, help="Put together what all shards made."),
-    )
-    for option in reversed(options):
-        run = option(run)
-    return cast("Verb", run)
-
-
 def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
     """Of a verb's options, those that say what it runs on."""
     return {name: options[name] for name in ("workers", "executor")}
-
-
-def say_part_done(part: Shard, what: str, *, err: bool = False) -> None:
-    """Say what a shard has done, and what comes after all of them."""
-    click.echo(f"part {part}: {what}; next: the same with --merge", err=err)
 
 
 def write_report(report: Any, folder: Path | None, name: str) -> list[Path]:
@@ -185,13 +156,6 @@ def say_report(report: Any, written: Sequence[Path], folder: Path | None, *, as_
     click.echo(report.to_json() if as_json else report.to_text())
     if folder is not None:
         click.echo(f"written: {len(written)} files in {folder}", err=as_json)
-
-
-def _shard(context: click.Context, parameter: click.Parameter, value: str | None) -> Shard | None:
-    try:
-        return None if value is None else Shard.parse(value)
-    except ChoiceError as error:
-        raise click.BadParameter(str(error), context, parameter) from error
 
 
 def files_parameters(verb: Verb) -> Verb:

@@ -9,13 +9,10 @@ import click
 from deepaccident_devkit.cli.options import (
     WordChoice,
     engine_parameters,
-    part_parameters,
     pixel_size,
     refuse_unused,
-    say_part_done,
 )
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.parallel import Shard
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.checking import checked_text
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE, Sensors
@@ -26,7 +23,7 @@ from deepaccident_devkit.taxonomy import Layout
 _DEFAULTS = SynthConfig()
 _OF_FILES = (
     *("scenarios", "image_size", "layout", "sensors", "unlabelled_test", "exact", "for_released_code"),
-    *("unplanned", "workers", "scheduler", "scheduler_file", "shard", "merge"),
+    *("unplanned", "workers", "scheduler", "scheduler_file"),
 )
 """Options of what is written."""
 _FAULTY = 1
@@ -128,7 +125,6 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     help="hidden: a house at the corner hides the two vehicles that will collide from each other.",
 )
 @engine_parameters
-@part_parameters
 @click.option(
     "--list-designs",
     is_flag=True,
@@ -151,7 +147,7 @@ def synth(context: click.Context, /, out: Path | None, *, check: bool, **options
 
     If a run is interrupted, the same command continues it.
     """
-    how = {name: options.pop(name) for name in ("workers", "executor", "part")}
+    how = {name: options.pop(name) for name in ("workers", "executor")}
     if check:
         _check(context, out, options)
         return
@@ -163,10 +159,6 @@ def synth(context: click.Context, /, out: Path | None, *, check: bool, **options
     if config.sensors == "none" and not has_embree():
         click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
     made = make_release(out, config, progress=True, **how)
-    if isinstance(how["part"], Shard):
-        own = len(how["part"].of(range(config.scenarios)))
-        say_part_done(how["part"], f"{own} of {config.scenarios} scenarios")
-        return
     scenarios = f"{config.scenarios} scenario{'s' if config.scenarios > 1 else ''}"
     frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"
     click.echo(f"{made}: {scenarios}{frames} with five agents, layout {config.layout}")

@@ -6,22 +6,20 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import files_parameters, part_parameters, refuse_unused, say_part_done
-from deepaccident_devkit.parallel import Part, Shard
+from deepaccident_devkit.cli.options import files_parameters, refuse_unused
 from deepaccident_devkit.release.store import Dataroot
-from deepaccident_devkit.validation import merged_validation, release_completeness, validate_release, validation_shard
+from deepaccident_devkit.validation import release_completeness, validate_release
 
 _FINDINGS_STATUS = 1
 
 
 @click.command()
 @files_parameters
-@part_parameters
 @click.option(
     "--parts",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Folder to keep what is found in each scenario: the same command then goes on, and shards meet there.",
+    help="Folder to keep what is found in each scenario: the same command then goes on, and several share the work.",
 )
 @click.option(
     "--files",
@@ -43,8 +41,6 @@ def validate(
     notes: bool,
     whole: bool,
     as_json: bool,
-    part: Part,
-    parts: Path | None,
     **how: Any,
 ) -> None:
     """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
@@ -55,23 +51,14 @@ def validate(
     """
     how |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
     if files:
-        refuse_unused("with --files, which opens no file", "deep", "notes", "whole", "parts", "shard", "merge")
+        refuse_unused("with --files, which opens no file", "deep", "notes", "whole", "parts")
         del how["deep"]
         counted = release_completeness(dataroot, **how)
         click.echo(counted.to_json() if as_json else counted.to_text())
         return
     if as_json:
         refuse_unused("with --json, which has all findings and notes", "notes", "whole")
-    if part is None:
-        report = validate_release(dataroot, parts=parts, **how)
-    elif parts is None:
-        raise click.UsageError("--shard and --merge need a folder, in which the parts lie; give --parts FOLDER too")
-    elif isinstance(part, Shard):
-        done = validation_shard(dataroot, part, parts, **how)
-        say_part_done(part, f"{len(done)} scenarios")
-        return
-    else:
-        report = merged_validation(dataroot, parts, **how)
+    report = validate_release(dataroot, **how)
     click.echo(report.to_json() if as_json else report.to_text(notes=notes, whole=whole))
     if not report.is_good:
         sys.exit(_FINDINGS_STATUS)

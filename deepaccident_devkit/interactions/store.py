@@ -10,12 +10,14 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.files import place_in
 from deepaccident_devkit.interactions.config import InteractionConfig
 from deepaccident_devkit.interactions.records import interaction_specs
 from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names
+from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.tables.columns import NULL_INTEGER
-from deepaccident_devkit.tables.streams import read_streams, streams_metadata, whole_streams, write_streams
+from deepaccident_devkit.tables.streams import read_streams, streams
 
 logger = logging.getLogger(__name__)
 
@@ -26,22 +28,17 @@ VERSION: Final = "1"
 
 def kept_path(dataset: Dataset, scenario: str) -> Path:
     """Where the interactions of a scenario are kept; raises OutputFolderError if that is behind a link."""
-    return place_in(dataset.tables_folder, f"{FOLDER}/{scenario}.arrow")
+    return _store(dataset).path(scenario)
 
 
 def read_kept(dataset: Dataset, scenario: str, config: InteractionConfig) -> Interactions | None:
     """The kept interactions of a scenario; None if there are none of this version, or the file is damaged."""
     import pyarrow as pa
 
-    content = whole_streams(kept_path(dataset, scenario))
+    content = _store(dataset).kept(scenario, _key(config), "index")
     if content is None:
         return None
-    try:
-        if streams_metadata(content) != _metadata(config):
-            return None
-        tables = read_streams(pa.BufferReader(content), list(interaction_specs().values()))
-    except (pa.ArrowException, ValueError):
-        return None
+    tables = read_streams(pa.BufferReader(content), list(interaction_specs().values()))
     return None if tables is None else _from_columns(dataset, scenario, config, tables)
 
 
@@ -49,17 +46,23 @@ def keep(dataset: Dataset, found: Interactions) -> bool:
     """Write the file of a scenario's interactions; whether that could be done."""
     if not dataset.tables_folder.is_dir():  # made again meanwhile
         return False
-    tables = list(zip(interaction_specs().values(), _to_columns(dataset, found), strict=True))
+    content = streams(list(zip(interaction_specs().values(), _to_columns(dataset, found), strict=True)))
     try:
-        write_streams(kept_path(dataset, found.scenario), tables, _metadata(found.config))
+        _store(dataset).keep(found.scenario, _key(found.config), content)
     except OSError as error:
         logger.debug("%s: interactions are not kept: %s", found.scenario, error)
         return False
     return True
 
 
-def _metadata(config: InteractionConfig) -> dict[str, str]:
-    return {"version": VERSION, "config": repr(config)}
+def _store(dataset: Dataset) -> Store:
+    """Nobody locks it: two processes write the same file, one after the other."""
+    folder = place_in(dataset.tables_folder, FOLDER, opened=True)
+    return Store(folder, folder, "keeps interactions", IndexStoreError)
+
+
+def _key(config: InteractionConfig) -> str:
+    return f"{VERSION} {config!r}"
 
 
 def _to_columns(dataset: Dataset, found: Interactions) -> list[dict[str, Any]]:

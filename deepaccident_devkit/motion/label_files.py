@@ -11,11 +11,12 @@ import hashlib
 import os
 import zipfile
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 
@@ -27,28 +28,19 @@ from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.label_folder import (
     FORMAT_VERSION,
+    MANIFEST,
     Manifest,
     batch_path,
     folder_path,
     label_path,
-    writing_to,
+    label_store,
+    remove_half_written,
 )
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.motion.stored_labels import StoredLabels, write_array
-from deepaccident_devkit.parallel import (
-    MERGE,
-    Failure,
-    Part,
-    Places,
-    Shard,
-    Tried,
-    check_failures,
-    check_whole,
-    mine,
-    part_of,
-    run_batch,
-)
+from deepaccident_devkit.parallel import Places
+from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
 from deepaccident_devkit.text import choice
@@ -67,7 +59,7 @@ class LabelsWritten:
     """What `write_label_files` did.
 
     Attributes:
-        samples: how many of the requested samples, or of those of the part, the folder now holds.
+        samples: how many of the requested samples the folder now holds.
         written: files made.
         kept: files that were there already and hold the same.
     """
@@ -77,7 +69,7 @@ class LabelsWritten:
     kept: int
 
 
-def write_label_files(  # noqa: PLR0913 - what, where, on what, and which part
+def write_label_files(
     dataset: Dataset,
     folder: str | os.PathLike[str],
     tokens: Iterable[RowArgument],
@@ -86,13 +78,13 @@ def write_label_files(  # noqa: PLR0913 - what, where, on what, and which part
     names: BatchNames | None = None,
     workers: int | None = None,
     executor: Executor | None = None,
-    part: Part | str = None,
     progress: bool = False,
 ) -> LabelsWritten:
     """Write the motion labels of samples into a folder, one file for each scenario and agent.
 
-    Files are complete or absent. If a call is interrupted, the same call continues it. Samples can be added later;
-    files are written again if the release has changed in the meantime.
+    Files are complete or absent. If a call is interrupted, the same call continues it; several processes that make the
+    same call share the scenarios. Samples can be added later; files are written again if the release has changed in the
+    meantime.
 
     Args:
         dataset: the release.
@@ -103,8 +95,6 @@ def write_label_files(  # noqa: PLR0913 - what, where, on what, and which part
             its own, some 0.1 MB, for loops with numpy alone; None writes files for `LabelFiles`, 25 times smaller.
         workers: processes; None chooses by the amount of work.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        part: `3/8` for the scenarios of the third of eight parts (docs/clusters.md), whose samples the folder does not
-            list yet; `merge` to list all once they are there.
         progress: whether to show a bar.
 
     Raises:
@@ -112,49 +102,40 @@ def write_label_files(  # noqa: PLR0913 - what, where, on what, and which part
         LabelFilesError: the folder holds something else, its manifest cannot be read, or it cannot be written to.
         OutputFolderError: a link in the folder leads out of it; nothing is written there.
         TokenError: no such sample.
-        ChoiceError: no sample at all, or no such agent, configuration of agents, code, or part.
+        ChoiceError: no sample at all, or no such agent, configuration of agents, or code.
         NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
         SomeFailedError: labels of some samples cannot be made; the others are written, and the same call continues.
-        UnfinishedError: `part` is `merge`, and some files are missing, or were made from something else.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    root, chosen, part = folder_path(folder), label_config(config), part_of(part)
+    root, chosen = folder_path(folder), label_config(config)
     names = choice("names", names, (*get_args(BatchNames), None))
     wanted = _by_recording(dataset, tokens)
     _check_agents(dataset, wanted, chosen)
     Manifest.of(root, chosen, names)
-    own = set(mine(part, list(dict.fromkeys(map(_scenario, wanted)))))
-    wanted = {recording: frames for recording, frames in wanted.items() if _scenario(recording) in own}
-    with writing_to(root, shared=isinstance(part, Shard)):
+    store = label_store(root, digest_of({"config": chosen.digest, "names": names, "samples": wanted}))
+    with store.shared(tidy=partial(remove_half_written, root)) as turn:
         manifest = Manifest.of(root, chosen, names)
-        manifest.write(root)
-        work = _Work(dataset, root, manifest.config, names, merge=part == MERGE)
+        if not (root / MANIFEST).exists():
+            manifest.write(root)
         files = {
             recording: _with_kept(dataset, root, recording, frames, manifest) for recording, frames in wanted.items()
         }
-        results = run_batch(
-            Tried(work.write),
-            list(files.items()),
+        made = store.run(
+            _Work(dataset, root, manifest.config, names).write,
+            {recording: (recording, frames) for recording, frames in files.items()},
             workers=workers,
             executor=executor,
             label="motion labels",
             progress=progress,
             places=Places(reads=dataset.places, writes=(root,)),
         )
-        made = _checked(list(files), results, root)
-        if not isinstance(part, Shard):
+        if turn.alone():
+            manifest = Manifest.of(root, chosen, names)
             manifest.samples.update({recording: list(frames) for recording, frames in files.items()})
             manifest.write(root)
-    return LabelsWritten(samples=sum(map(len, wanted.values())), written=sum(made), kept=len(made) - sum(made))
-
-
-def _checked(recordings: Sequence[str], results: Sequence[_Files | Failure], root: Path) -> list[bool]:
-    """Whether each file was written now; raises SomeFailedError or UnfinishedError if not all are there."""
-    check_failures(zip(recordings, results, strict=True), str(root))
-    files = {name: new for result in results if not isinstance(result, Failure) for name, new in result.items()}
-    made = {name: new for name, new in files.items() if new is not None}
-    check_whole(list(files), made, root)
-    return list(made.values())
+            store.remove()
+    each = [new for files_made in made.values() for new in files_made]
+    return LabelsWritten(samples=sum(map(len, wanted.values())), written=sum(each), kept=len(each) - sum(each))
 
 
 class LabelFiles(Mapping[str, MotionLabels]):
@@ -253,10 +234,6 @@ class LabelFiles(Mapping[str, MotionLabels]):
         return archive
 
 
-_Files: TypeAlias = dict[str, bool | None]
-"""Name in the folder → whether the file was written now, or was there already; None if it is to be there and is not."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Work:
     """What workers do; cheap to pickle."""
@@ -265,10 +242,9 @@ class _Work:
     root: Path
     config: MotionLabelConfig
     names: BatchNames | None
-    merge: bool
 
-    def write(self, task: tuple[str, tuple[int, ...]]) -> _Files:
-        """Write the files of one scenario and agent, with labels of these frames; none if they are to be there."""
+    def write(self, task: tuple[str, tuple[int, ...]]) -> list[bool]:
+        """Write the files of one scenario and agent, with labels of these frames; whether each was written now."""
         recording, frames = task
         source = self._source(recording, frames)
         paths = (
@@ -276,17 +252,12 @@ class _Work:
             if self.names is None
             else {batch_path(self.root, recording, frame): (frame,) for frame in frames}
         )
-        return {
-            path.relative_to(self.root).as_posix(): self._write_file(path, recording, each, source)
-            for path, each in paths.items()
-        }
+        return [self._write_file(path, recording, each, source) for path, each in paths.items()]
 
-    def _write_file(self, path: Path, recording: str, frames: tuple[int, ...], source: str) -> bool | None:
+    def _write_file(self, path: Path, recording: str, frames: tuple[int, ...], source: str) -> bool:
         """Write one file, unless it is there; a batch has its code's arrays alone, its source is the zip's comment."""
         if _source_of(path, self.names) == source:
             return False
-        if self.merge:
-            return None
         place = place_in(self.root, path.relative_to(self.root))
         with replacing(place) as temporary, zipfile.ZipFile(temporary, "w") as archive:
             if self.names is None:

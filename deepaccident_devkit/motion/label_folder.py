@@ -1,21 +1,22 @@
-"""A folder of motion labels: its manifest, which fixes the configuration, and its lock (schema/motion_labels.md)."""
+"""A folder of motion labels: its manifest, which fixes the configuration (schema/motion_labels.md)."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, get_args
 
-from deepaccident_devkit.errors import ConfigError, DeepAccidentError, LabelFilesError
-from deepaccident_devkit.files import held_lock, path_of, place_in, temporary_of, write_bytes
+from deepaccident_devkit.errors import ConfigError, LabelFilesError
+from deepaccident_devkit.files import path_of, place_in, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.reading import check_size, fault_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -25,7 +26,7 @@ FORMAT_VERSION: Final = 1
 MANIFEST: Final = "manifest.json"
 _CELL_BYTES: Final = 16
 """Of the maps of a sample, in memory, at least."""
-_LOCK: Final = ".lock"
+_UNFINISHED: Final = ".unfinished"
 _WRITTEN: Final = re.compile(rf"{re.escape(MANIFEST)}|({'|'.join(AGENTS)}|\d{{3}})\.npz")
 _RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]{{1,255}}/(?!\.)[^/\\\0]{{1,255}}/({'|'.join(AGENTS)})")
 
@@ -118,34 +119,9 @@ class Manifest:
         write_bytes(root / MANIFEST, f"{lists_in_a_line}\n".encode())
 
 
-@contextmanager
-def writing_to(root: Path, *, shared: bool = False) -> Iterator[None]:
-    """Hold the lock of a folder while labels are written into it; make it, and remove what killed processes left.
-
-    The system releases the lock when the process ends, even if it is killed. Those who share it write different files,
-    and leave the removing to one who has it alone.
-
-    Raises:
-        LabelFilesError: the folder cannot be made, locked or written to.
-        OutputFolderError: its lock is a link.
-    """
-    path = place_in(root, _LOCK, opened=True)
-    try:
-        lock = held_lock(path, "writes labels", shared=shared)
-    except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
-        raise LabelFilesError(f"{root}: no labels can be written there ({error}); choose another folder") from error
-    tidy = (lambda _: None) if shared else _remove_half_written
-    try:
-        tidy(root)
-        yield
-    except DeepAccidentError:
-        raise
-    except OSError as error:
-        remedy = "make room there, or choose another folder, and run it again"
-        raise LabelFilesError(f"{root}: labels cannot be written ({error}); {remedy}") from error
-    finally:
-        tidy(root)
-        lock.release()
+def label_store(root: Path, command: str) -> Store:
+    """What keeps others from writing the same labels into a folder; `command` says which labels are written."""
+    return Store(place_in(root, _UNFINISHED, opened=True), root, "writes labels", LabelFilesError, command)
 
 
 def folder_path(folder: str | os.PathLike[str]) -> Path:
@@ -163,10 +139,10 @@ def batch_path(root: Path, recording: str, frame: int) -> Path:
     return root / recording / f"{frame:03d}.npz"
 
 
-def _remove_half_written(root: Path) -> None:
-    """Remove the temporary files of stopped processes; what cannot be removed stays until the next call.
+def remove_half_written(root: Path) -> None:
+    """Remove the temporary files of stopped processes, on whatever host; what cannot be removed stays.
 
-    The lock is held, so that no living process has one, on whatever host.
+    The caller has the store alone.
     """
     for folder, _, names in os.walk(root):  # follows no link
         for name in filter(_is_half_written, names):
@@ -175,8 +151,8 @@ def _remove_half_written(root: Path) -> None:
 
 
 def _is_own(name: str) -> bool:
-    """Whether a call that was killed before it wrote a manifest may have left a file of this name."""
-    return name == _LOCK or _is_half_written(name)
+    """Whether a call may have made a file of this name before it wrote a manifest, or has written it just now."""
+    return name in (_UNFINISHED, MANIFEST) or _is_half_written(name)
 
 
 def _is_half_written(name: str) -> bool:

@@ -1,4 +1,4 @@
-"""Bulk work: on this process, on others of this machine, or on any executor of `concurrent.futures`; or in shards.
+"""Bulk work: on this process, on others of this machine, or on any executor of `concurrent.futures`; and its store.
 
 Every function that works on many scenarios or samples takes `workers` and `executor`; none has a pool of its own.
 """
@@ -8,34 +8,19 @@ from deepaccident_devkit.parallel.calls import Places
 from deepaccident_devkit.parallel.executors import cluster_executor
 from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
 from deepaccident_devkit.parallel.pool import own_threads
-from deepaccident_devkit.parallel.shard import (
-    MERGE,
-    Part,
-    Shard,
-    ShardFiles,
-    check_whole,
-    mine,
-    part_of,
-    unfinished_folder,
-)
+from deepaccident_devkit.parallel.store import Store, unfinished_folder
 
 __all__ = [
-    "MERGE",
     "Engine",
     "Failure",
-    "Part",
     "Places",
     "Progress",
-    "Shard",
-    "ShardFiles",
+    "Store",
     "Tried",
     "check_failures",
-    "check_whole",
     "cluster_executor",
     "in_order",
-    "mine",
     "own_threads",
-    "part_of",
     "run_batch",
     "run_unordered",
     "unfinished_folder",

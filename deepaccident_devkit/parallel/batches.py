@@ -59,7 +59,7 @@ def run_batch(
     workers: int | None = None,
     executor: Executor | None = None,
     label: str = "",
-    progress: bool = False,
+    progress: Progress = False,
     places: Places | None = None,
 ) -> list[Result]:
     """Apply `work` to every item and return the results in the items' order.
@@ -71,7 +71,7 @@ def run_batch(
             alone if the work is too little for a pool or the caller is a worker itself.
         executor: any `concurrent.futures.Executor` to run on instead (a dask client's, MPI's, a thread pool).
         label: text of the progress bar.
-        progress: whether to show one.
+        progress: whether to show one; or a function, as of `run_unordered`.
         places: what the workers of an executor must see; checked before their first item.
 
     Raises:
@@ -99,8 +99,8 @@ def run_unordered(
     """Apply `work` to every item; yields each one's position and result as soon as it is ready.
 
     Closing the generator cancels what has not begun, and ends its own workers, as an interruption does. Arguments and
-    errors are those of `run_batch`, but `progress` may be a function, and `sizes` is how far each item moves the
-    progress bar; None for one step each.
+    errors are those of `run_batch`; `progress` may be a function that gets each item's share of the work, and `sizes`
+    is how far each item moves the progress bar; None for one step each.
     """
     from tqdm.auto import tqdm  # here: with asyncio and multiprocessing, a third of the package's import time
 

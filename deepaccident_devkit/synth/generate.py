@@ -1,17 +1,15 @@
-"""Making a synthetic release, as a whole or in shards."""
+"""Making a synthetic release."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import is_writable_folder, path_of, place_in
-from deepaccident_devkit.parallel import MERGE, Part, Places, Progress, Shard, check_whole, mine, part_of, run_unordered
+from deepaccident_devkit.parallel import Places, Progress
 from deepaccident_devkit.release.store.names import SPLIT_FILE_FOLDER
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios, plan_splits
@@ -32,13 +30,13 @@ def make_release(
     *,
     workers: int | None = None,
     executor: Executor | None = None,
-    part: Part | str = None,
     progress: Progress = False,
 ) -> Path:
     """Write a complete synthetic release; returns its folder.
 
     The release is made in a hidden folder beside `out`, `.NAME.unfinished`, and renamed when it is complete. After an
-    interruption (a full disk, a kill) the same call makes only what is still missing.
+    interruption (a full disk, a kill) the same call makes only what is still missing; several processes that make the
+    same call share the scenarios.
 
     Args:
         out: the folder to make; it must be empty, or not exist yet.
@@ -46,21 +44,19 @@ def make_release(
         workers: number of processes; several may record one scenario. With None the generator chooses. The files
             depend neither on it nor on interruptions.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        part: `3/8` records the scenarios of the third of eight parts (docs/clusters.md), and leaves them in the hidden
-            folder; `merge` makes the release of them once all are there.
         progress: whether to show a progress bar; or a function that is called after each part of the work, with its
             share of all that was to do.
 
     Raises:
         ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of another
-            configuration is there, or another process makes it; the scenario file cannot be read or simulated.
+            configuration is there; the scenario file cannot be read or simulated; or something cannot be written.
         OutputFolderError: a link in the hidden folder leads out of it; nothing is written there.
-        ChoiceError: there is no such part, or `workers` is less than 1.
+        ChoiceError: `workers` is less than 1.
         MissingExtraError: files of sensors are wanted and the package embreex is not installed.
-        UnfinishedError: `part` is `merge`, and some scenarios are not recorded.
+        SomeFailedError: some parts cannot be recorded; the others are, and the same call continues.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    wanted, part = config or SynthConfig(), part_of(part)
+    wanted = config or SynthConfig()
     out = path_of(out)
     check_free(out)
     if wanted.sensors != "none":
@@ -68,24 +64,27 @@ def make_release(
     plans = plan_scenarios(wanted)
     if not is_writable_folder(out.parent):
         raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
-    with unfinished_release(out, wanted, shared=isinstance(part, Shard)) as unfinished:
-        own = mine(part, plans)
-        count = workers or _worker_count(wanted, len(own))
+    unfinished = Unfinished(out.absolute())
+    with unfinished_release(unfinished, wanted) as alone:
+        count = workers or _worker_count(wanted, len(plans))
         draws = progress is True and count == 1 and executor is None
-        scenarios = [_parts(unfinished, wanted, plan, progress=draws) for plan in own]
-        if part == MERGE:
-            check_whole([name for parts in scenarios for name in parts], unfinished.made(), out)
-        recorded = _recorded(unfinished, scenarios, workers=count, executor=executor, progress=progress)
-        with closing(recorded):
-            for parts in recorded:
-                if not isinstance(part, Shard):
-                    unfinished.gather(parts)
-        if isinstance(part, Shard):
-            return out
-        splits = plan_splits(plans)
-        splits.save(unfinished.release, overwrite=True)
-        if wanted.for_released_code:
-            splits.save(place_in(unfinished.release, SPLIT_FILE_FOLDER, opened=True), overwrite=True)
+        parts = {
+            name: part for plan in plans for name, part in _parts(unfinished, wanted, plan, progress=draws).items()
+        }
+        places = Places(writes=(unfinished.folder,))
+        how: dict[str, Any] = {"workers": count, "executor": executor, "progress": progress}
+        try:
+            unfinished.store.run(_record, parts, label="recording", places=places, **how)
+        finally:
+            forget_scenario()
+        if alone():
+            unfinished.release.mkdir(exist_ok=True)
+            unfinished.gather(parts)
+            splits = plan_splits(plans)
+            splits.save(unfinished.release, overwrite=True)
+            if wanted.for_released_code:
+                splits.save(place_in(unfinished.release, SPLIT_FILE_FOLDER, opened=True), overwrite=True)
+            unfinished.complete()
     return out
 
 
@@ -110,44 +109,10 @@ def _parts(
     }
 
 
-def _recorded(
-    unfinished: Unfinished,
-    scenarios: Sequence[Mapping[str, _Part]],
-    *,
-    workers: int,
-    executor: Executor | None,
-    progress: Progress,
-) -> Generator[Mapping[str, _Part], None, None]:
-    """Record the parts that are not made yet; yields each scenario when all its parts are there."""
-    made = set(unfinished.made())
-    yield from (parts for parts in scenarios if made.issuperset(parts))
-    left = [(part, parts) for parts in scenarios for name, part in parts.items() if name not in made]
-    recorded = run_unordered(
-        _record,
-        [part for part, _ in left],
-        workers=workers,
-        executor=executor,
-        label="recording",
-        progress=progress,
-        places=Places(writes=(unfinished.folder,)),
-    )
-    try:
-        with closing(recorded):
-            for position, _ in recorded:
-                part, parts = left[position]
-                made.add(part.name)
-                if made.issuperset(parts):
-                    yield parts
-    finally:
-        forget_scenario()
-
-
 def _record(part: _Part) -> None:
     """Record a part, unless it is made."""
     unfinished, name = part.unfinished, part.name
-    with unfinished.alone(name):  # a worker that a scheduler took for lost may be at it still
-        if unfinished.is_made(name):
-            return
+    if not unfinished.is_made(name):
         unfinished.clear(name)
         record_scenario(part.job)
         unfinished.note(name)

@@ -6,31 +6,43 @@ Several processes and hosts may record parts of its scenarios at once. One that 
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import held_lock, place_in, remove_in, temporary_of, write_bytes
+from deepaccident_devkit.files import place_in, remove_in, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.synth.config import SynthConfig
 
-_CONFIG_FILE, _CONFIG_LOCK, _LOCK = "config.json", ".config.lock", ".lock"
+_CONFIG_FILE = "config.json"
+_MADE = "made"
 
 
 @dataclass(frozen=True, slots=True)
 class Unfinished:
-    """The folder of a release that is being made; cheap to pickle.
+    """The hidden folder of a release that is being made; cheap to pickle.
 
     Attributes:
-        folder: hidden, beside the place that the release will have.
+        out: the place that the release will have; absolute.
     """
 
-    folder: Path
+    out: Path
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies; raises OutputFolderError if it is a link."""
+        return place_in(self.out.parent, f".{self.out.name}.unfinished", opened=True)
+
+    @property
+    def store(self) -> Store:
+        """What says which parts are made, and keeps others from recording the same."""
+        return Store(self.folder, self.out, "makes the release", ConfigError)
 
     @property
     def release(self) -> Path:
@@ -41,40 +53,19 @@ class Unfinished:
         """Where a part of a scenario is recorded, as in a release of its own."""
         return place_in(self.folder, f"parts/{name}", opened=True)
 
-    @contextmanager
-    def alone(self, name: str) -> Iterator[None]:
-        """Keep other processes and hosts from recording the same part in the block.
-
-        Raises:
-            ConfigError: nobody makes the release any more.
-        """
-        self._check_there()
-        lock = held_lock(self._locks / name, f"records {name}")
-        try:
-            yield
-        finally:
-            lock.release()
-
     def clear(self, name: str) -> None:
         """Remove the incomplete files of a part that was interrupted."""
         remove_in(self.folder, f"parts/{name}")
 
     def is_made(self, name: str) -> bool:
         """Whether a part is complete."""
-        return self._note(name).exists()
-
-    def made(self) -> frozenset[str]:
-        """Names of the complete parts."""
-        return frozenset(path.name for path in self._note("").glob("*"))
-
-    def is_at_hand(self) -> bool:
-        """Whether a part is being recorded, perhaps by a worker whose caller was stopped."""
-        return any(map(_is_held, self._locks.glob("*")))
+        return self.store.kept(name, _MADE) is not None
 
     def note(self, name: str) -> None:
         """Remember that a part is complete; raises ConfigError if it was removed meanwhile."""
-        self._check_there()
-        write_bytes(self._note(name), b"")
+        if not (self.folder / _CONFIG_FILE).exists():
+            raise ConfigError(f"{self.folder}: was removed while parts of the release were recorded; make it again")
+        self.store.keep(name, _MADE, b"")
 
     def gather(self, names: Iterable[str]) -> None:
         """Move the files of a scenario's parts into the release, if they are not there yet."""
@@ -82,81 +73,49 @@ class Unfinished:
             if self.part(name).is_dir():
                 _merge(self.part(name), self.release)
 
-    @property
-    def _locks(self) -> Path:
-        return place_in(self.folder, "locks", opened=True)
-
-    def _note(self, name: str) -> Path:
-        return place_in(self.folder, f"made/{name}")
-
-    def _check_there(self) -> None:
-        if not (self.folder / _CONFIG_FILE).exists():
-            raise ConfigError(f"{self.folder}: was removed while parts of the release were recorded; make it again")
+    def complete(self) -> None:
+        """Move the release into its place, and remove the folder."""
+        if self.out.is_dir():
+            self.out.rmdir()
+        self.release.replace(self.out)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 @contextmanager
-def unfinished_release(out: Path, config: SynthConfig, *, shared: bool = False) -> Iterator[Unfinished]:
-    """The release that becomes `out` when the block succeeds; if the block fails, a later call can continue it.
+def unfinished_release(unfinished: Unfinished, config: SynthConfig) -> Iterator[Callable[[], bool]]:
+    """Work on a release in the block; if nothing of it is made at the end, nothing is left.
 
     Args:
-        out: its place.
+        unfinished: its folder.
         config: its settings.
-        shared: whether others may work on it too who share it, each on parts of its own; it does not become `out` then.
+
+    Yields:
+        A function that waits until this process has the folder alone; whether no other one has completed the release.
 
     Raises:
-        ConfigError: `out` is taken, the unfinished release is of another configuration or version, or another process
-            is making it.
+        ConfigError: its place is taken, the unfinished release is of another configuration or version, or something
+            cannot be written.
     """
-    place = out.absolute()
-    unfinished = Unfinished(place_in(place.parent, f".{place.name}.unfinished", opened=True))
-    try:
-        lock = held_lock(unfinished.folder / _LOCK, "makes the release", shared=shared, wait=False)
-    except BlockingIOError as error:
-        raise ConfigError(
-            f"{out}: another process is making it; wait for that one, or choose another folder"
-        ) from error
-    try:
-        check_free(out)  # who held the lock may have completed it
-        _agree(unfinished.folder, config)
-        with nullcontext() if shared else _becoming(out, unfinished):
-            yield unfinished
-    finally:
-        lock.release()
+    store, settings = unfinished.store, unfinished.folder / _CONFIG_FILE
 
+    def begin() -> None:
+        check_free(unfinished.out)  # who held the lock may have completed it
+        _write_or_compare(settings, config)
 
-@contextmanager
-def _becoming(out: Path, unfinished: Unfinished) -> Iterator[None]:
-    """Make the release's folder, and move it to its place if the block succeeds; else keep it if anything is made."""
-    unfinished.release.mkdir(exist_ok=True)
-    try:
-        yield
-        _move_into_place(unfinished.release, out)
-    finally:
-        if not (unfinished.release.is_dir() and (unfinished.made() or unfinished.is_at_hand())):
-            shutil.rmtree(unfinished.folder, ignore_errors=True)
+    with store.shared(begin) as turn:
+        _write_or_compare(settings, config)
+        try:
+            yield turn.alone
+        finally:
+            nothing = unfinished.folder.is_dir() and not any(unfinished.folder.glob("kept/*"))
+            if nothing and turn.alone(wait=False):
+                shutil.rmtree(unfinished.folder, ignore_errors=True)
 
 
 def check_free(out: Path) -> None:
     """Raise ConfigError unless a release can be made there: nothing is, or an empty folder."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
-
-
-def _is_held(lock: Path) -> bool:
-    try:
-        held_lock(lock, "records", wait=False).release()
-    except BlockingIOError:
-        return True
-    return False
-
-
-def _agree(folder: Path, config: SynthConfig) -> None:
-    """Write the configuration beside the release, or compare it with the one that is there."""
-    lock = held_lock(folder / _CONFIG_LOCK, "begins the release")  # those who share the folder may begin at once
-    try:
-        _write_or_compare(folder / _CONFIG_FILE, config)
-    finally:
-        lock.release()
 
 
 def _write_or_compare(path: Path, config: SynthConfig) -> None:
@@ -198,12 +157,6 @@ def _as_json(config: SynthConfig) -> dict[str, Any]:
     fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
     as_read: dict[str, Any] = json.loads(json.dumps(fields))
     return as_read
-
-
-def _move_into_place(release: Path, out: Path) -> None:
-    if out.is_dir():
-        out.rmdir()
-    release.replace(out)
 
 
 def _merge(part: Path, release: Path) -> None:

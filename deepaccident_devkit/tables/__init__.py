@@ -2,7 +2,7 @@
 
 from deepaccident_devkit.tables.clearing import Cleared, clear_index
 from deepaccident_devkit.tables.findings import SEVERITIES, Finding, Severity
-from deepaccident_devkit.tables.index import Index, index_shard, open_index, open_merged_index, place_outside
+from deepaccident_devkit.tables.index import Index, open_index, place_outside
 from deepaccident_devkit.tables.manifest import Problem
 from deepaccident_devkit.tables.opened import OpenTables, RowArgument
 from deepaccident_devkit.tables.report import IndexInfo, IndexReport, index_report
@@ -26,9 +26,7 @@ __all__ = [
     "clear_index",
     "displacement_velocities",
     "index_report",
-    "index_shard",
     "open_index",
-    "open_merged_index",
     "place_outside",
     "table_names",
     "visible_ids",

@@ -25,11 +25,10 @@ from typing import TYPE_CHECKING, Any, get_args
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError
 from deepaccident_devkit.files import is_writable_folder, place_in
-from deepaccident_devkit.parallel import Shard
 from deepaccident_devkit.reading import RefusedFileError, fault_text, limit_of
 from deepaccident_devkit.release import ReleaseLayout
 from deepaccident_devkit.release.store import Dataroot, index_places
-from deepaccident_devkit.tables.indexing import Outcome, check_indexed, index_scenarios, is_unfinished, make_index
+from deepaccident_devkit.tables.indexing import is_unfinished, make_index
 from deepaccident_devkit.tables.locking import index_lock
 from deepaccident_devkit.tables.manifest import (
     MANIFEST_FILE,
@@ -117,40 +116,6 @@ def open_index(
         index = _finished(index, make)
     _accept(layout, index, on_error)
     return index
-
-
-def open_merged_index(layout: ReleaseLayout, **how: Any) -> Index:
-    """The index that the shards of `index_shard` make together; arguments and errors are those of `open_index`.
-
-    Raises:
-        UnfinishedError: a scenario has no shard.
-    """
-    index_dir = how.get("index_dir")
-    if _current_index(layout, index_dir) is None:
-        check_indexed(layout, _writable_folder(layout, index_dir))
-    return open_index(layout, **how)
-
-
-def index_shard(layout: ReleaseLayout, shard: Shard, *, index_dir: Path | None = None, **how: Any) -> list[Outcome]:
-    """Index a part of a release; `open_index` makes the whole index with what is there then.
-
-    Args:
-        layout: the release.
-        shard: which part.
-        index_dir: where indexes are kept, as of `open_index`.
-        **how: of `open_index`: `check_files`, `workers`, `executor`, `progress`.
-
-    Returns:
-        The outcome of each scenario; broken ones are among them.
-
-    Raises:
-        IndexStoreError: something cannot be written, or a newer devkit's index is there.
-    """
-    _refuse_wrong_limits()
-    folder = _writable_folder(layout, index_dir)
-    with index_lock(folder, shared=True):
-        _refuse_newer(folder)
-        return index_scenarios(layout, folder, shard, **how)
 
 
 def _refuse_wrong_limits() -> None:

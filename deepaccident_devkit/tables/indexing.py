@@ -9,11 +9,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import DeepAccidentError, IndexStoreError
 from deepaccident_devkit.files import replacing_folder
-from deepaccident_devkit.parallel import Places, Shard, check_whole, run_batch
+from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import file_checksum, observed
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta
 from deepaccident_devkit.release.store import places_of
@@ -90,15 +90,14 @@ def make_index(
     splits = assign_splits(layout)
     _refuse_links(folder / SHARDS_FOLDER)
     with _store_errors(folder), _marked_unfinished(folder):
-        outcomes = _indexed(
-            layout,
-            folder,
+        outcomes = run_batch(
+            partial(index_scenario, folder / SHARDS_FOLDER, check_files=check_files),
             _candidates(layout, splits),
-            check_files=check_files,
             workers=workers,
             executor=executor,
             label="indexing scenarios",
             progress=progress,
+            places=Places(reads=places_of(layout.root), writes=(folder,)),
         )
         tables, table_files = _write_tables(folder, [outcome for outcome in outcomes if outcome.indexed], splits)
         manifest = Manifest(
@@ -112,53 +111,6 @@ def make_index(
         write_manifest(folder, manifest)
         _remove_stale_shards(folder, {outcome.token for outcome in outcomes if outcome.indexed})
     return manifest
-
-
-def index_scenarios(
-    layout: ReleaseLayout,
-    folder: Path,
-    part: Shard,
-    **how: Any,
-) -> list[Outcome]:
-    """Write the shards of a part of the scenarios, and no tables; the caller shares the folder's lock.
-
-    `how` is as of `make_index`.
-
-    Raises:
-        IndexStoreError: something cannot be written; or shards lie behind a link.
-        SplitFileError: a split file cannot be read.
-        WorkerError: a worker was killed.
-    """
-    _refuse_links(folder / SHARDS_FOLDER)
-    candidates = part.of(_candidates(layout, assign_splits(layout)))
-    with _store_errors(folder):
-        return _indexed(layout, folder, candidates, label=f"indexing part {part}", **how)
-
-
-def _indexed(
-    layout: ReleaseLayout, folder: Path, scenarios: list[ScenarioFolder], *, check_files: bool = False, **how: Any
-) -> list[Outcome]:
-    work = partial(index_scenario, folder / SHARDS_FOLDER, check_files=check_files)
-    return run_batch(work, scenarios, places=Places(reads=places_of(layout.root), writes=(folder,)), **how)
-
-
-def check_indexed(layout: ReleaseLayout, folder: Path) -> None:
-    """Raise UnfinishedError if a scenario that can be indexed has no shard of its present files."""
-    candidates = _candidates(layout, assign_splits(layout))
-    done = {each.token for each in candidates if _has_shard(folder / SHARDS_FOLDER, each)}
-    for scenario in candidates:
-        if scenario.token in done:
-            continue
-        scan = scan_scenario(scenario)
-        if scan.agents and not scan.problems and _read(scenario, scan)[0] is not None:
-            break
-        done.add(scenario.token)  # a broken one, which has no shard, or one without files
-    check_whole([each.token for each in candidates], done, folder)
-
-
-def _has_shard(shards: Path, scenario: ScenarioFolder) -> bool:
-    state = shard_state(shard_path(shards, scenario.token))
-    return state is not None and state.times == _times_of(scenario)
 
 
 def _times_of(scenario: ScenarioFolder) -> str:

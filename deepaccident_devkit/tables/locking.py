@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import SharedLock, held_lock, place_in, say_waiting
+from deepaccident_devkit.files import place_in, say_waiting
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -18,13 +18,12 @@ _TASK = "makes an index"
 
 
 @contextmanager
-def index_lock(folder: Path, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
+def index_lock(folder: Path, *, wait: bool = True) -> Iterator[bool]:
     """Hold the folder's lock, which the system takes back when a process ends, however it ends.
 
     Args:
         folder: an index folder; made where it is missing.
         wait: whether to wait, saying so, while another process holds it.
-        shared: whether others may hold it too who share it; this waits.
 
     Yields:
         Whether it is held; always so after waiting.
@@ -34,20 +33,16 @@ def index_lock(folder: Path, *, wait: bool = True, shared: bool = False) -> Iter
     """
     from filelock import FileLock, Timeout
 
-    lock: BaseFileLock | SharedLock
+    lock = FileLock(folder / LOCK_FILE)
     try:
         place_in(folder, LOCK_FILE, opened=True)  # a link's target would be emptied
-        if shared:
-            lock = held_lock(folder / LOCK_FILE, _TASK, shared=True)
-        else:
-            lock = FileLock(folder / LOCK_FILE)
-            _acquire(lock, folder, wait=wait)
+        _acquire(lock, folder, wait=wait)
     except Timeout:
         pass
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise IndexStoreError(f"{folder}: cannot be locked ({error}); give another index_dir=") from error
     try:
-        yield isinstance(lock, SharedLock) or lock.is_locked
+        yield lock.is_locked
     finally:
         lock.release()
 

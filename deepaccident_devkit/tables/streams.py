@@ -15,15 +15,21 @@ _CHECKSUM_SIZE = 16
 
 def write_streams(path: Path, tables: Sequence[tuple[TableSpec, Columns]], metadata: Mapping[str, str]) -> None:
     """Write the rows of each table, with words on what they were made from; the file is whole or not there."""
+    content = streams(tables, metadata)
+    write_bytes(path, content + _checksum(content))
+
+
+def streams(tables: Sequence[tuple[TableSpec, Columns]], metadata: Mapping[str, str] | None = None) -> bytes:
+    """The rows of each table, with or without words, as compressed Arrow streams one after the other."""
     import pyarrow as pa
 
     options = pa.ipc.IpcWriteOptions(compression="zstd")
     sink = pa.BufferOutputStream()
     for spec, columns in tables:
-        with pa.ipc.new_stream(sink, arrow_schema(spec).with_metadata(dict(metadata)), options=options) as writer:
+        with pa.ipc.new_stream(sink, arrow_schema(spec).with_metadata(dict(metadata or {})), options=options) as writer:
             writer.write_batch(record_batch(spec, columns))
-    content = sink.getvalue().to_pybytes()
-    write_bytes(path, content + _checksum(content))
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
 
 
 def whole_streams(path: Path) -> bytes | None:

@@ -7,7 +7,7 @@ from deepaccident_devkit.validation.codes import CODES
 from deepaccident_devkit.validation.completeness import release_completeness
 from deepaccident_devkit.validation.completeness_report import Completeness, FileCount, LackingScenario, SplitFiles
 from deepaccident_devkit.validation.report import ValidationReport
-from deepaccident_devkit.validation.validate import findings, merged_validation, validate_release, validation_shard
+from deepaccident_devkit.validation.validate import findings, validate_release
 
 __all__ = [
     "CODES",
@@ -20,8 +20,6 @@ __all__ = [
     "ValidationReport",
     "VelocityFit",
     "findings",
-    "merged_validation",
     "release_completeness",
     "validate_release",
-    "validation_shard",
 ]

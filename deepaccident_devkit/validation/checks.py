@@ -1,4 +1,4 @@
-"""`ScenarioCheck`: what was found in one scenario; and the file in which one is kept."""
+"""`ScenarioCheck`: what was found in one scenario; and what decides it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import hashlib
 import json
 import os
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.reading import LIMITS_VARIABLE, read_bytes
+from deepaccident_devkit.reading import LIMITS_VARIABLE
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.store import Entry, ReleasePath, listed
 from deepaccident_devkit.tables import Finding
@@ -42,7 +41,7 @@ class ScenarioCheck:
 
     @classmethod
     def of_json(cls, text: bytes) -> ScenarioCheck:
-        """The check that `to_json` wrote; raises ValueError, KeyError or TypeError."""
+        """The check that `to_json` wrote."""
         stored = json.loads(text)  # names of files may have half characters
         return cls(
             token=stored["token"],
@@ -52,26 +51,15 @@ class ScenarioCheck:
         )
 
 
-def kept_path(folder: Path, scenario: ScenarioFolder, *, deep: bool) -> Path:
-    """The file in which a scenario's check is kept: its name changes with all that decides the check.
-
-    That is the devkit, the settings, and names, sizes and times of the scenario's files.
-    """
+def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
+    """A digest of all that decides a scenario's check: the devkit, settings, names, sizes and times of its files."""
     settings = (__version__, deep, str(scenario.root), scenario.folder, os.environ.get(LIMITS_VARIABLE))
     digest = hashlib.blake2b(f"{settings} {times_digest(scenario)}".encode(), digest_size=8)
     for agent in AGENTS:
         for channel in CHANNELS:
             for words in (f"{agent}/{channel}", *_entries(scenario.kind_folder(agent, channel))):
                 digest.update(os.fsencode(f"{words}\n"))
-    return folder / f"{scenario.scenario_type}.{scenario.name}.{digest.hexdigest()}.json"
-
-
-def kept_check(path: Path) -> ScenarioCheck | None:
-    """The check in a file; None if it is not there or damaged."""
-    try:
-        return ScenarioCheck.of_json(read_bytes(path, "bundle"))
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    return digest.hexdigest()
 
 
 def _entries(folder: ReleasePath) -> list[str]:

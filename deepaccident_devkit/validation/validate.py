@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import TokenError
-from deepaccident_devkit.files import writable_folder, write_bytes
-from deepaccident_devkit.parallel import Places, Shard, check_whole, run_batch
+from deepaccident_devkit.errors import ConfigError, TokenError
+from deepaccident_devkit.files import writable_folder
+from deepaccident_devkit.parallel import Places, Store, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import left_aside, names_without_calib
 from deepaccident_devkit.release.store import Dataroot, checksums_compared, open_dataroot, places_of
@@ -21,7 +21,7 @@ from deepaccident_devkit.tables.build import read_scenario
 from deepaccident_devkit.tables.scan import scan_scenario
 from deepaccident_devkit.tables.velocities import fit_velocities, total_fit
 from deepaccident_devkit.validation.agreement import check_agreement
-from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, kept_check, kept_path
+from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, check_key
 from deepaccident_devkit.validation.completeness import chosen_scenarios, completeness
 from deepaccident_devkit.validation.inventory import absences, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
@@ -58,8 +58,9 @@ def validate_release(
         workers: processes to use; see `parallel.run_batch`.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
         scenarios: tokens of the scenarios to look at; None for all.
-        parts: folder to keep what was found in each scenario, so that the same call, or one of shards, does only what
-            is left; of a scenario whose files have changed since, nothing is left. None writes nothing.
+        parts: folder to keep what was found in each scenario, so that the same call does only what is left, and several
+            processes that are given it share the scenarios; one whose files have changed since is looked at again.
+            None writes nothing.
         progress: whether to show a progress bar.
 
     Raises:
@@ -70,40 +71,10 @@ def validate_release(
         WorkerError: a worker was killed, or cannot do the work.
     """
     layout = find_release(open_dataroot(root), version)
-    work = _Work(deep=deep, parts=None if parts is None else writable_folder(parts))
+    folder = None if parts is None else writable_folder(parts)
+    store = None if folder is None else Store(folder, folder, "validates scenarios", ConfigError)
     how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
-    checks = work.run(chosen_scenarios(layout, scenarios), **how)
-    return _report(layout, checks, scenarios, root=root, deep=deep, **how)
-
-
-def validation_shard(root: Dataroot, shard: Shard, parts: Path, version: str = "v1", **how: Any) -> list[ScenarioCheck]:
-    """Look at a part of a release, and keep what was found for `merged_validation`.
-
-    Args:
-        root: the release, as of `DeepAccident`: a folder, archives, or a URL.
-        shard: which part of its scenarios, or of `scenarios`.
-        parts: folder that all shards write into; what is there already is not done again.
-        version: `v1` or `v1-mini`.
-        **how: of `validate_release`: `deep`, `workers`, `executor`, `scenarios`, `progress`.
-
-    Raises:
-        ConfigError, DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
-    """
-    layout = find_release(open_dataroot(root), version)
-    chosen = shard.of(chosen_scenarios(layout, how.pop("scenarios", None)))
-    return _Work(deep=how.pop("deep", False), parts=writable_folder(parts)).run(chosen, **how)
-
-
-def merged_validation(root: Dataroot, parts: Path, version: str = "v1", **how: Any) -> ValidationReport:
-    """What `validate_release` gives, from what the shards kept; arguments are those of `validation_shard`.
-
-    Raises:
-        UnfinishedError: a scenario is not done, or only with other settings, by another devkit, or with other files.
-        DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
-    """
-    layout = find_release(open_dataroot(root), version)
-    scenarios, deep = how.pop("scenarios", None), how.pop("deep", False)
-    checks = _Work(deep=deep, parts=parts, merge=True).run(chosen_scenarios(layout, scenarios), **how)
+    checks = _Work(deep=deep, store=store).run(chosen_scenarios(layout, scenarios), **how)
     return _report(layout, checks, scenarios, root=root, deep=deep, **how)
 
 
@@ -113,36 +84,37 @@ class _Work:
 
     Attributes:
         deep: whether sensor files are decoded.
-        parts: folder of what was found before, and is found now.
-        merge: whether nothing is looked at that is not there.
+        store: what was found before, and is found now.
     """
 
     deep: bool
-    parts: Path | None
-    merge: bool = False
+    store: Store | None
 
-    def __call__(self, scenario: ScenarioFolder) -> ScenarioCheck | None:
-        """Look at one scenario; None if it should be there and is not."""
-        if self.parts is None:
+    def __call__(self, scenario: ScenarioFolder) -> ScenarioCheck:
+        """Look at one scenario, unless that was done."""
+        if self.store is None:
             return check_scenario(scenario, deep=self.deep)
-        path = kept_path(self.parts, scenario, deep=self.deep)  # before anything is read: a later edit is noticed
-        check = kept_check(path)
-        if check is None and not self.merge:
-            check = check_scenario(scenario, deep=self.deep)
-            write_bytes(path, check.to_json().encode())
+        key = check_key(scenario, deep=self.deep)  # before anything is read: a later edit is noticed
+        kept = self.store.kept(_name(scenario), key)
+        if kept is not None:
+            return ScenarioCheck.of_json(kept)
+        check = check_scenario(scenario, deep=self.deep)
+        self.store.keep(_name(scenario), key, check.to_json().encode())
         return check
 
     def run(self, scenarios: Sequence[ScenarioFolder], **how: Any) -> list[ScenarioCheck]:
-        """Look at all of them; raises UnfinishedError if one is not there."""
-        places = Places(
-            reads=tuple({place for scenario in scenarios for place in places_of(scenario.root)}),
-            writes=() if self.parts is None else (self.parts,),
-        )
-        found = run_batch(self, scenarios, label="validating scenarios", places=places, **how)
-        names = [str(Path(scenario.folder, scenario.token)) for scenario in scenarios]
-        done = {name: check for name, check in zip(names, found, strict=True) if check is not None}
-        check_whole(names, done, self.parts)
-        return list(done.values())
+        """Look at all of them."""
+        reads = tuple({place for scenario in scenarios for place in places_of(scenario.root)})
+        how |= {"label": "validating scenarios"}
+        if self.store is None:
+            return run_batch(self, scenarios, places=Places(reads=reads), **how)
+        with self.store.shared():
+            places = Places(reads=reads, writes=(self.store.folder,))
+            return list(self.store.run(self, {_name(each): each for each in scenarios}, places=places, **how).values())
+
+
+def _name(scenario: ScenarioFolder) -> str:
+    return Path(scenario.folder, scenario.token).as_posix()
 
 
 def _report(

@@ -19,8 +19,6 @@ COMMANDS = {
     "synth": "synth {out}/made --scenarios 3 --frames 3 --size 64x36 --seed 5",
 }
 """Name → command line."""
-OF_PARTS = {"validate": " --parts {out}/validate"}
-"""What a shard and the merging have besides, where a command writes no files."""
 
 
 class Local(NamedTuple):
@@ -38,10 +36,9 @@ class Cluster(NamedTuple):
     workers: list[int]
 
 
-def words(name: str, places: dict[str, Path], *, parts: bool = False) -> list[str]:
+def words(name: str, places: dict[str, Path]) -> list[str]:
     """The command line of a product."""
-    text = COMMANDS[name] + (OF_PARTS.get(name, "") if parts else "")
-    return text.format(**places).split()
+    return COMMANDS[name].format(**places).split()
 
 
 def command(arguments: Sequence[str]) -> list[str]:

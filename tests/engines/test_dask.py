@@ -39,7 +39,7 @@ def test_a_killed_scheduler_costs_what_is_at_hand(local: Local, tmp_path: Path) 
     workers = [started_worker(address) for _ in range(2)]
     line = words("opencood", {**local.places, "out": tmp_path})
     with subprocess.Popen([*command(line), "--scheduler", address], stderr=subprocess.PIPE, text=True) as running:
-        wait_for(lambda: list(tmp_path.glob("opencood/.deepaccident-parts/opencood/*/done.json")))
+        wait_for(lambda: list(tmp_path.glob("opencood/.deepaccident-parts/kept/opencood/*/done")))
         scheduler.kill()
         _, errors = running.communicate(timeout=120)
     for process in (scheduler, *workers):

@@ -17,15 +17,12 @@ BLOCKS = re.findall(r"^```(bash|python)\n(.*?)^```", PAGE, re.DOTALL | re.MULTIL
 PROGRAMS = {
     "ssh": '#!/bin/bash\nshift\nexec bash -c "$*"\n',
     "sbatch": """#!/bin/bash
-[[ $1 == --dependency=afterok:7 && $2 == --wrap ]] && exec bash -ec "$3"
-[[ $1 == --parsable ]] || exit 1
-[[ $(cat "$2") =~ --array=1-([0-9]+) ]] || exit 1
-export SLURM_ARRAY_TASK_COUNT=${BASH_REMATCH[1]}
-for each in $(seq "$SLURM_ARRAY_TASK_COUNT"); do SLURM_ARRAY_TASK_ID=$each bash -e "$2" >&2 || exit; done
-echo 7
+[[ $1 == --wait && $(cat "$2") =~ --array=1-([0-9]+) ]] || exit 1
+for each in $(seq "${BASH_REMATCH[1]}"); do bash -e "$2" >&2 & done
+for job in $(jobs -p); do wait "$job" || exit; done
 """,
 }
-"""Programs of a cluster that stand for themselves here: one host, one job after another."""
+"""Programs of a cluster that stand for themselves here: one host, all tasks at once."""
 
 
 @pytest.fixture

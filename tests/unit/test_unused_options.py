@@ -39,7 +39,6 @@ CASES = [
     ("split release --overwrite", "--overwrite changes nothing without --out"),
     ("synth out --spec mine.yaml --unplanned 0.5", "--unplanned changes nothing with --spec or --view hidden"),
     ("synth --spec mine.yaml --check --layout B", "--layout changes nothing with --check"),
-    ("synth --spec mine.yaml --check --shard 1/2", "--shard changes nothing with --check"),
     ("stats release --format png", "--format is for figures; give --out FOLDER too"),
 ]
 

@@ -5,6 +5,7 @@ With PyTorch also files of weights and a run of training.
 
 import json
 import shutil
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -41,6 +42,13 @@ SETUPS = {
 
 
 HAS_TORCH = find_spec("torch") is not None
+
+
+class _Killed(OpenCood):
+    """Stopped when all scenarios are written."""
+
+    def finish(self, *_: object) -> None:
+        raise KeyboardInterrupt
 
 
 def make_healthy(folder: Path, *, weights: bool = HAS_TORCH) -> Path:
@@ -110,10 +118,10 @@ def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -
     """A complete export and one that was killed, questions with answers, and a cache of images."""
     export_release(dataset, folder / "exports" / "whole", EXPORT, workers=1)
     begun = folder / "exports" / "begun"
-    for part in ("1/2", "2/2"):
-        export_release(dataset, begun, EXPORT, workers=1, part=part)
-    unfinished = begun / ".deepaccident-parts" / "opencood"
-    max(unfinished.glob("*/done.json")).unlink()  # a unit of which some was written
+    with suppress(KeyboardInterrupt):
+        export_release(dataset, begun, _Killed(without_clouds=True), workers=1)
+    unfinished = begun / ".deepaccident-parts" / "kept" / "opencood"
+    max(unfinished.glob("*/done")).unlink()  # a unit of which some was written
     (unfinished / "a_unit_of_before.paths").write_bytes(b"before/one.yaml\0before/two.yaml\0")
     (begun / "before").mkdir()
     for name in ("one", "two"):

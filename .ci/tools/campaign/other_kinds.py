@@ -152,8 +152,8 @@ def _judge_findings(room: Room, sentences: list[str]) -> str | None:
 
 _EXPORTED = Action(_exported, _judge_exported)
 _CACHED = Action(_cached, _judge_cached)
-_JOURNALS = ".deepaccident-parts/opencood/*.paths"
-_DONE = ".deepaccident-parts/opencood/*/done.json"
+_JOURNALS = ".deepaccident-parts/kept/opencood/*.paths"
+_DONE = ".deepaccident-parts/kept/opencood/*/done"
 KINDS = (
     Kind("export's manifest", "manifest", "exports", "*/opencood.manifest.json", (_EXPORTED,), writes=True),
     Kind("export's journals", "journal", "exports", f"begun/{_JOURNALS}", (_EXPORTED,), writes=True),

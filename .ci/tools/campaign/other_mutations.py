@@ -65,7 +65,7 @@ def journal_that_leads_out(path: Path, rng: Rng) -> None:
 
 @by_content("names", "journal")
 def journal_of_odd_names(content: bytes, rng: Rng) -> bytes:
-    odd = ("", ".", "/", "//", "~", "\\..\\x", "x" * 300, "\ud800", "C:\\x", ".deepaccident.lock", "*")
+    odd = ("", ".", "/", "//", "~", "\\..\\x", "x" * 300, "\ud800", "C:\\x", ".deepaccident-parts", "*")
     names = [any_of(rng, (*ODD_NAMES, *odd)) for _ in range(int(rng.integers(1, 9)))]
     return content + "".join(f"{name}\0" for name in names).encode("utf-8", "surrogatepass")
 

@@ -188,7 +188,7 @@ class Evaluator(ABC, Generic[Result]):
         """
         target = path_of(path)
         state = {
-            "made_by": self._maker,
+            "made_by": self.maker,
             "settings": self.settings,
             "repeated": sorted(self.repeated),
             "counts": {token: self._counts[token] for token in sorted(self._counts)},
@@ -214,8 +214,8 @@ class Evaluator(ABC, Generic[Result]):
             counts = {token: dict(each) for token, each in state["counts"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise EvaluationError(f"{source}: no saved evaluation ({fault_text(error)}); begin again") from error
-        if maker != self._maker:
-            raise EvaluationError(f"{source}: was saved by {maker}, this is {self._maker}; begin again")
+        if maker != self.maker:
+            raise EvaluationError(f"{source}: was saved by {maker}, this is {self.maker}; begin again")
         if settings != self.settings:
             raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin again, or use those")
         for token, each in counts.items():
@@ -224,7 +224,7 @@ class Evaluator(ABC, Generic[Result]):
         return self
 
     @property
-    def _maker(self) -> str:
+    def maker(self) -> str:
         """The class and version that made the counts: another version may count differently."""
         return f"{type(self).__name__} of devkit {__version__}"
 

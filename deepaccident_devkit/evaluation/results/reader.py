@@ -53,7 +53,7 @@ class EntryContents:
         """The entries of a sample."""
         return self._kind.prediction(self._entries, token)
 
-    def check(self, _samples: Collection[str] | None, **_how: Any) -> None:
+    def check(self, **_how: Any) -> None:
         """Nothing to do: all was checked when it was read."""
 
 
@@ -91,14 +91,13 @@ class MotionContents:
             with at(token):
                 return read(archive, token, self.form)
 
-    def check(self, samples: Collection[str] | None, **how: Any) -> None:
-        """Read every array, or those of the shards that begin with one of these samples, as `run_batch` is told.
+    def check(self, **how: Any) -> None:
+        """Read every array, as `run_batch` is told.
 
         Raises:
             ResultsError: names shard, token and array.
         """
-        chosen = [each for each in self._manifest.shards if samples is None or each.tokens[0] in samples]
-        tasks = [ShardCheck(self._root, shard, self.form) for shard in chosen]
+        tasks = [ShardCheck(self._root, shard, self.form) for shard in self._manifest.shards]
         run_batch(check_shard, tasks, label="shards", places=Places(reads=(self._root,)), **how)
 
 
@@ -243,7 +242,6 @@ class Results:
     def check(
         self,
         *,
-        samples: Collection[str] | None = None,
         workers: int | None = 1,
         executor: Executor | None = None,
         progress: bool = False,
@@ -251,7 +249,6 @@ class Results:
         """Read and check everything: do so before long work and before publishing.
 
         Args:
-            samples: of motion, only the shards that begin with one of these; None for all.
             workers: processes for the shards of motion; None takes what the work is worth.
             executor: any executor of `concurrent.futures` to run on, in place of own workers.
             progress: whether to show a bar.
@@ -264,7 +261,7 @@ class Results:
             now = content_fingerprint(read_bytes(self._file, "results"))
         if now != self.fingerprint:
             raise ResultsError(f"{self._file}: was changed after it was opened; open it again")
-        self._contents.check(samples, workers=workers, executor=executor, progress=progress)
+        self._contents.check(workers=workers, executor=executor, progress=progress)
 
     @property
     def _file(self) -> Path:

@@ -5,10 +5,11 @@ says which differences of two are real.
 """
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
+from deepaccident_devkit.evaluation.runs.checkpoints import evaluation_store
 from deepaccident_devkit.evaluation.runs.compare import compare_bundles
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
 from deepaccident_devkit.evaluation.runs.differences import Difference
-from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results, evaluate_shard
+from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
     BREAKDOWNS,
     EvaluationRun,
@@ -44,7 +45,7 @@ __all__ = [
     "coverage",
     "default_selection",
     "evaluate_results",
-    "evaluate_shard",
+    "evaluation_store",
     "prevented_accidents",
     "read_bundle",
     "read_rows",

@@ -1,24 +1,27 @@
-"""Counts that are kept beside an evaluation until it is written: of a run that broke off, and of shards."""
+"""The folder beside an evaluation in which counts are kept until it is written."""
 
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Collection, Mapping
-from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import path_of
-from deepaccident_devkit.parallel import Shard, ShardFiles, unfinished_folder
+from deepaccident_devkit.files import path_of, remove_in
+from deepaccident_devkit.parallel import Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
 
-_ENDING: Final = ".counts.json"
-_OF_SHARD: Final = re.compile(rf"[0-9a-f]+\.([1-9]\d{{0,8}})-of-([1-9]\d{{0,8}}){re.escape(_ENDING)}", re.ASCII)
+_COUNTS = "counts"
+
+
+def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
+    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
+
+    `command` says which evaluation that is.
+    """
+    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
 
 
 def checkpoint_path(
@@ -26,20 +29,17 @@ def checkpoint_path(
     setup: EvaluationSetup,
     tokens: Collection[str],
     fingerprints: Mapping[str, str],
-    *,
-    shard: Shard | None = None,
 ) -> Path:
-    """The file beside `out` that such a run saves its counts to.
+    """The folder beside `out` in which such a run keeps its counts.
 
     Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
-    and another devkit have another file, and so never go on with these counts.
+    and another devkit have another folder, and so never go on with these counts.
 
     Args:
         out: the folder that the finished evaluation goes to.
         setup: task and rules.
         tokens: the samples.
         fingerprints: of the predictions and of the labels.
-        shard: the part that the samples are of; None for all.
     """
     name = digest_of(
         {
@@ -49,35 +49,11 @@ def checkpoint_path(
             "fingerprints": dict(fingerprints),
         }
     )
-    files = ShardFiles(_absolute(out), name, _ENDING)
-    return files.folder / f"{name}{_ENDING}" if shard is None else files.path(shard)
-
-
-def stored_shards(out: str | os.PathLike[str]) -> list[Shard]:
-    """The parts whose counts are beside `out`, of one evaluation or of several."""
-    found = (_OF_SHARD.fullmatch(path.name) for path in ShardFiles(_absolute(out), "*", _ENDING).found())
-    numbers = {(int(each[2]), int(each[1])) for each in found if each is not None}
-    return [Shard(number, count) for count, number in sorted(numbers) if number <= count]
-
-
-def whole_counts(path: Path, evaluator: Evaluator[Any]) -> Evaluator[Any] | None:
-    """The counts in a file, if it is there; one from which none can be taken is removed: only time is lost."""
-    if path.exists():
-        try:
-            return evaluator.fresh().resume(path)
-        except EvaluationError:
-            path.unlink()
-    return None
+    return evaluation_store(out).folder / _COUNTS / name
 
 
 def remove_checkpoints(out: str | os.PathLike[str]) -> None:
-    """Remove all such files beside `out`, those of shards too, once what they were for is written."""
-    folder = unfinished_folder(_absolute(out))
-    for path in folder.glob(f"*{_ENDING}"):
-        path.unlink(missing_ok=True)
-    with suppress(OSError):  # something else lies there
-        folder.rmdir()
-
-
-def _absolute(out: str | os.PathLike[str]) -> Path:
-    return path_of(out).absolute()
+    """Remove all such folders beside `out`, once what they were for is written."""
+    store = evaluation_store(out)
+    remove_in(store.folder, _COUNTS)
+    store.remove()

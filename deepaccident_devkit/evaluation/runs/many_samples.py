@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.files import path_of
-from deepaccident_devkit.parallel import Places, run_unordered
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.parallel import Places, Store, run_batch
+from deepaccident_devkit.release.fingerprints import digest_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 EvaluatorT = TypeVar("EvaluatorT", bound=Evaluator[Any])
 _BATCH: Final = 8
-"""Samples that a worker evaluates before it reports."""
-_SAVE_SECONDS: Final = 30.0
-"""Seconds from one save to the next, which a killed run can lose."""
+"""Samples that a worker evaluates at once, and a killed run can lose."""
 
 
 def evaluate_samples(
@@ -39,7 +37,7 @@ def evaluate_samples(
 ) -> EvaluatorT:
     """Update an evaluator with many samples; the result is the same, to the bit, for any number of workers.
 
-    If a sample cannot be evaluated, the others are counted and saved before the error is raised.
+    If a sample cannot be evaluated, the others are counted before the error is raised.
 
     Args:
         evaluator: what counts; samples that it has already are passed over.
@@ -48,8 +46,9 @@ def evaluate_samples(
             function of a module that they can import, or `functools.partial` of one (a dataset may be bound to it).
         workers: processes; None takes what the work is worth, and this one alone if others cannot import `load`.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        checkpoint: a file that the counts are saved to every half minute and at the end, also of a run that breaks
-            off; if it is there, its samples are not evaluated again. None for none.
+        checkpoint: a folder in which counts are kept, eight samples at a time: what was counted there with the same
+            settings is not evaluated again, and several processes that are given it share the samples. It is for one
+            set of predictions and labels; remove it when these change. None for none.
         progress: whether to show a bar.
         places: what workers on other hosts must see.
 
@@ -58,41 +57,33 @@ def evaluate_samples(
 
     Raises:
         EvaluationError: samples cannot be evaluated (the message begins with the token of the only one, or lists all),
-            the checkpoint is of other settings or samples or cannot be read or written, or workers cannot import
-            `load`.
+            the checkpoint cannot be written, or workers cannot import `load`.
         WorkerError: a worker was killed.
         ChoiceError: `workers` is less than 1.
     """
-    saved = None if checkpoint is None else path_of(checkpoint)
-    if saved is not None:
-        if saved.exists():
-            _resume(evaluator, saved, samples)
-        evaluator.save(saved)  # shows at once, and not after an hour, whether it can be written
+    path = None if checkpoint is None else path_of(checkpoint)
+    store = None if path is None else Store(path, path, "evaluates samples", EvaluationError)
     counted = evaluator.tokens
     left = [(token, task) for token, task in samples.items() if token not in counted]
     batches = [
-        _Batch(evaluator.fresh(), tuple(left[first : first + _BATCH]), load) for first in range(0, len(left), _BATCH)
+        _Batch(evaluator.fresh(), tuple(left[first : first + _BATCH]), load, store)
+        for first in range(0, len(left), _BATCH)
     ]
     if executor is None and workers != 1 and batches:
         workers = _workers_that_can(batches[0], workers)
-    done = run_unordered(
-        _evaluated,
-        batches,
-        workers=workers,
-        executor=executor,
-        label="samples",
-        progress=progress,
-        sizes=[len(batch.samples) for batch in batches],
-        places=places,
-    )
+    how: dict[str, Any] = {
+        "workers": workers,
+        "executor": executor,
+        "label": f"samples, {_BATCH} at once",
+        "progress": progress,
+        "places": places,
+    }
     failed: dict[str, EvaluationError] = {}
-    with _saved_now_and_then(evaluator, saved) as save, closing(done):
-        for _, (part, faults) in done:
-            evaluator.merge(part)
-            for token, fault in faults.items():
-                fault.__cause__ = None if failed else fault.__cause__  # it holds what was being loaded
-                failed[token] = fault
-            save()
+    for part, faults in _done(batches, store, how):
+        evaluator.merge(part)
+        for token, fault in faults.items():
+            fault.__cause__ = None if failed else fault.__cause__  # it holds what was being loaded
+            failed[token] = fault
     _check_failed([failed[token] for token in samples if token in failed], len(left))
     return evaluator
 
@@ -102,13 +93,41 @@ class _Batch(Generic[Task]):
     evaluator: Evaluator[Any]
     samples: tuple[tuple[str, Task], ...]
     load: Callable[[Task], Sequence[Any]]
+    store: Store | None
+
+    @property
+    def name(self) -> str:
+        return digest_of([token for token, _ in self.samples])
+
+    @property
+    def key(self) -> str:
+        return f"{self.evaluator.maker} {self.evaluator.settings}"
 
 
-def _evaluated(batch: _Batch[Any]) -> tuple[Any, dict[str, EvaluationError]]:
-    """The counts of a batch, and why some of its samples have none."""
-    evaluator = batch.evaluator.fresh()
-    faults = {token: _fault(evaluator, token, batch.load, task) for token, task in batch.samples}
-    return evaluator, {token: fault for token, fault in faults.items() if fault is not None}
+_Counted: TypeAlias = tuple[Any, dict[str, EvaluationError]]
+"""An evaluator with the counts of a batch, and why some of its samples have none."""
+
+
+def _done(batches: Sequence[_Batch[Any]], store: Store | None, how: dict[str, Any]) -> Sequence[_Counted]:
+    """What each batch gives."""
+    if store is None:
+        return run_batch(_evaluated, batches, **how)
+    with store.shared():
+        return list(store.run(_evaluated, {batch.name: batch for batch in batches}, **how).values())
+
+
+def _evaluated(batch: _Batch[Any]) -> _Counted:
+    evaluator, store = batch.evaluator.fresh(), batch.store
+    content = None if store is None else store.kept(batch.name, batch.key, "results")
+    if content is not None:
+        for token, counts in parsed_json(content, constants=True).items():
+            evaluator.add(token, counts)
+        return evaluator, {}
+    found = {token: _fault(evaluator, token, batch.load, task) for token, task in batch.samples}
+    faults = {token: fault for token, fault in found.items() if fault is not None}
+    if store is not None and not faults:
+        store.keep(batch.name, batch.key, json.dumps(dict(evaluator.counts)).encode())
+    return evaluator, faults
 
 
 def _fault(
@@ -135,29 +154,6 @@ def _check_failed(failed: Sequence[EvaluationError], samples: int) -> None:
         raise EvaluationError("\n".join(lines)) from cause
 
 
-def take_stored(evaluator: Evaluator[Any], stored: Evaluator[Any]) -> None:
-    """Take stored counts, some of which it may have already; that alone does not make a sample a repeated one.
-
-    Raises:
-        EvaluationError: it has other counts of a sample.
-    """
-    repeated = evaluator.repeated | stored.repeated
-    evaluator.merge(stored)
-    evaluator.repeated = repeated
-
-
-def _resume(evaluator: Evaluator[Any], path: Path, samples: Mapping[str, Any]) -> None:
-    """Take what a checkpoint has of the samples."""
-    stored = evaluator.fresh().resume(path)
-    others = sorted(stored.tokens - samples.keys() - evaluator.tokens)
-    if others:
-        raise EvaluationError(
-            f"{path}: has {len(others)} samples that are not among these, such as {others[0]}; give each evaluation a "
-            "checkpoint of its own"
-        )
-    take_stored(evaluator, stored)
-
-
 def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:
     """The number asked for if other processes can do a batch's work, which they import by name; if not, raises."""
     from multiprocessing.reduction import ForkingPickler
@@ -174,23 +170,3 @@ def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:
     raise EvaluationError(
         f"load: {workers} workers cannot import it ({reason}); put it into a module of its own, or choose workers=1"
     )
-
-
-@contextmanager
-def _saved_now_and_then(evaluator: Evaluator[Any], path: Path | None) -> Iterator[Callable[[], None]]:
-    """Give a function that saves if the last time is long ago; save at the end, also after an error."""
-    if path is None:
-        yield lambda: None
-        return
-    last = time.monotonic()
-
-    def save() -> None:
-        nonlocal last
-        if time.monotonic() - last >= _SAVE_SECONDS:
-            evaluator.save(path)
-            last = time.monotonic()
-
-    try:
-        yield save
-    finally:
-        evaluator.save(path)

@@ -1,25 +1,23 @@
-"""The manifest of an export's folder, which fixes what is in it, and its lock."""
+"""The manifest of an export's folder, which fixes what is in it."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ExportError
+from deepaccident_devkit.errors import ConfigError, ExportError
 from deepaccident_devkit.export.bulk.output import MALFORMED, Tally
 from deepaccident_devkit.export.bulk.unfinished import FOLDER
-from deepaccident_devkit.files import held_lock, place_in, remove_leftovers, temporary_of, write_bytes
+from deepaccident_devkit.files import remove_leftovers, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 
 _FORMAT: Final = "DeepAccident export"
-_LOCK: Final = ".deepaccident.lock"
 _ENDING: Final = ".manifest.json"
 _AGAIN: Final = "export again into an empty folder"
 
@@ -75,7 +73,8 @@ class Manifest:
         except OSError as error:
             raise ExportError(f"{folder}: cannot be read ({error}); choose another folder") from error
         welcome = any(manifest_path(folder, each).name in others for each in beside)
-        strange = [each for each in others if not _is_own(each)]
+        own = manifest_path(folder, name).name  # another process may have written it just now
+        strange = [each for each in others if not _is_own(each) and each != own]
         if strange and not welcome:
             raise ExportError(
                 f"{folder}: is not empty ({shortened(strange[0])}) and holds no {name} export; choose a new folder"
@@ -144,41 +143,11 @@ def manifest_path(folder: Path, name: str) -> Path:
     return folder / f"{name}{_ENDING}"
 
 
-@contextmanager
-def writing_to(folder: Path, *, shared: bool = False) -> Iterator[None]:
-    """Hold the lock of a folder while an export is written into it; make it, and remove what killed processes left.
+def remove_half_written(folder: Path) -> None:
+    """Remove the temporary files of dead processes; a worker that a scheduler took for lost may live, and goes on.
 
-    The file of the lock stays, as one who waits for it may have it open already. Those who share it write different
-    units, and leave the removing to one who has it alone.
-
-    Raises:
-        ExportError: the folder cannot be made, locked or written to.
-        OutputFolderError: its lock is a link.
+    The caller has the folder alone.
     """
-    path = place_in(folder, _LOCK, opened=True)
-    try:
-        lock = held_lock(path, "writes an export", shared=shared)
-    except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
-        raise ExportError(f"{folder}: no export can be written there ({error}); choose another folder") from error
-    tidy = (lambda _: None) if shared else _remove_half_written
-    try:
-        tidy(folder)
-        try:
-            yield
-        except BaseException:
-            tidy(folder)
-            raise
-    except DeepAccidentError:
-        raise
-    except OSError as error:
-        remedy = "make room there, or choose another folder, and run it again"
-        raise ExportError(f"{folder}: the export cannot be written ({error}); {remedy}") from error
-    finally:
-        lock.release()
-
-
-def _remove_half_written(folder: Path) -> None:
-    """Remove the temporary files of dead processes; a worker that a scheduler took for lost may live, and goes on."""
     begun = {temporary_of(each.name) or "" for each in folder.iterdir()}
     remove_leftovers(folder, [name for name in begun if name.endswith(_ENDING)])  # those are written by this one alone
     for each, _, _ in os.walk(folder):
@@ -187,4 +156,4 @@ def _remove_half_written(folder: Path) -> None:
 
 def _is_own(name: str) -> bool:
     """Whether an export that was killed before it wrote its manifest may have left a file of this name."""
-    return name in (_LOCK, FOLDER) or temporary_of(name) is not None
+    return name == FOLDER or temporary_of(name) is not None

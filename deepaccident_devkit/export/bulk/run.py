@@ -13,23 +13,11 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from deepaccident_devkit.errors import ExportError, MissingFileError, NotAvailableError
 from deepaccident_devkit.export.bulk.format import Format, Plan, Unit
-from deepaccident_devkit.export.bulk.manifest import Manifest, writing_to
+from deepaccident_devkit.export.bulk.manifest import Manifest, remove_half_written
 from deepaccident_devkit.export.bulk.output import Tally
 from deepaccident_devkit.export.bulk.unfinished import Unfinished
 from deepaccident_devkit.files import path_of
-from deepaccident_devkit.parallel import (
-    MERGE,
-    Failure,
-    Part,
-    Places,
-    Shard,
-    Tried,
-    check_failures,
-    check_whole,
-    mine,
-    part_of,
-    run_batch,
-)
+from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders, sensor_digest
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
@@ -66,19 +54,20 @@ class Exported:
     tally: Tally
 
 
-def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
+def export_release(
     dataset: Dataset,
     folder: str | os.PathLike[str],
     form: Format,
     *,
     workers: int | None = None,
     executor: Executor | None = None,
-    part: Part | str = None,
     progress: bool = False,
     dry_run: bool = False,
     on_plan: Callable[[Plan, int], object] | None = None,
 ) -> Exported:
     """Write scenarios of a release in another format. If a call is interrupted, the same call continues it.
+
+    Several processes that make the same call share the scenarios.
 
     What is continued equals an undisturbed call: scenarios whose label, meta or calib files have changed since are
     written again. A complete export is compared with the release: units whose sensor files have come, gone or changed
@@ -90,7 +79,6 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
         form: the format, with which scenarios and agents, and its own settings.
         workers: processes; None chooses by the amount of work.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        part: `3/8` for the third of eight parts (docs/clusters.md); `merge` to complete the export once all are there.
         progress: whether to show bars.
         dry_run: only plan; nothing is written, and the folder is not made.
         on_plan: called with the plan and the bytes that are free, before anything is written.
@@ -103,27 +91,26 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
         NotAvailableError: no scenario or no sample is left to export, or the release has no such split.
         ChoiceError, FieldError: no such filter, or `workers` is less than 1.
         SomeFailedError: files of some scenarios cannot be read; the others are written, and the same call continues.
-        UnfinishedError: `part` is `merge`, and some scenarios are not written.
         WorkerError: a worker was killed, or cannot do the work.
     """
     root = path_of(folder, "expected a folder for the export", error=ExportError).absolute()
-    part = part_of(part)
     scenarios = _chosen(dataset, form)
     settings = {**form.settings(), "version": dataset.version}
     manifest = Manifest.of(root, form.name, settings, form.beside)
-    task, units = _Work(dataset, form, Unfinished(root, form.name), merge=part == MERGE), form.units(dataset, scenarios)
-    run = partial(run_batch, workers=workers, executor=executor, progress=progress)
-    own = mine(part, units)
-    plans = run(task.plan, own, label="planning", places=Places(reads=dataset.places))
+    unfinished = Unfinished(root, form.name, digest_of({"format": form.name, "settings": settings, "of": scenarios}))
+    task, units = _Work(dataset, form, unfinished), form.units(dataset, scenarios)
+    engine: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
+    run: Callable[..., list[Any]] = partial(run_batch, **engine)
+    plans = run(task.plan, units, label="planning", places=Places(reads=dataset.places))
     plan = sum(plans, Plan())
-    if not plan.samples and not isinstance(part, Shard):
+    if not plan.samples:
         raise NotAvailableError(form.nothing)
     free = shutil.disk_usage(next(each for each in (root, *root.parents) if each.exists())).free
     exported = partial(Exported, folder=root, plan=plan)
     if on_plan is not None:
         on_plan(plan, free)
     if not manifest.complete:
-        _check_room(task, dict(zip(own, plans, strict=True)), free)
+        _check_room(task, dict(zip(units, plans, strict=True)), free)
     if dry_run:
         return exported(written=0, kept=0, tally=Tally())
     form.check(dataset, root)
@@ -131,33 +118,45 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
     compare = partial(run, task.state, list(folders.values()), label="comparing", places=Places(reads=dataset.places))
     if _is_current(manifest, root, folders, compare):
         return exported(written=0, kept=len(units), tally=manifest.tally)
-    with writing_to(root, shared=isinstance(part, Shard)):
-        held = Manifest.of(root, form.name, settings, form.beside)
-        if held.complete and not manifest.complete:  # by the one who held the lock
-            return exported(written=0, kept=len(units), tally=held.tally)
-        Manifest(name=form.name, settings=settings).write(root)
-        if not isinstance(part, Shard):
-            task.unfinished.remove_others(units)
-        jobs = [(unit, tuple(folders[token] for token in unit.scenarios)) for unit in own]
+    whole, written = _completed(task, manifest, units, folders, engine)
+    return exported(written=written, kept=len(units) - written, tally=whole.tally)
+
+
+def _completed(
+    task: _Work,
+    manifest: Manifest,
+    units: Sequence[Unit],
+    folders: Mapping[str, ScenarioFolder],
+    engine: dict[str, Any],
+) -> tuple[Manifest, int]:
+    """Write what is left of an export, beside others that write it; its manifest, and how many units are new."""
+    unfinished, form, dataset = task.unfinished, task.form, task.dataset
+    root, settings = unfinished.root, manifest.settings
+
+    def completed() -> Manifest | None:
+        """The manifest, if another process has completed the export meanwhile."""
+        found = Manifest.of(root, form.name, settings, form.beside)
+        return found if found.complete and not manifest.complete else None
+
+    def begin() -> None:
+        if completed() is None:
+            Manifest(name=form.name, settings=settings).write(root)
+            unfinished.remove_others(units)
+
+    with unfinished.store.shared(begin, tidy=partial(remove_half_written, root)) as turn:
+        if (whole := completed()) is not None:
+            unfinished.remove(keep=bool(form.sensors()))
+            return whole, 0
+        jobs = {unit.name: (unit, tuple(folders[token] for token in unit.scenarios)) for unit in units}
         places = Places(reads=dataset.places, writes=(root,))
-        done = _checked(run(Tried(task.write), jobs, label=form.name, places=places), own, root)
-        tally = sum((each.tally for each in done), Tally())
-        if not isinstance(part, Shard):
-            manifest = task.finished(units, done, settings)
-            if not form.sensors():  # no later download changes it, so that its parts are needed no more
-                task.unfinished.remove()
-            manifest.write(root)
-            tally = manifest.tally
-    written = sum(each.new for each in done)
-    return exported(written=written, kept=len(own) - written, tally=tally)
-
-
-def _checked(results: Sequence[_Done | Failure | None], units: Sequence[Unit], root: Path) -> list[_Done]:
-    """What was done; raises SomeFailedError or UnfinishedError if that is not all."""
-    named = list(zip((unit.name for unit in units), results, strict=True))
-    check_failures(named, str(root))
-    check_whole([name for name, _ in named], {name for name, done in named if done is not None}, root)
-    return [done for done in results if isinstance(done, _Done)]
+        done = unfinished.store.run(task.write, jobs, label=form.name, places=places, **engine)
+        if turn.alone() and completed() is None:
+            whole = task.finished(units, list(done.values()), settings)
+            unfinished.remove(keep=bool(form.sensors()))  # else no later download changes it
+            whole.write(root)
+        else:
+            whole = Manifest.of(root, form.name, settings, form.beside)
+    return whole, sum(each.new for each in done.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +175,6 @@ class _Work:
     dataset: Dataset
     form: Format
     unfinished: Unfinished
-    merge: bool = False
 
     def plan(self, unit: Unit) -> Plan:
         """About how much a unit is."""
@@ -188,19 +186,16 @@ class _Work:
         listed = {_SENSORS: sensor_digest(folder, sensors)} if sensors else {}
         return {**folder_hashes(folder).as_dict(), **listed}
 
-    def write(self, job: Job) -> _Done | None:
-        """Write a unit, unless it was written from the same files before; None if it is to be there and is not."""
+    def write(self, job: Job) -> _Done:
+        """Write a unit, unless it was written from the same files before."""
         unit, folders = job
         states = {each.token: self.state(each) for each in folders}
-        with self.unfinished.alone(unit):  # a worker that a scheduler took for lost may be at it still
-            found = self.unfinished.done(unit)
-            if found is not None and found[0] == states:
-                return _Done(states, found[1], new=False)
-            if self.merge:
-                return None
-            with self.unfinished.output(self.form.link, unit) as output:
-                self.form.write(self.dataset, unit, output)
-            self.unfinished.set_done(unit, states, output.tally)
+        tally = self.unfinished.done(unit, states)
+        if tally is not None:
+            return _Done(states, tally, new=False)
+        with self.unfinished.output(self.form.link, unit) as output:
+            self.form.write(self.dataset, unit, output)
+        self.unfinished.set_done(unit, states, output.tally)
         return _Done(states, output.tally, new=True)
 
     def finished(self, units: Sequence[Unit], done: Sequence[_Done], settings: Mapping[str, Any]) -> Manifest:
@@ -232,7 +227,7 @@ def _chosen(dataset: Dataset, form: Format) -> list[str]:
 
 def _check_room(task: _Work, plans: Mapping[Unit, Plan], free: int) -> None:
     """Raise ExportError if what is not written yet needs more bytes than are free."""
-    left = sum((plan for unit, plan in plans.items() if task.unfinished.done(unit) is None), Plan())
+    left = sum((plan for unit, plan in plans.items() if not task.unfinished.is_written(unit)), Plan())
     need = left.bytes + (left.linked_bytes if task.form.link == "copy" else 0)
     if need > free:
         raise ExportError(

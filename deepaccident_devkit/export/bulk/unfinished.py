@@ -1,4 +1,4 @@
-"""What lies beside an export: of each unit its parts, the paths that it wrote, and a record that it is done.
+"""What lies beside an export: of each unit its parts, the paths that it wrote, and its counts once it is done.
 
 By the paths the next call removes what an earlier one wrote and would not be written today: of a scenario whose files
 have changed since, or that is not chosen any more. By the parts a complete export gets new sensor files without being
@@ -17,16 +17,18 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.export.bulk.format import Unit
-from deepaccident_devkit.export.bulk.output import MALFORMED, Link, Output, Tally
-from deepaccident_devkit.files import held_lock, place_in, remove_in, remove_leftovers, write_bytes
+from deepaccident_devkit.export.bulk.output import Link, Output, Tally
+from deepaccident_devkit.files import place_in, remove_in, remove_leftovers, write_bytes
 from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.release.fingerprints import digest_of
 
 FOLDER: Final = ".deepaccident-parts"
-_DONE: Final = "done.json"
+_DONE: Final = "done"
 _PATHS: Final = ".paths"
-_LOCK: Final = ".lock"
 _REFUSED: Final = re.compile(r"(.*/)?(\.{0,2}|\.deepaccident[^/]*|[^/]*\.manifest\.json)(/.*)?", re.DOTALL)
 """Paths that no export notes: out of its folder, or to what it keeps there itself. Somebody else wrote those."""
 _LONGEST: Final = 4096
@@ -40,43 +42,40 @@ class Unfinished:
     Attributes:
         root: of the export.
         name: of the format.
+        command: a digest of the format, its settings and what is exported.
     """
 
     root: Path
     name: str
+    command: str = ""
+
+    @property
+    def store(self) -> Store:
+        """What says which units are done, and keeps others from writing the same."""
+        folder = place_in(self.root, FOLDER, opened=True)
+        return Store(folder, self.root, "writes an export", ExportError, self.command)
 
     @property
     def folder(self) -> Path:
         """Its place, there or not; raises OutputFolderError if it is behind a link."""
-        return place_in(self.root, f"{FOLDER}/{self.name}", opened=True)
+        return self.store.path(self.name)
 
     def parts(self, unit: Unit) -> Path:
         """The folder of a unit's parts."""
         return self.folder / unit.name
 
-    def done(self, unit: Unit) -> tuple[Mapping[str, Any], Tally] | None:
-        """The hashes of a unit's scenarios and the unit's counts; None if this devkit has not written it."""
-        try:
-            record = parsed_json(read_bytes(self.parts(unit) / _DONE, "bundle"))
-            if record["devkit"] != __version__:
-                return None
-            return dict(record["scenarios"]), Tally.of(record["written"])
-        except (OSError, *MALFORMED):
-            return None
+    def is_written(self, unit: Unit) -> bool:
+        """Whether there is a record that a unit was written, from whatever files."""
+        return (self.parts(unit) / _DONE).exists()
 
-    def set_done(self, unit: Unit, scenarios: Mapping[str, Any], tally: Tally) -> None:
+    def done(self, unit: Unit, states: Mapping[str, Any]) -> Tally | None:
+        """The counts of a unit; None if this devkit has not written it from files of these states."""
+        content = self.store.kept(f"{self.name}/{unit.name}/{_DONE}", _key(states))
+        return None if content is None else Tally.of(parsed_json(content))
+
+    def set_done(self, unit: Unit, states: Mapping[str, Any], tally: Tally) -> None:
         """Record that a unit was written."""
-        record = {"devkit": __version__, "scenarios": scenarios, "written": tally.as_dict()}
-        write_bytes(self.parts(unit) / _DONE, json.dumps(record).encode())
-
-    @contextmanager
-    def alone(self, unit: Unit) -> Iterator[None]:
-        """Keep other processes and hosts from writing the same unit in the block."""
-        lock = held_lock(self.folder / f"{unit.name}{_LOCK}", f"writes {unit.name}")
-        try:
-            yield
-        finally:
-            lock.release()
+        self.store.keep(f"{self.name}/{unit.name}/{_DONE}", _key(states), json.dumps(tally.as_dict()).encode())
 
     @contextmanager
     def output(self, link: Link, unit: Unit | None = None) -> Iterator[Output]:
@@ -115,13 +114,12 @@ class Unfinished:
             self._remove_paths(_noted(journals[name]) - kept - above)
             remove_in(self.folder, name)
             journals[name].unlink()
-            (self.folder / f"{name}{_LOCK}").unlink(missing_ok=True)
 
-    def remove(self) -> None:
-        """Remove all of it."""
-        remove_in(self.root, f"{FOLDER}/{self.name}")
-        with suppress(OSError):  # another format's is there
-            (self.root / FOLDER).rmdir()
+    def remove(self, *, keep: bool) -> None:
+        """Remove all of it, or with `keep` the locks alone."""
+        if not keep:
+            self.store.drop(self.name)
+        self.store.remove(keep=any(self.store.folder.glob("kept/*")))  # another format's
 
     def _remove_half_written(self, paths: Collection[str]) -> None:
         """Remove the temporary files and folders of these paths."""
@@ -137,6 +135,10 @@ class Unfinished:
             remove_in(self.root, path)
             with suppress(OSError):
                 os.removedirs((self.root / path).parent)
+
+
+def _key(states: Mapping[str, Any]) -> str:
+    return digest_of({"devkit": __version__, "states": dict(states)})
 
 
 def _noted(journal: Path) -> set[str]:

@@ -1,11 +1,10 @@
-"""Results of the baselines in parts, on any executor, and after an interruption: the very bytes of one calm run."""
+"""Results of the baselines, shared, on any executor, and after an interruption: the very bytes of one calm run."""
 
 import multiprocessing
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pytest
 from deepaccident_devkit import DeepAccident, __version__
 from deepaccident_devkit.baselines import Baseline, predict_results
 from deepaccident_devkit.baselines.predict_results import is_predicted, samples_by_scenario
-from deepaccident_devkit.errors import ConfigError, NotAvailableError, ResultsError, SomeFailedError, UnfinishedError
+from deepaccident_devkit.errors import ConfigError, NotAvailableError, ResultsError, SomeFailedError
 from deepaccident_devkit.evaluation.results import ResultsTask, read_results
 from deepaccident_devkit.v2x import Link
 
@@ -27,7 +26,8 @@ def tokens(da_b: DeepAccident) -> list[str]:
     """Of four scenarios, two agents and two moments."""
     every = [each["token"] for each in da_b.sample if each["labelled"]]
     own = [token for token in every if token.split("/")[2] in ("ego_vehicle", "other_vehicle")]
-    return [token for run in samples_by_scenario(own)[:4] for token in run if token.endswith(("2", "4"))]
+    runs = list(samples_by_scenario(Path("out"), own).values())
+    return [token for run in runs[:4] for token in run if token.endswith(("2", "4"))]
 
 
 @pytest.fixture(scope="module")
@@ -72,65 +72,28 @@ def stopped_at(token: str, error: BaseException) -> Callable[..., Any]:
 
 
 def test_samples_are_taken_scenario_by_scenario(tokens: Sequence[str]) -> None:
-    runs = samples_by_scenario(tokens)
-    assert [len(run) for run in runs] == [4, 4, 4, 4]
-    assert [token for run in runs for token in run] == tokens
-    assert samples_by_scenario(["a/b/c/001", "a/d/c/001", "a/b/c/002"]) == [
-        ("a/b/c/001",),
-        ("a/d/c/001",),
-        ("a/b/c/002",),
-    ]
+    runs = samples_by_scenario(Path("out"), tokens)
+    assert [len(run) for run in runs.values()] == [4, 4, 4, 4]
+    assert [token for run in runs.values() for token in run] == tokens
+    assert samples_by_scenario(Path("out"), ["a/b/c/001", "a/d/c/001", "a/b/c/002"]) == {
+        "a/b": ("a/b/c/001", "a/b/c/002"),
+        "a/d": ("a/d/c/001",),
+    }
 
 
 @pytest.mark.parametrize("task", NAMES)
-@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 3, pytest.param(8, marks=pytest.mark.slow)])
-def test_shards_are_put_together_to_the_bytes_of_the_whole(
-    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, task: ResultsTask, count: int
+def test_several_calls_share_the_scenarios(
+    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, predicted: list[str], task: ResultsTask
 ) -> None:
     out = tmp_path / NAMES[task]
-    call = partial(predict_results, da_b, task, tokens, out, NOISY, workers=1)
-    with pytest.raises(UnfinishedError, match="16 of 16 are not done, such as"):
-        call(part="merge")
-    for number in range(count, 0, -1):
-        assert not is_predicted(da_b, task, tokens, out, NOISY)
-        call(part=f"{number}/{count}")
-        assert not out.exists()
-    assert call(part="merge") == out
+    with ThreadPoolExecutor(3) as threads:
+        made = threads.map(lambda _: predict_results(da_b, task, tokens, out, NOISY, workers=1), range(3))
+        assert list(made) == [out] * 3
+    assert sorted(predicted) == sorted(tokens)
     assert contents(out) == contents(wholes / NAMES[task])
     assert [path.name for path in tmp_path.iterdir()] == [NAMES[task]]
 
 
-def test_a_missing_shard_is_refused_or_done_without_one(
-    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "accident.json"
-    call = partial(predict_results, da_b, "accident", tokens, out, NOISY, workers=1)
-    call(part="1/3")
-    call(part="3/3")
-    with pytest.raises(UnfinishedError, match=rf"4 of 16 are not done, such as {tokens[4]}; run their shards again"):
-        call(part="merge")
-    assert not out.exists()
-    call()
-    assert contents(out) == contents(wholes / "accident.json")
-
-
-def test_shards_of_other_settings_or_samples_are_not_taken(
-    da_b: DeepAccident, tokens: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "accident.json"
-    predict_results(da_b, "accident", tokens, out, NOISY, workers=1, part="1/1")
-    for samples, baseline in ((tokens[:-1], NOISY), (tokens, Baseline())):
-        with pytest.raises(UnfinishedError, match=f"{len(samples)} of {len(samples)} are not done"):
-            predict_results(da_b, "accident", samples, out, baseline, part="merge")
-    module = import_module(
-        "deepaccident_devkit.baselines.predict_results"
-    )  # a function of the package is called so too
-    monkeypatch.setattr(module, "__version__", "another")
-    with pytest.raises(UnfinishedError, match="16 of 16 are not done"):
-        predict_results(da_b, "accident", tokens, out, NOISY, part="merge")
-
-
-@pytest.mark.parametrize("part", [None, "1/1"])
 def test_an_interrupted_call_loses_the_scenario_at_hand(
     da_b: DeepAccident,
     tokens: list[str],
@@ -138,22 +101,33 @@ def test_an_interrupted_call_loses_the_scenario_at_hand(
     tmp_path: Path,
     predicted: list[str],
     monkeypatch: pytest.MonkeyPatch,
-    part: str | None,
 ) -> None:
     call = partial(predict_results, da_b, "motion", tokens, tmp_path / "motion", NOISY, workers=1)
     with monkeypatch.context() as patch:
         patch.setattr(Baseline, "predict", stopped_at(tokens[6], KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
-            call(part=part)
+            call()
     assert predicted == tokens[:6]
     assert not (tmp_path / "motion").exists()
     del predicted[:]
-    call(part=part)
-    assert predicted == tokens[4:]
-    call(part=part)
-    call(part="merge")
+    call()
     assert predicted == tokens[4:]
     assert contents(tmp_path / "motion") == contents(wholes / "motion")
+
+
+def test_what_was_predicted_with_other_settings_or_samples_is_not_taken(
+    da_b: DeepAccident, tokens: list[str], tmp_path: Path, predicted: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "accident.json"
+    for samples, baseline in ((tokens[:-1], NOISY), (tokens, Baseline()), (tokens, NOISY)):
+        with monkeypatch.context() as patch:
+            patch.setattr(Baseline, "predict", stopped_at(samples[-1], KeyboardInterrupt()))
+            with pytest.raises(KeyboardInterrupt):
+                predict_results(da_b, "accident", samples, out, baseline, workers=1)
+    del predicted[:]
+    predict_results(da_b, "accident", tokens, out, NOISY, workers=1)
+    assert predicted == tokens[-4:]
+    assert [path.name for path in tmp_path.iterdir()] == ["accident.json"]
 
 
 def test_scenarios_that_fail_are_listed_and_the_others_done(
@@ -166,8 +140,6 @@ def test_scenarios_that_fail_are_listed_and_the_others_done(
         scenario = tokens[6].rsplit("/", 2)[0]
         with pytest.raises(SomeFailedError, match=rf"1 of 4 failed:\n  {scenario}: no such day\n"):
             call()
-        with pytest.raises(UnfinishedError, match=f"4 of 16 are not done, such as {tokens[4]}"):
-            call(part="merge")
     call()
     assert contents(out) == contents(wholes / "detection.json")
 
@@ -190,13 +162,11 @@ def test_complete_results_stay_and_others_are_refused(
     out = wholes / NAMES[task]
     before = contents(out)
     assert is_predicted(da_b, task, tokens, out, NOISY)
-    for part in (None, "1/3", "merge"):
-        assert predict_results(da_b, task, tokens, out, NOISY, part=part) == out
+    assert predict_results(da_b, task, tokens, out, NOISY) == out
     others = ((tokens[1:], NOISY), (tokens[::-1], NOISY), (tokens, Baseline(agents="+behind")))
     for samples, baseline in others:
-        for part in (None, "1/3", "merge"):
-            with pytest.raises(ResultsError, match=f"{out}: is there already; choose another path, or remove it"):
-                predict_results(da_b, task, samples, out, baseline, part=part)
+        with pytest.raises(ResultsError, match=f"{out}: is there already; choose another path, or remove it"):
+            predict_results(da_b, task, samples, out, baseline)
     broken = tmp_path / NAMES[task]
     broken.mkdir()
     (broken / "results.json").write_bytes(b"{}")
@@ -240,21 +210,3 @@ def test_any_executor_writes_the_same(
             path = predict_results(da_b, task, tokens, tmp_path / name, NOISY, executor=executor)
             assert contents(path) == contents(wholes / name)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(NAMES.values())
-
-
-def test_another_process_may_write_the_same_part(
-    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    call = partial(predict_results, da_b, "motion", tokens, tmp_path / "motion", NOISY, workers=1)
-    original, others = Baseline.predict, [0]
-
-    def predict(self: Baseline, dataset: Any, task: ResultsTask, token: str) -> Any:
-        if token == tokens[3] and not others[0]:
-            others[0] += 1
-            call(part="1/4")
-        return original(self, dataset, task, token)
-
-    monkeypatch.setattr(Baseline, "predict", predict)
-    call()
-    assert others == [1]
-    assert contents(tmp_path / "motion") == contents(wholes / "motion")

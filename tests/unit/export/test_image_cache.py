@@ -137,11 +137,16 @@ def test_another_release_and_agents_without_images_are_refused(
         cache.check_release(edited, [f"{scenario}/ego_vehicle"])
 
 
-def test_what_is_no_complete_cache_is_refused(da: DeepAccident, tmp_path: Path) -> None:
+def test_what_is_no_complete_cache_is_refused(
+    da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(ConfigError, match=r"holds no cache of images \(.*\); make one with deepaccident cache"):
         ImageCache(tmp_path)
     form = CachedImages(images=IMAGES, where=ALL, agents=("infrastructure",))
-    export_release(da, tmp_path / "out", form, workers=1, part="1/2")
+    with monkeypatch.context() as patch:
+        patch.setattr(CachedImages, "finish", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            export_release(da, tmp_path / "out", form, workers=1)
     with pytest.raises(ConfigError, match="is not complete; run the deepaccident cache that makes it again"):
         ImageCache(tmp_path / "out")
 

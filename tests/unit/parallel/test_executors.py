@@ -94,8 +94,6 @@ def test_errors_of_the_work_are_not_those_of_workers() -> None:
     [
         (["--scheduler", "tcp://x", "--scheduler-file", "f"], "name the same; give one of them"),
         (["--scheduler", "tcp://x", "--workers", "2"], "--workers changes nothing with a scheduler"),
-        (["--shard", "9/8"], "expected K/N with K from 1 to N"),
-        (["--shard", "1/8", "--merge"], "--merge puts all shards together; leave --shard out"),
     ],
 )
 def test_usage_errors(options: list[str], told: str) -> None:

@@ -1,6 +1,5 @@
-"""Validation on any executor and in shards: the same report as at once, and nothing is done twice."""
+"""Validation on any executor and by several processes: the same report as at once, and nothing is done twice."""
 
-import json
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -11,10 +10,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import ConfigError, TokenError, UnfinishedError
-from deepaccident_devkit.parallel import Shard
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.validation import ScenarioCheck, checks, merged_validation, validate_release, validation_shard
+from deepaccident_devkit.validation import ScenarioCheck, checks, validate_release
 from deepaccident_devkit.validation import validate as module
 from deepaccident_devkit.validation.validate import check_scenario
 
@@ -36,71 +34,61 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(deepaccident, ["validate", *map(str, arguments)], catch_exceptions=False)
 
 
-def refuse(*_: object, **__: object) -> Any:
-    raise AssertionError("nothing should be looked at")
-
-
 def test_an_executor_gives_the_same_report(root: Path, tmp_path: Path) -> None:
     whole = validate_release(root, workers=1)
     assert {finding.severity for finding in whole.findings} >= {"error", "warning"}
     with ThreadPoolExecutor(3) as executor:
         assert validate_release(root, executor=executor) == whole
         assert validate_release(root, executor=executor, parts=tmp_path / "parts") == whole
-    assert len(list((tmp_path / "parts").iterdir())) == 6
+    assert sum(path.is_file() for path in (tmp_path / "parts" / "kept").rglob("*")) == 6
 
 
-@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 3, pytest.param(8, marks=pytest.mark.slow)])
-def test_shards_merge_to_the_whole(root: Path, tmp_path: Path, count: int) -> None:
-    done = [validation_shard(root, Shard(number, count), tmp_path, workers=1) for number in range(count, 0, -1)]
-    assert sum(map(len, done)) == 6
-    for which in (None, [done[-1][0].token]):
-        whole = validate_release(root, workers=1, scenarios=which)
-        assert merged_validation(root, tmp_path, workers=1, scenarios=which).to_json() == whole.to_json()
-    with pytest.raises(TokenError, match="has no scenario 'nowhere'"):
-        merged_validation(root, tmp_path, scenarios=["nowhere"])
-
-
-def test_a_missing_shard_is_named_and_the_whole_goes_on(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kept = validation_shard(root, Shard(1, 2), tmp_path, workers=1)
-    with pytest.raises(UnfinishedError, match=r"^.*: 3 of 6 are not done, such as .*; run their shards again"):
-        merged_validation(root, tmp_path, workers=1)
-    whole, looked = validate_release(root, workers=1), []
+@pytest.fixture
+def looked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The scenarios that are looked at."""
+    tokens: list[str] = []
 
     def noted(scenario: Any, *, deep: bool) -> ScenarioCheck:
-        looked.append(scenario.token)
+        tokens.append(scenario.token)
         return check_scenario(scenario, deep=deep)
 
     monkeypatch.setattr(module, "check_scenario", noted)
-    assert validate_release(root, workers=1, parts=tmp_path) == whole
-    assert len(looked) == 3
-    assert not {check.token for check in kept} & set(looked)
+    return tokens
 
 
-def test_what_is_done_is_not_done_again(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done = validation_shard(root, Shard(1, 1), tmp_path, workers=1)
-    files = sorted(tmp_path.iterdir())
-    contents = [path.read_bytes() for path in files]
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "check_scenario", refuse)
-        assert validation_shard(root, Shard(1, 1), tmp_path, workers=1) == done
-    for damaged in (b"", contents[0][:-9], b"[]", b'{"token": 1}', b'{"findings": 3}'):
-        files[0].write_bytes(damaged)
-        with pytest.raises(UnfinishedError, match="1 of 6"):
-            merged_validation(root, tmp_path, workers=1)
-        assert validation_shard(root, Shard(1, 1), tmp_path, workers=1) == done
-        assert [path.read_bytes() for path in files] == contents
+def test_several_calls_with_one_folder_share_the_scenarios(root: Path, tmp_path: Path, looked: list[str]) -> None:
+    whole = validate_release(root, workers=1)
+    del looked[:]
+    with ThreadPoolExecutor(3) as threads:
+        reports = list(threads.map(lambda _: validate_release(root, workers=1, parts=tmp_path), range(3)))
+    assert reports == [whole] * 3
+    assert sorted(looked) == sorted(scenario.token for scenario in find_release(root).scenarios)
+
+
+def test_what_is_done_is_not_done_again(root: Path, tmp_path: Path, looked: list[str]) -> None:
+    some = find_release(root).scenarios[0].token
+    first = validate_release(root, workers=1, parts=tmp_path, scenarios=[some])
+    whole = validate_release(root, workers=1, parts=tmp_path)
+    assert len(looked) == 6
+    assert validate_release(root, workers=1, parts=tmp_path, scenarios=[some]) == first
+    assert len(looked) == 6
+    kept = next(path for path in (tmp_path / "kept").rglob("*") if path.is_file())
+    content = kept.read_bytes()
+    for damaged in (b"", content[:-9], b"[]"):
+        kept.write_bytes(damaged)
+        assert validate_release(root, workers=1, parts=tmp_path) == whole
+        assert kept.read_bytes() == content
+    assert len(looked) == 9
 
 
 @pytest.mark.parametrize("change", ["deep", "version", "limits", "label", "image", "image gone", "another place"])
-def test_what_was_found_in_other_files_or_ways_is_not_merged(
-    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
+def test_what_was_found_in_other_files_or_ways_is_not_taken(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looked: list[str], change: str
 ) -> None:
     """Files are changed in place, to the same size: only their own times tell."""
     parts = tmp_path / "parts"
-    validation_shard(small, Shard(1, 1), parts, workers=1)
-    assert merged_validation(small, parts, workers=1) == validate_release(small, workers=1)
+    validate_release(small, workers=1, parts=parts)
+    del looked[:]
     (image, *_), (label, *_) = (sorted(small.glob(pattern)) for pattern in ("**/Camera_Front/*/*", "**/label/*/*"))
     if change == "version":
         monkeypatch.setattr(checks, "__version__", "0.0")
@@ -113,8 +101,8 @@ def test_what_was_found_in_other_files_or_ways_is_not_merged(
         image.unlink()
     elif change == "another place":
         small = small.rename(tmp_path / "moved")
-    with pytest.raises(UnfinishedError, match="are not done"):
-        merged_validation(small, parts, workers=1, deep=change == "deep")
+    validate_release(small, workers=1, parts=parts, deep=change == "deep")
+    assert looked
 
 
 def test_a_check_survives_its_file(root: Path, small: Path) -> None:
@@ -131,26 +119,13 @@ def test_a_check_survives_its_file(root: Path, small: Path) -> None:
 def test_parts_need_a_folder(root: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="file is a file; give a folder"):
-        validation_shard(root, Shard(1, 1), tmp_path / "file")
-    with pytest.raises(ConfigError, match="file is a file; give a folder"):
         validate_release(root, parts=tmp_path / "file")
-    alone = run(root, "--merge")
-    assert (alone.exit_code, "give --parts FOLDER too" in alone.output) == (2, True)
 
 
 @pytest.mark.slow
 def test_the_verb_prints_the_same_report(root: Path, tmp_path: Path) -> None:
-    for options in (
-        ("--notes", "--all"),
-        ("--json",),
-        ("--deep",),
-        ("--scenario", find_release(root).scenarios[-1].token),
-    ):
-        whole, command = run(root, *options), (root, *options, "--parts", tmp_path)
-        parts = [run(*command, "--shard", f"{number}/3") for number in (1, 2, 3)]
-        assert [(part.exit_code, part.output.split(":")[0]) for part in parts] == [
-            (0, f"part {number}/3") for number in (1, 2, 3)
-        ]
-        merged = run(*command, "--merge")
-        assert (merged.output, merged.exit_code) == (whole.output, whole.exit_code)
-    assert json.loads(run(root, "--json", "--merge", "--parts", tmp_path).output)["scenarios"] == 6
+    for options in (("--notes", "--all"), ("--json",), ("--deep",)):
+        whole = run(root, *options)
+        for _ in range(2):
+            again = run(root, *options, "--parts", tmp_path)
+            assert (again.output, again.exit_code) == (whole.output, whole.exit_code)

@@ -136,7 +136,7 @@ def test_a_hostile_state_is_refused_in_few_words(tmp_path: Path) -> None:
     for state in (
         "[" * 10**6,
         json.dumps({"made_by": long, "settings": {}, "counts": {}, "repeated": []}),
-        json.dumps({"made_by": filled("a")._maker, "settings": {long: 1}, "counts": {}, "repeated": []}),
+        json.dumps({"made_by": filled("a").maker, "settings": {long: 1}, "counts": {}, "repeated": []}),
     ):
         path.write_text(state)
         with pytest.raises(EvaluationError, match="begin again") as raised:

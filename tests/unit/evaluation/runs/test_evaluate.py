@@ -265,11 +265,11 @@ class TestBrokenOff:
     ) -> None:
         out = tmp_path / "out"
         self.run_of(da_b, ten, out)
-        (kept,) = (tmp_path / "out.unfinished").iterdir()
-        kept.write_text(kept.read_text()[:-9])
+        (kept, _) = sorted((tmp_path / "out.unfinished").glob("counts/*/kept/*"))
+        kept.write_bytes(kept.read_bytes()[:-9])
         loaded = broken_after(None)
         self.run_of(da_b, ten, out)
-        assert len(loaded) == 10
+        assert len(loaded) in (8, 2)
 
     def test_the_name_says_all_that_counts(self, tmp_path: Path) -> None:
         prints = {"results": "a", "release": "b"}
@@ -283,18 +283,17 @@ class TestBrokenOff:
             )
         }
         assert len(names) == 4
-        assert {name.parent for name in names} == {tmp_path / "out.unfinished"}
+        assert {name.parent for name in names} == {tmp_path / "out.unfinished" / "counts"}
 
     def test_removing_leaves_what_is_not_its_own(self, tmp_path: Path) -> None:
-        path = checkpoint_path(tmp_path / "out", SETUP, ["x"], {})
-        path.parent.mkdir()
-        path.touch()
-        (path.parent / "mine.txt").touch()
+        folder = tmp_path / "out.unfinished"
+        checkpoint_path(tmp_path / "out", SETUP, ["x"], {}).mkdir(parents=True)
+        (folder / "mine.txt").touch()
         remove_checkpoints(tmp_path / "out")
-        assert [each.name for each in path.parent.iterdir()] == ["mine.txt"]
-        (path.parent / "mine.txt").unlink()
+        assert [each.name for each in folder.iterdir()] == ["mine.txt"]
+        (folder / "mine.txt").unlink()
         remove_checkpoints(tmp_path / "out")
-        assert not path.parent.exists()
+        assert not folder.exists()
 
 
 def test_warnings_are_broken_down_by_whole_recordings_alone() -> None:

@@ -24,11 +24,6 @@ from deepaccident_devkit.parallel import run_unordered
 VALUES = {f"{index:02d}": float(10 ** (index % 17)) + index / 10 for index in range(40)}
 
 
-@pytest.fixture
-def often_saved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(many_samples, "_SAVE_SECONDS", 0.0)
-
-
 def done(folder: Path) -> int:
     """How many tasks were done."""
     return len(list(folder.iterdir()))
@@ -122,7 +117,7 @@ class TestFaults:
 
 class TestCheckpoints:
     def test_a_run_that_raises_goes_on(self, tmp_path: Path) -> None:
-        path, folder = tmp_path / "runs" / "state.json", tmp_path / "trace"
+        path, folder = tmp_path / "runs" / "counts", tmp_path / "trace"
         folder.mkdir()
         load = partial(number_and_trace, folder)
         with pytest.raises(EvaluationError, match="30: cannot be"):
@@ -130,17 +125,16 @@ class TestCheckpoints:
         before = done(folder)
         evaluator = evaluate_samples(Sums(), VALUES, load, workers=1, checkpoint=path)
         assert evaluator.compute() == sum_of_all()
-        assert (before, done(folder)) == (40, 40 + 1)  # all others are kept
+        assert (before, done(folder)) == (40, 40 + 8)  # all other batches are kept
         again = evaluate_samples(Sums(), VALUES, load, workers=2, checkpoint=path)
-        assert done(folder) == 40 + 1
+        assert done(folder) == 40 + 8
         assert dict(again.counts) == dict(evaluator.counts)
         assert not again.repeated
-        assert [each.name for each in path.parent.iterdir()] == ["state.json"]
 
     @pytest.mark.slow
     @pytest.mark.parametrize("workers", [1, 2])
     def test_a_killed_run_goes_on(self, tmp_path: Path, workers: int) -> None:
-        path, folder = tmp_path / "state.json", tmp_path / "trace"
+        path, folder = tmp_path / "counts", tmp_path / "trace"
         folder.mkdir()
         values = {f"{index:03d}": 0.1 * index for index in range(160)}
         script = f"""
@@ -148,9 +142,7 @@ class TestCheckpoints:
             from pathlib import Path
             from evaluating import Sums, number_and_trace
             from deepaccident_devkit.evaluation import evaluate_samples
-            from deepaccident_devkit.evaluation.runs import many_samples
 
-            many_samples._SAVE_SECONDS = 0.0
             values = {{f"{{index:03d}}": 0.1 * index for index in range(160)}}
             load = partial(number_and_trace, Path({str(folder)!r}))
             evaluate_samples(Sums(), values, load, workers={workers}, checkpoint={str(path)!r})
@@ -165,7 +157,7 @@ class TestCheckpoints:
         finally:
             process.kill()
             process.wait()
-        kept = len(Sums().resume(path))
+        kept = many_samples._BATCH * len(list(path.glob("kept/*")))
         assert 0 < kept < 160
         before = done(folder)
         evaluator = evaluate_samples(Sums(), values, partial(number_and_trace, folder), workers=1, checkpoint=path)
@@ -173,47 +165,20 @@ class TestCheckpoints:
         late = 2 * many_samples._BATCH  # workers of the killed run end a moment later
         assert done(folder) <= before + 160 - kept + late
 
-    @pytest.mark.usefixtures("often_saved")
-    def test_counts_are_saved_on_the_way(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        sizes: list[int] = []
-        monkeypatch.setattr(Sums, "save", lambda self, _: sizes.append(len(self)))
-        evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=tmp_path / "state.json")
-        assert sizes == [0, 8, 16, 24, 32, 40, 40]
-
-    def test_counts_that_are_there_twice_are_no_repeated_samples(self, tmp_path: Path) -> None:
-        path = tmp_path / "state.json"
+    def test_of_other_settings_or_damaged(self, tmp_path: Path) -> None:
+        path = tmp_path / "counts"
+        evaluate_samples(Sums(scale=2.0), {**VALUES, "00": 1000.0}, number, workers=1, checkpoint=path)
         evaluator = evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=path)
+        assert evaluator.compute() == sum_of_all()
         assert not evaluate_samples(evaluator, VALUES, number, workers=1, checkpoint=path).repeated
-        other = Sums()
-        other.update("00", 5.0)
-        with pytest.raises(EvaluationError, match="00: evaluated twice, with different results"):
-            evaluate_samples(other, VALUES, number, workers=1, checkpoint=path)
-
-    def test_of_other_settings_or_samples(self, tmp_path: Path) -> None:
-        path = Sums(scale=2.0).save(tmp_path / "state.json")
-        before = path.read_bytes()
-        with pytest.raises(EvaluationError, match="was saved with other settings"):
-            evaluate_samples(Sums(), VALUES, number, checkpoint=path)
-        assert path.read_bytes() == before
-        evaluate_samples(Sums(scale=2.0), VALUES, number, workers=1, checkpoint=path)
-        with pytest.raises(EvaluationError, match=r"has 39 samples that are not among these, such as 01; give each"):
-            evaluate_samples(Sums(scale=2.0), {"00": VALUES["00"]}, number, workers=1, checkpoint=path)
-
-    def test_a_damaged_one(self, tmp_path: Path) -> None:
-        path = tmp_path / "state.json"
-        path.write_text('{"settings": {"scale"')
-        with pytest.raises(EvaluationError, match=r"state\.json: no saved evaluation .*; begin again"):
-            evaluate_samples(Sums(), VALUES, number, checkpoint=path)
+        for kept in path.glob("kept/*"):
+            kept.write_bytes(kept.read_bytes()[1:])
+        assert evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=path).compute() == sum_of_all()
 
     def test_where_none_can_be_written_is_told_at_once(self, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
-        with pytest.raises(EvaluationError, match="cannot be saved"):
-            evaluate_samples(Sums(), {"x": BROKEN}, number, workers=1, checkpoint=tmp_path / "file" / "state.json")
-
-
-def test_the_bar_counts_samples(capsys: pytest.CaptureFixture[str]) -> None:
-    evaluate_samples(Sums(), VALUES, number, workers=1, progress=True)
-    assert "40/40" in capsys.readouterr().err
+        with pytest.raises(EvaluationError, match="file/counts: cannot be written"):
+            evaluate_samples(Sums(), {"x": BROKEN}, number, workers=1, checkpoint=tmp_path / "file" / "counts")
 
 
 def test_a_closed_run_begins_nothing_more(tmp_path: Path) -> None:

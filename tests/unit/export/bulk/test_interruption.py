@@ -17,7 +17,7 @@ from tiny_format import TinyFormat
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.bulk.manifest import writing_to
+from deepaccident_devkit.export.bulk.unfinished import Unfinished
 
 pytestmark = pytest.mark.slow
 
@@ -111,24 +111,24 @@ def test_a_full_disk(tmp_path: Path, job: Job, whole: dict[str, bytes | None], l
     """A limit on files' sizes stands for the disk."""
     answer = job(tmp_path / "out", limit=limit)
     assert answer["status"] == 1
-    assert answer["message"].startswith(f"ExportError: {tmp_path / 'out'}: the export cannot be written (")
+    assert answer["message"].startswith(f"ExportError: {tmp_path / 'out'}: cannot be written (")
     assert answer["message"].endswith("; make room there, or choose another folder, and run it again")
     assert not [name for name in contents(tmp_path / "out") if ".tmp" in name]
     assert job(tmp_path / "out")["status"] == 0
     assert contents(tmp_path / "out") == whole
 
 
-def test_one_process_waits_for_another(small_root: Path, tmp_path: Path, whole: dict[str, bytes | None]) -> None:
+def test_processes_share_an_export(small_root: Path, tmp_path: Path, whole: dict[str, bytes | None]) -> None:
     script = "import sys, tiny_format; tiny_format.export_tiny(sys.argv[1], sys.argv[2], 1)"
     command = [sys.executable, "-c", script, str(small_root), str(tmp_path / "out")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    with writing_to(tmp_path / "out"):
+    with Unfinished(tmp_path / "out", "tiny", "another command").store.shared():
         processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) for _ in range(2)]
         for process in processes:
             assert process.stderr
             assert "another process writes an export there; waiting for it" in process.stderr.readline()
-        assert contents(tmp_path / "out").keys() == {".deepaccident.lock"}
+        assert not (tmp_path / "out" / "tiny.manifest.json").exists()
     for process in processes:
-        assert process.communicate(timeout=60)[1] == ""
+        process.communicate(timeout=60)
         assert process.returncode == 0
     assert contents(tmp_path / "out") == whole

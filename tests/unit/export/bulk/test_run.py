@@ -98,9 +98,9 @@ def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
     plans: list[tuple[Plan, int]] = []
     done = written(small, tmp_path / "deep" / "out", on_plan=lambda plan, free: plans.append((plan, free)))
     there = {name for name, content in contents(done.folder).items() if content is not None}
-    files = {name for name in there if not name.startswith(".deepaccident-parts/tiny/")}
-    assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 2
-    assert {MANIFEST, ".deepaccident.lock", "counts.json"} < files
+    files = {name for name in there if not name.startswith(".deepaccident-parts/")}
+    assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 1
+    assert {MANIFEST, "counts.json"} < files
     assert plans == [(done.plan, plans[0][1])]
     assert plans[0][1] > 0
     assert (done.plan.samples, done.plan.files, done.plan.linked_files) == (PICTURES, 9, PICTURES)
@@ -201,14 +201,14 @@ def test_a_folder_with_other_things_is_refused(small: DeepAccident, tmp_path: Pa
         written(small, tmp_path)
     with pytest.raises(ExportError, match=r"notes.txt: is a file; give a folder"):
         written(small, tmp_path / "notes.txt")
-    with pytest.raises(ExportError, match=r"no export can be written there \(.*Not a directory"):
+    with pytest.raises(ExportError, match=r"cannot be written \(.*Not a directory"):
         written(small, tmp_path / "notes.txt" / "out")
     assert states(tmp_path) == before
 
 
 def test_what_was_left_before_the_manifest_is_no_other_thing(small: DeepAccident, whole: Path, tmp_path: Path) -> None:
-    (tmp_path / ".deepaccident.lock").touch()
-    (tmp_path / ".deepaccident-parts" / "tiny").mkdir(parents=True)
+    (tmp_path / ".deepaccident-parts" / "kept" / "tiny").mkdir(parents=True)
+    (tmp_path / ".deepaccident-parts" / ".lock").touch()
     temporary_path(tmp_path / MANIFEST).touch()
     assert contents(written(small, tmp_path).folder) == contents(whole)
 
@@ -222,10 +222,10 @@ def test_a_place_that_cannot_be_written_to(
     small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, 1 << 30))  # the system says none for /proc
-    with pytest.raises(ExportError, match=r"/proc/out: no export can be written there .*; choose another folder"):
+    with pytest.raises(ExportError, match=r"/proc/out: cannot be written .*; make room there, or choose"):
         written(small, Path("/proc/out"))
-    (tmp_path / ".deepaccident.lock").mkdir()
-    with pytest.raises(ExportError, match="no export can be written there"):
+    (tmp_path / ".deepaccident-parts" / ".lock").mkdir(parents=True)
+    with pytest.raises(ExportError, match="cannot be written"):
         written(small, tmp_path)
 
 
@@ -240,7 +240,7 @@ def test_an_export_beside_another(small: DeepAccident, tmp_path: Path, monkeypat
     monkeypatch.setattr(Beside, "finish", lambda *_: None)
     written(small, out, Beside())
     new = contents(out).keys() - before.keys()
-    assert {name for name in new if not name.startswith(".deepaccident-parts/beside")} == {"beside.manifest.json"}
+    assert {name for name in new if not name.startswith(".deepaccident-parts/kept/beside")} == {"beside.manifest.json"}
     assert written(small, out).kept == SCENARIOS
     with pytest.raises(ExportError, match="is not empty"):
         written(small, written(small, tmp_path / "other", Beside()).folder)
@@ -328,14 +328,6 @@ class TestRelease:
         assert written(reopened(changing), out).written == 0
         next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
         assert written(reopened(changing), out).written == SCENARIOS
-
-    def test_shards_of_a_changed_export(self, changing: Path, tmp_path: Path) -> None:
-        out = written(reopened(changing), tmp_path / "out").folder
-        next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
-        parts = [written(reopened(changing), out, part=f"{number}/2").written for number in (1, 2)]
-        assert sum(parts) == 1
-        assert written(reopened(changing), out, part="merge").kept == SCENARIOS
-        assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
 
     def test_an_unfinished_export_is_continued_with_the_new_state(self, changing: Path, tmp_path: Path) -> None:
         dataset = reopened(changing)
@@ -502,7 +494,7 @@ class TestDamage:
         self, small: DeepAccident, whole: Path, tmp_path: Path, text: str | None
     ) -> None:
         stopped(small, tmp_path / "out", 2)
-        record = next((tmp_path / "out").glob(".deepaccident-parts/tiny/*/done.json"))
+        record = next((tmp_path / "out").glob(".deepaccident-parts/kept/tiny/*/done"))
         if text is None:
             record.unlink()
             os.mkfifo(record)
@@ -519,7 +511,7 @@ class TestDamage:
         stopped(small, tmp_path / "out", 1)
         kept = tmp_path / "kept.txt"
         kept.touch()
-        for journal in (tmp_path / "out" / ".deepaccident-parts" / "tiny").glob("*.paths"):
+        for journal in (tmp_path / "out" / ".deepaccident-parts" / "kept" / "tiny").glob("*.paths"):
             with journal.open("ab") as file:
                 file.write(f"{path.format(root=tmp_path)}\0".encode(errors="surrogateescape"))
             shutil.rmtree(journal.with_name(journal.name.removesuffix(".paths")), ignore_errors=True)

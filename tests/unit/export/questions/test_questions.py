@@ -222,13 +222,11 @@ def test_the_readme_and_the_schema(asked: Asked) -> None:
 
 
 @pytest.mark.slow
-def test_workers_and_shards_write_the_same_bytes(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
+def test_workers_write_the_same_bytes(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
     export_release(da_motion, tmp_path / "two", FORM, workers=2)
-    for part in ("2/2", "1/2", "merge"):
-        export_release(da_motion, tmp_path / "shards", FORM, workers=1, part=part)
     for name in ("questions/questions.jsonl", "truth.jsonl", "questions/README.md", "questions.manifest.json"):
-        there = [(folder / name).read_bytes() for folder in (asked.done.folder, tmp_path / "two", tmp_path / "shards")]
-        assert there[0] == there[1] == there[2]
+        there = [(folder / name).read_bytes() for folder in (asked.done.folder, tmp_path / "two")]
+        assert there[0] == there[1]
 
 
 def without(folder: str) -> Callable[[Path, str], None]:

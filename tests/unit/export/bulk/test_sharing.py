@@ -1,7 +1,8 @@
-"""Exports in shards: the merged bytes, what is missing, failed scenarios, workers that were taken for lost."""
+"""Exports that several processes write: their bytes, failed scenarios, workers that were taken for lost."""
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,11 @@ import pytest
 from tiny_format import TinyFormat
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ExportError, ReleaseError, SomeFailedError, UnfinishedError
+from deepaccident_devkit.errors import ReleaseError, SomeFailedError
 from deepaccident_devkit.export.bulk import Exported, export_release
-from deepaccident_devkit.export.bulk.manifest import writing_to
+from deepaccident_devkit.export.bulk.manifest import Manifest
+from deepaccident_devkit.export.bulk.run import _Work
 from deepaccident_devkit.export.bulk.unfinished import Unfinished
-from deepaccident_devkit.export.mmdet3d import Mmdet3d
-from deepaccident_devkit.parallel import MERGE, Shard
 from deepaccident_devkit.selection import find
 
 SCENARIOS = 3
@@ -28,30 +28,13 @@ def written(small: DeepAccident, folder: Path, **options: Any) -> Exported:
     return export_release(small, folder, TinyFormat(), workers=1, **options)
 
 
-@pytest.mark.parametrize("count", [1, 2, 8])
-def test_shards_merge_to_the_same_bytes(small: DeepAccident, tmp_path: Path, count: int) -> None:
+def test_several_calls_share_the_scenarios(small: DeepAccident, tmp_path: Path) -> None:
     whole = written(small, tmp_path / "whole")
-    shards = [written(small, tmp_path / "shards", part=f"{number}/{count}") for number in range(count, 0, -1)]
-    assert sum(each.written for each in shards) == SCENARIOS
-    assert sum(each.plan.samples for each in shards) == whole.plan.samples
-    merged = written(small, tmp_path / "shards", part=MERGE)
-    assert (merged.written, merged.kept) == (0, SCENARIOS)
-    assert merged.tally == whole.tally
-    assert contents(tmp_path / "shards") == contents(tmp_path / "whole")
-    again = written(small, tmp_path / "shards", part=Shard(1, count))
-    assert again.written == 0
-
-
-def test_a_missing_shard(small: DeepAccident, tmp_path: Path) -> None:
-    written(small, tmp_path, part="1/3")
-    with pytest.raises(UnfinishedError, match=rf"^{tmp_path}: 2 of {SCENARIOS} are not done, such as \S+; run their"):
-        written(small, tmp_path, part=MERGE)
-    assert written(small, tmp_path).written == 2  # the whole does what is left
-
-
-def test_mmdet3d_needs_the_whole_nuscenes_export(small: DeepAccident, tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="holds no complete nuscenes export"):
-        export_release(small, tmp_path / "out", Mmdet3d(), part="1/2")
+    with ThreadPoolExecutor(3) as threads:
+        done = list(threads.map(lambda _: written(small, tmp_path / "shared"), range(3)))
+    assert sum(each.written for each in done) == SCENARIOS
+    assert {each.tally.files for each in done} == {whole.tally.files}
+    assert contents(tmp_path / "shared") == contents(tmp_path / "whole")
 
 
 def test_the_rest_is_done(small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,49 +68,35 @@ def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
         output.tally.files, output.tally.bytes = 0, 0
         whole(self, dataset, unit, output)
 
-    first = {"part": "1/3"}
     with monkeypatch.context() as patch:
         patch.setattr(TinyFormat, "write", write)
-        lost = threading.Thread(target=written, args=(small, tmp_path / "out"), kwargs=first)
+        form, unit = TinyFormat(), TinyFormat().units(small, [find(small)[0]["token"]])[0]
+        unfinished = Unfinished(tmp_path / "out", "tiny")
+        Manifest(name="tiny", settings={**form.settings(), "version": small.version}).write(unfinished.root)
+        lost = threading.Thread(
+            target=unfinished.store.run, args=(_Work(small, form, unfinished).write, {unit.name: (unit, ())})
+        )
         lost.start()
         assert begun.wait(20)
-    again = threading.Thread(target=written, args=(small, tmp_path / "out"), kwargs=first)
+    again = threading.Thread(target=written, args=(small, tmp_path / "out"))
     again.start()
     time.sleep(0.3)
     assert again.is_alive()
     go_on.set()
     lost.join()
     again.join()
-    written(small, tmp_path / "out")
     written(small, tmp_path / "whole")
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
 def test_what_another_host_left_of_a_unit_is_removed(small: DeepAccident, tmp_path: Path) -> None:
-    written(small, tmp_path / "out", part="1/3")
+    written(small, tmp_path / "out")
     unfinished = Unfinished(tmp_path / "out", "tiny")
-    (unit,) = (each.name.removesuffix(".paths") for each in unfinished.folder.glob("*.paths"))
-    (unfinished.folder / unit / "done.json").unlink()
+    unit = min(each.name.removesuffix(".paths") for each in unfinished.folder.glob("[!.]*.paths"))
+    unfinished.store.drop(f"tiny/{unit}/done")
+    settings = {**TinyFormat().settings(), "version": small.version}
+    Manifest(name="tiny", settings=settings).write(unfinished.root)
     left = tmp_path / "out" / "folders" / f".{unit[:50]}.0123abcd-77-99-1.tmp"
     left.mkdir()
-    other = left.with_name(".another.0123abcd-77-99-1.tmp")
-    other.mkdir()
-    written(small, tmp_path / "out", part="1/3")
+    written(small, tmp_path / "out")
     assert not left.exists()
-    assert other.exists()  # of a unit that may be written at this moment
-
-
-def test_shards_write_together_and_the_merging_waits(tmp_path: Path) -> None:
-    merging = threading.Event()
-
-    def merge() -> None:
-        with writing_to(tmp_path):
-            merging.set()
-
-    with writing_to(tmp_path, shared=True):
-        with writing_to(tmp_path, shared=True):
-            thread = threading.Thread(target=merge)
-            thread.start()
-        assert not merging.wait(0.2)
-    thread.join(10)
-    assert merging.is_set()

@@ -1,0 +1,297 @@
+"""One result an item of bulk work, such as a scenario: made once, by whichever process comes to it first.
+
+Processes, also on several hosts, that are given the same command and the same folder share its items. Each makes what
+nobody else is making; one that finds no such item waits for the others; then one of them after the other has the folder
+alone. The first writes what spans the items; the others see that it is there. Another command waits for its turn.
+
+The folder is the devkit's own, and hidden from whoever uses what is made:
+
+    .lock         held together by all that take part, and by one alone before that; says for which command
+    .making       held together while items are made, and by one alone after that
+    locks/NAME    held while an item is made
+    kept/NAME     a result: its bytes, and a seal of these and of a key, which says what it was made from
+
+Locks are `flock`, which network file systems pass on (docs/clusters.md). The system takes them back from a process that
+ends, however it ends. A result is written under a temporary name and renamed: it is whole or not there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Generic, TypeVar
+
+from deepaccident_devkit.errors import DeepAccidentError
+from deepaccident_devkit.files import place_in, remove_in, say_waiting, write_bytes
+from deepaccident_devkit.parallel.batches import run_batch
+from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
+from deepaccident_devkit.reading import FileKind, read_bytes
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+_SEAL: Final = 16
+"""Bytes after a result."""
+_LOCKS: Final = (".lock", ".making")
+
+
+@dataclass(frozen=True, slots=True)
+class Store:
+    """The folder of the results of some bulk work; cheap to pickle.
+
+    Attributes:
+        folder: it need not exist. The caller has checked that no link leads there; below it none is followed.
+        out: the place of what is made, for messages.
+        task: what those who hold its lock do, such as `writes labels`, for who waits for them.
+        error: raised if something cannot be written.
+        command: a digest of what is made. Only those who make the same share the folder.
+    """
+
+    folder: Path
+    out: Path
+    task: str
+    error: type[DeepAccidentError]
+    command: str = ""
+
+    def path(self, name: str) -> Path:
+        """Where the result of an item lies; raises OutputFolderError if a link leads there, or it is one."""
+        return place_in(self.folder, f"kept/{name}", opened=True)
+
+    def kept(self, name: str, key: str, kind: FileKind = "bundle") -> bytes | None:
+        """A result; None if there is none that was made from what `key` says, or it is damaged.
+
+        Args:
+            name: of the item; a path below the folder.
+            key: a digest of all that decides the result, such as files and settings.
+            kind: of the file, which limits its size.
+
+        Raises:
+            OutputFolderError: a link leads there.
+        """
+        try:
+            content = read_bytes(self.path(name), kind)
+        except OSError:
+            return None
+        return content[:-_SEAL] if content[-_SEAL:] == _seal(key, content[:-_SEAL]) else None
+
+    def keep(self, name: str, key: str, content: bytes) -> None:
+        """Keep a result in place of an earlier one of this name; raises OSError or OutputFolderError."""
+        write_bytes(self.path(name), content + _seal(key, content))
+
+    def drop(self, name: str) -> None:
+        """Remove a result, if it is there; raises OSError or OutputFolderError."""
+        remove_in(self.folder, f"kept/{name}")
+
+    def remove(self, *, keep: bool = False) -> None:
+        """Remove all of it, or all but results, once the whole is written; who waits for its locks sees that.
+
+        Raises:
+            OSError, OutputFolderError: something cannot be removed, or there is a link on the way.
+        """
+        for name in ("locks", *_LOCKS, *(() if keep else ("kept",))):
+            remove_in(self.folder, name)
+        with suppress(OSError):  # something else is there, or another process has begun again
+            self.folder.rmdir()
+
+    @contextmanager
+    def shared(
+        self, begin: Callable[[], object] = lambda: None, *, tidy: Callable[[], object] = lambda: None
+    ) -> Iterator[Turn]:
+        """Take part in the work on the items, together with others, while the block runs.
+
+        Args:
+            begin: called before that, if nobody else takes part.
+            tidy: removes what killed processes left; called before `begin`, and after an error, if nobody else makes
+                items.
+
+        Raises:
+            OutputFolderError: the folder or its lock is a link.
+            DeepAccidentError: of the kind `error`, for any OSError: the folder cannot be made or written to, its file
+                system has no locks, the disk is full.
+        """
+        turn = Turn(self)
+        try:
+            turn.join(lambda: (tidy(), begin()))
+            yield turn
+        except BaseException as error:
+            with suppress(OSError):
+                if turn.alone(wait=False):
+                    tidy()
+            if isinstance(error, DeepAccidentError) or not isinstance(error, OSError):
+                raise
+            remedy = "make room there, or choose another folder, and run it again"
+            raise self.error(f"{self.out}: cannot be written ({error}); {remedy}") from error
+        finally:
+            turn.tidy()
+            turn.end()
+
+    def run(self, work: Callable[[Item], Result], items: Mapping[str, Item], **how: Any) -> dict[str, Result]:
+        """Apply `work` to every item that no other process has at hand; then to those, once they have been let go.
+
+        Args:
+            work: an importable function, or an object that can be pickled. It has the item alone, and looks first
+                whether its result is there.
+            items: name → item; names are paths.
+            **how: of `run_batch`: `workers`, `executor`, `label`, `progress`, `places`.
+
+        Returns:
+            Name → result, in the order of the items.
+
+        Raises:
+            SomeFailedError: some items failed, as `Tried` has it; the others are done.
+            OSError: an item cannot be locked, or its result cannot be written.
+            ChoiceError, WorkerError: as of `run_batch`.
+        """
+        results: dict[str, Result | Failure | _AtHand] = {}
+        left = list(items.items())
+        for wait in (False, True):
+            if wait and left:
+                say_waiting(self.out, self.task)
+            done = run_batch(Tried(_Alone(self, work, wait=wait)), left, **how) if left else []
+            results |= {name: result for (name, _), result in zip(left, done, strict=True)}
+            left = [each for each in left if isinstance(results[each[0]], _AtHand)]
+        check_failures(results.items(), str(self.out))
+        return {name: each for name, each in results.items() if not isinstance(each, Failure | _AtHand)}
+
+    def lock_path(self, name: str) -> Path:
+        """The lock of an item; raises OutputFolderError if a link leads there."""
+        return place_in(self.folder, f"locks/{name}", opened=True)
+
+
+class Turn:
+    """The part of one process in the work on a store: first beside others, at the end alone."""
+
+    def __init__(self, store: Store) -> None:
+        """Hold nothing yet."""
+        self._store = store
+        self._lock = self._making = -1
+
+    def join(self, begin: Callable[[], object]) -> None:
+        """Take part together with others who make the same; as of `Store.shared`."""
+        import fcntl
+
+        command, others = self._store.command.encode(), False
+        while True:
+            self.end()
+            self._lock, self._making = (_opened(place_in(self._store.folder, name, opened=True)) for name in _LOCKS)
+            if self._take(self._lock, fcntl.LOCK_EX, wait=others) and self._is_there():
+                begin()
+                os.ftruncate(self._lock, 0)
+                os.pwrite(self._lock, command, 0)
+            fcntl.flock(self._lock, fcntl.LOCK_UN)
+            self._take(self._lock, fcntl.LOCK_SH)
+            others = os.pread(self._lock, len(command) + 1, 0) != command
+            if not others and self._take(self._making, fcntl.LOCK_SH) and self._is_there():
+                return  # else another process has finished just now, or makes something else
+
+    def alone(self, *, wait: bool = True) -> bool:
+        """Wait until no other process makes items; no, if one of them has finished meanwhile and removed the store.
+
+        If this process does not wait, and others make items, the answer is no too.
+        """
+        import fcntl
+
+        if self._making < 0:  # it could not join
+            return False
+        fcntl.flock(self._making, fcntl.LOCK_UN)  # NFS: two that hold it together would wait for each other
+        return self._take(self._making, fcntl.LOCK_EX, wait=wait) and self._is_there()
+
+    def tidy(self) -> None:
+        """Remove the store if nothing is kept and nobody makes items, nor a worker whose caller was stopped."""
+        folder = self._store.folder
+        with suppress(OSError):
+            if not self.alone(wait=False) or any(folder.glob("kept/*")):
+                return
+            if not any(_is_held(path) for path in folder.glob("locks/**/*") if path.is_file()):
+                self._store.remove()
+
+    def end(self) -> None:
+        """Give the locks back that are held."""
+        for file in (self._making, self._lock):
+            if file >= 0:
+                os.close(file)
+        self._lock = self._making = -1
+
+    def _take(self, file: int, kind: int, *, wait: bool = True) -> bool:
+        """Take the lock of an open file; false if another process holds it and this one does not wait."""
+        import fcntl
+
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if not wait:
+                return False
+            say_waiting(self._store.out, self._store.task)
+            fcntl.flock(file, kind)
+        return True
+
+    def _is_there(self) -> bool:
+        """Whether the lock that is held is the one that others find by its name."""
+        try:
+            found, held = (self._store.folder / _LOCKS[0]).lstat(), os.fstat(self._lock)
+        except OSError:
+            return False
+        return (found.st_dev, found.st_ino) == (held.st_dev, held.st_ino)
+
+
+@dataclass(frozen=True, slots=True)
+class _AtHand:
+    """In place of a result: another process has the item."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Alone(Generic[Item, Result]):
+    """Work on an item whose lock is held; cheap to pickle."""
+
+    store: Store
+    work: Callable[[Item], Result]
+    wait: bool
+
+    def __call__(self, named: tuple[str, Item]) -> Result | _AtHand:
+        import fcntl
+
+        name, item = named
+        file = _opened(self.store.lock_path(name))
+        try:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if self.wait else fcntl.LOCK_NB))
+            except BlockingIOError:
+                return _AtHand()
+            return self.work(item)
+        finally:
+            os.close(file)
+
+
+def unfinished_folder(out: Path) -> Path:
+    """The folder beside `out` for what is not finished; raises OutputFolderError if it is a link."""
+    place = out.absolute()
+    return place_in(place.parent, f"{place.name}.unfinished", opened=True)
+
+
+def _opened(lock: Path) -> int:
+    """The file of a lock, which is made where it is not there; its folder too."""
+    while True:
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # another process has just removed the folder
+            return os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+
+
+def _is_held(lock: Path) -> bool:
+    """Whether a process has an item."""
+    import fcntl
+
+    file = _opened(lock)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(file)
+    return False
+
+
+def _seal(key: str, content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=_SEAL, key=hashlib.blake2b(key.encode()).digest()).digest()
