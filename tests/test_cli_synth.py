@@ -208,5 +208,5 @@ def test_a_design_is_shown_as_a_file_to_begin_with():
 def test_help_names_every_option():
     text = CliRunner().invoke(synth, ["--help"]).output
     named = {option for parameter in synth.params for option in parameter.opts if option.startswith("--")}
-    assert len(named) == 21
+    assert len(named) == 19
     assert all(option in text for option in named)

@@ -22,6 +22,7 @@ NOT_FOR_USERS = {
         "json_text",
         "nuscenes_names",
         "overview",
+        "pages",
         "parallel",
         "reading",
         "tables",

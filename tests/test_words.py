@@ -59,7 +59,7 @@ def test_all_words_are_spelt_right() -> None:
 
 
 def test_a_misspelling_is_found(tmp_path: Path) -> None:
-    page, module = tmp_path / "page.md", tmp_path / "module.py"
+    page, module = (tmp_path / "page").with_suffix(".md"), tmp_path / "module.py"
     page.write_text("Two vehicles colide at the `juncton`, and\n[a link](#junctoin).\n\n    colid\n\n```\ncolid\n```\n")
     module.write_text(
         '"""A modul.\n\nArgs:\n    colide: a wrod, `colide`.\n\n>>> colide\n"""\ncolid = "colid"  # colid\n'

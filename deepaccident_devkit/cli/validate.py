@@ -52,7 +52,7 @@ def validate(
     how |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
     if files:
         refuse_unused("with --files, which opens no file", "deep", "notes", "whole", "parts")
-        del how["deep"]
+        del how["deep"], how["parts"]
         counted = release_completeness(dataroot, **how)
         click.echo(counted.to_json() if as_json else counted.to_text())
         return

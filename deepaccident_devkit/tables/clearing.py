@@ -104,13 +104,18 @@ def _refuse_foreign(folder: Path) -> None:
     if stored is None or stored <= SCHEMA_VERSION:  # a newer devkit's folders may hold other files
         own_folders = [path for path in _entries(folder) if path not in foreign and path.is_dir()]
         inside = (path for own in own_folders for path in own.rglob("*"))
-        foreign += [path for path in inside if path.is_symlink() or not (path.is_dir() or _FILE.fullmatch(path.name))]
+        foreign += [path for path in inside if path.is_symlink() or not (path.is_dir() or _is_own_file(path))]
         named = {path.name for path in _entries(folder)} - {LOCK_FILE}
         if stored is None and named == {MANIFEST_FILE}:
             foreign.append(folder / MANIFEST_FILE)
     if foreign:
         names = ", ".join(str(path.relative_to(folder)) for path in sorted(foreign)[:_NAMED])
         raise IndexStoreError(f"{folder}: not removed: it holds what is no part of an index: {names}; look at it")
+
+
+def _is_own_file(path: Path) -> bool:
+    """Whether a file in a devkit's folder has the name of one of its files; what a store keeps has any name."""
+    return "kept" in path.parts or _FILE.fullmatch(path.name) is not None
 
 
 def _is_own(path: Path) -> bool:

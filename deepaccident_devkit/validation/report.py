@@ -56,7 +56,7 @@ class ValidationReport(Report):
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        content = super().to_dict()
+        content = Report.to_dict(self)  # no `super()`: a dataclass with slots is another class
         content["counts"] = self.counts
         content["velocity"]["best"] = self.velocity.best
         return content

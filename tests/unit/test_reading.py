@@ -122,15 +122,15 @@ NOT_OF_STRANGERS = {
     "cli/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
     "explore/pages/scenarios.py": "the split file that was written a line before",
-    "explore/pages/static.py": "the package's own styles and scripts",
+    "explore/pages/answers.py": "the package's own styles and scripts",
     "explore/serving.py": "a browser",
     "export/questions/format.py": "the parts that the export wrote",
+    "pages.py": "the package's own templates",
+    "parallel/store.py": "locks, of which nothing is believed",
     "release/images.py": "the head of an image that the gate opened",
     "release/store/sources.py": "fsspec, and the gate's files",
     "release/store/store.py": "the cache's own copies",
     "release/store/zips.py": "the directory of an archive that the gate or fsspec opened",
-    "render/replay/replay.py": "the package's own page",
-    "render/safety/report.py": "the package's own style and script",
     "synth/spec/catalogue.py": "the package's own designs",
 }
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from deepaccident_devkit.evaluation.runs.explanation import explain
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
@@ -94,7 +93,6 @@ CALLS: dict[str, Callable[..., Any]] = {
     "hashes": lambda job, **how: scenario_hashes(job.dataset, map(scenario_of, job.results.tokens), **how),
     "breakdowns": lambda job, **how: job.whole().broken_down(["agent", "all"], FEW, **how).summary(),
     "sanity": lambda job, **how: check_sanity(job.dataset, job.results, SETUP, job.results.tokens, samples=2, **how),
-    "explain": lambda job, **how: explain(job.dataset, job.results, SETUP, job.results.tokens[:1], **how),
 }
 
 

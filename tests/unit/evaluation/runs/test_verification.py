@@ -187,7 +187,8 @@ class TestNamed:
 
     def test_another_protocol_claimed(self, bundle: Path, da_b: DeepAccident) -> None:
         changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.present": False}))
-        assert found(verify(bundle, da_b)) == ["metrics_summary.json: settings/choices/reading/present"]
+        changes = ["files.json: metrics_summary.json", "metrics_summary.json: settings/choices/reading/present"]
+        assert found(verify(bundle, da_b)) == changes
 
     def test_many_are_counted(self) -> None:
         many = tuple(Difference(where=str(index), stored=0, found=1) for index in range(22))

@@ -19,7 +19,6 @@ from deepaccident_devkit.errors import ChoiceError, EvaluationError, TokenError
 from deepaccident_devkit.evaluation import (
     Accident,
     DetectedBoxes,
-    MotionEvaluator,
     MotionOutput,
     box_truth,
     detection_truth,
@@ -249,15 +248,16 @@ def test_instances_are_judged_frame_by_frame(da_motion: DeepAccident, sample: st
         assert [kind for kind, color in OUTCOME_COLORS.items() if lines_in(ax, color)] == kinds
 
 
-def test_instances_beyond_the_range_are_left_out(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
-    rules = replace(MotionEvaluator("released").protocol, ranges=(30.0,))
-    far = (20.0, 22.0, 3.0, 4.0)
-    count = {}
-    for protocol in ("released", rules):
-        verdict = sample_verdict(da_motion, sample, blocks(labels, far), protocol=protocol, label=labels)
+def test_instances_beyond_the_range_are_left_out(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, counts = blocks(labels, (20.0, 22.0, 3.0, 4.0)), []
+    for ranges in ({"100x100": 100.0}, {"30x30": 30.0}):
+        monkeypatch.setattr("deepaccident_devkit.render.outcomes.motion.RANGES", ranges)
+        verdict = sample_verdict(da_motion, sample, output, label=labels)
         ax = draw_outcome_in_camera(da_motion, verdict, "Camera_Front", ax=new_axes())
-        count[protocol == "released"] = len(lines_in(ax, OUTCOME_COLORS["false"]))
-    assert count == {True: 1, False: 0}
+        counts.append(len(lines_in(ax, OUTCOME_COLORS["false"])))
+    assert counts == [1, 0]
 
 
 @pytest.mark.parametrize(("agent", "ground"), [("ego_vehicle", 0.0), ("infrastructure", -4.0)])

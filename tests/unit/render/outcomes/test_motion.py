@@ -1,8 +1,7 @@
 """Predicted instances as found, false and missed, against the counts of the evaluation."""
 
-from dataclasses import replace
-
 import numpy as np
+import pytest
 from drawing import picture, title_of
 from matplotlib.colors import to_rgb
 from numpy.testing import assert_allclose
@@ -50,9 +49,9 @@ def test_motion_outcomes_are_those_that_are_counted(da_motion: DeepAccident, sam
     assert_allclose(picture(right)[4, 4], to_rgb(OUTCOME_COLORS["false"]))
 
 
-def test_what_lies_beyond_the_range_is_not_judged(labels: MotionLabels) -> None:
-    rules = replace(MotionEvaluator("released").protocol, ranges=(30.0,))
+def test_what_lies_beyond_the_range_is_not_judged(labels: MotionLabels, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deepaccident_devkit.render.outcomes.motion.RANGES", {"30x30": 30.0})
     output = instances_of(labels.instance, labels.config.grid)
-    cells = motion_outcome(output, labels, rules).outcomes("true")
+    cells = motion_outcome(output, labels).outcomes("true")
     here = labels.instance[0] > 0
     assert set(np.unique(cells[0][here]).tolist()) == {1, 3}

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from deepaccident_devkit.cli.replay import replay
 from numpy.testing import assert_array_equal
 from replay_page import accident, data_of
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli.render import replay
 from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
