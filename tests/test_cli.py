@@ -71,7 +71,7 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
     assert "WARNING: left out" in skipped.stderr
 
 
-@pytest.mark.parametrize("verb", ["info", "index", "labels", "split", "stats"])
+@pytest.mark.parametrize("verb", ["info", "index", "labels", "split"])
 def test_every_verb_on_a_release_has_the_same_grammar(verb: str) -> None:
     text = CliRunner().invoke(deepaccident, [verb, "--help"]).output
     assert "DATAROOT" in text
@@ -171,6 +171,9 @@ def test_info_counts_only_the_scenarios_of_where(own_release: Path) -> None:
     assert 0 < some["tables"]["annotation"] < whole["tables"]["annotation"]
     text = run("info", own_release, "--where", "designed_accident=true").stdout
     assert "selected: 3 of 6 scenarios" in text
+    assert text.count("_accident/Town") == 3
+    none = run("info", own_release, "--where", "length=1..2").stdout
+    assert none == "no scenario matches length=1..2; deepaccident info --fields lists what can be asked for\n"
     wrong = run("info", own_release, "--where", "town=Twon03")
     assert (wrong.returncode, "town: found 'Twon03'; possible are Town03" in wrong.stderr) == (2, True)
 
@@ -178,20 +181,20 @@ def test_info_counts_only_the_scenarios_of_where(own_release: Path) -> None:
 @pytest.mark.slow
 def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "stats"
-    made = run("stats", own_release, "--where", "designed_accident=true", "--out", out, "--format", "png")
+    made = run("info", own_release, "--statistics", "--where", "designed_accident=true", "--out", out)
     assert made.returncode == 0, made.stderr
     assert "selected: 3 of 6 scenarios" in made.stdout
     names = {path.name for path in out.iterdir()}
     assert f"written: {len(names)} files in {out}" in made.stdout
     assert {"statistics.json", "ends.csv", "collision_pairs.csv", "scenarios.png", "collisions.png"} <= names
-    assert not any(name.endswith((".pdf", ".tmp")) for name in names)
-    whole = run("stats", own_release, "--json")
+    assert not any(name.endswith(".tmp") for name in names)
+    whole = run("info", own_release, "--statistics", "--json")
     content = json.loads(whole.stdout)
     assert (content["scenarios"]["total"], content["selected"]) == (6, False)
     assert content["counts"]["collisions"]["counts"]["yes"]["total"] == 3
     assert json.loads((out / "statistics.json").read_text())["scenarios"]["total"] == 3
-    misplaced = run("stats", own_release, "--format", "png")
-    assert (misplaced.returncode, "--format is for figures; give --out FOLDER too" in misplaced.stderr) == (2, True)
+    misplaced = run("info", own_release, "--out", out)
+    assert (misplaced.returncode, "--out changes nothing without --statistics" in misplaced.stderr) == (2, True)
 
 
 @pytest.mark.slow
@@ -204,18 +207,18 @@ def test_stats_says_before_anything_else_what_it_cannot_write(own_release: Path,
         "/proc/nowhere": "no file can be written there; give a folder that you may write to",
     }
     for out, why in faults.items():
-        failed = run("stats", own_release, "--out", out)
+        failed = run("info", own_release, "--statistics", "--out", out)
         assert (failed.returncode, failed.stdout, why in failed.stderr) == (2, "", True), failed.stderr
         assert "Traceback" not in failed.stderr
 
 
 @pytest.mark.slow
 def test_stats_of_nothing(own_release: Path, tmp_path: Path) -> None:
-    nothing = run("stats", own_release, "--where", "length=1..2")
-    assert nothing.returncode == run("info", own_release, "--where", "length=1..2").returncode == 0
+    nothing = run("info", own_release, "--statistics", "--where", "length=1..2")
+    assert nothing.returncode == 0
     assert "selected: 0 of 6 scenarios" in nothing.stdout
     assert "no scenario meets the filters, so there is nothing to count" in nothing.stdout
-    failed = run("stats", own_release, "--where", "length=1..2", "--out", tmp_path / "new")
+    failed = run("info", own_release, "--statistics", "--where", "length=1..2", "--out", tmp_path / "new")
     assert (failed.returncode, failed.stdout) == (2, "")
     assert "no scenario matches --where, so there is nothing to write" in failed.stderr
     assert not (tmp_path / "new").exists()
@@ -281,7 +284,7 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
             "--orientation changes nothing with --names: the code",
         ),
         (("--out", ""), "error: expected a folder of motion labels, found an empty path; give '.' for the current one"),
-        (("--out", "/proc/nowhere"), "no labels can be written there"),
+        (("--out", "/proc/nowhere"), "cannot be written"),
     ],
 )
 def test_labels_says_what_is_wrong_and_writes_nothing(

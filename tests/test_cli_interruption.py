@@ -91,7 +91,7 @@ IN_TRAIN = ("--split", "train", "--scope", "all")
 WORDS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
     "index": lambda root, out, _: ("index", root, "--index-dir", out),
     "info": lambda root, out, _: ("info", root, "--index-dir", out),
-    "stats": lambda root, out, _: ("stats", root, "--index-dir", out, "--out", out / "statistics"),
+    "stats": lambda root, out, _: ("info", root, "--statistics", "--index-dir", out, "--out", out / "statistics"),
     "validate": lambda root, *_: ("validate", root, "--deep"),
     "labels": lambda root, out, _: ("labels", root, "--split", "train", "--samples", "all", "--out", out),
     "synth": lambda _, out, __: ("synth", out / "made", "--scenarios", 2, "--frames", 8, "--size", "64x36"),

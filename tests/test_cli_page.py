@@ -21,5 +21,5 @@ def test_the_page_is_up_to_date(script: ModuleType) -> None:
 def test_every_command_and_option_has_a_help_text(script: ModuleType) -> None:
     lines = script.page().splitlines()
     assert [line for line in lines if line.startswith("|") and line.endswith("|  |")] == []
-    for command in ("info", "index clear", "evaluate motion", "evaluate compare", "render bev", "export mcap"):
+    for command in ("info", "index", "evaluate motion", "evaluate compare", "render bev", "export mcap"):
         assert sum(line.lstrip("# ") == f"deepaccident {command}" for line in lines) == 1

@@ -83,7 +83,7 @@ WRITING: dict[str, Callable[[Any, Path, Path], tuple[object, ...]]] = {
         "--out",
         out,
     ),
-    "stats": lambda root, _, out: ("stats", root, "--out", out, "--format", "png", "--workers", 1),
+    "stats": lambda root, _, out: ("info", root, "--statistics", "--out", out, "--workers", 1),
     "split": lambda root, _, out: ("split", root, "--out", out / "mine.txt"),
     "twins": lambda root, _, out: ("safety", "twins", root, "--out", out, "--workers", 1),
     "lead-time": lambda root, _, out: ("safety", "lead-time", root, "--out", out, "--workers", 1),

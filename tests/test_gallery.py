@@ -20,7 +20,7 @@ def test_every_view_is_shown_by_its_command(script: ModuleType) -> None:
     commands = script.COMMAND.findall(script.PAGE.read_text(encoding="utf-8"))
     views = {line.split()[1] for line in commands if line.startswith("render ")}
     assert views == set(render.commands)
-    for others in ("export mcap ", "evaluate compare ", "stats "):
+    for others in ("export mcap ", "evaluate compare ", "info "):
         assert any(line.startswith(others) for line in commands), others
 
 

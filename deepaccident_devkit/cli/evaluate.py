@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.evaluate_bundles import compare, validate, verify
+from deepaccident_devkit.cli.evaluate_bundles import check, compare, verify
 from deepaccident_devkit.cli.evaluate_options import (
     resamples_parameter,
     selection_of,
@@ -237,5 +237,5 @@ def _with_sanity(
 
 for name in get_args(TaskName):
     evaluate.add_command(_task_verb(name))
-for command in (validate, verify, compare):
+for command in (check, verify, compare):
     evaluate.add_command(command)

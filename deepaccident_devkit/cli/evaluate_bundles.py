@@ -1,4 +1,4 @@
-"""`deepaccident evaluate validate|verify|compare`: check results; repeat or compare evaluations."""
+"""`deepaccident evaluate check|verify|compare`: check results; repeat or compare evaluations."""
 
 import json
 import sys
@@ -44,7 +44,7 @@ _DPI = 130
 @selection_parameters
 @engine_parameters
 @on_error_parameter
-def validate(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
+def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
     With --dataroot, also repeat the warnings of `evaluate … --sanity`.

@@ -1,20 +1,115 @@
-"""`deepaccident info`: what a release holds."""
+"""`deepaccident info`: what a release holds, its statistics, its index, and what scenarios can be found by."""
 
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import release_parameters, where_parameter
+from deepaccident_devkit.cli.options import (
+    engine_of,
+    index_check_parameter,
+    refuse_unused,
+    release_parameters,
+    say_report,
+    was_given,
+    where_parameter,
+    write_report,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.overview import overview
+from deepaccident_devkit.selection.fields import fields_text
+
+_OF_STATISTICS = ("interactions", "out")
+
+
+def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        click.echo(fields_text())
+        context.exit()
 
 
 @click.command()
 @release_parameters
 @where_parameter
+@click.option(
+    "--fields",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_list_fields,
+    help="List what --where takes: fields, their values and what they mean; without DATAROOT.",
+)
+@click.option("--statistics", is_flag=True, help="Print the paper's statistics by split instead.")
+@click.option("--interactions", is_flag=True, help="With --statistics: also count how soon moving pairs would collide.")
+@click.option(
+    "--out",
+    type=click.Path(),
+    help="With --statistics: folder to write statistics.json, one CSV file per table, and figures into; earlier ones "
+    "there are replaced.",
+)
+@click.option(
+    "--index",
+    "of_index",
+    is_flag=True,
+    help="Print instead where the indexes of all versions are, what they hold, and whether they are up to date. "
+    "Nothing is changed.",
+)
+@index_check_parameter
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
-def info(where: tuple[str, ...], as_json: bool, **release: Any) -> None:
-    """Print what the release in DATAROOT holds: tables, splits, agents, sensors, attributes."""
+def info(
+    where: tuple[str, ...],
+    statistics: bool,
+    interactions: bool,
+    out: str | None,
+    of_index: bool,
+    check: bool,
+    as_json: bool,
+    **release: Any,
+) -> None:
+    """Print what the release in DATAROOT holds: tables, splits, agents, sensors, attributes.
+
+    With --where, it is about the scenarios that match all filters, and lists them.
+    """
+    if not statistics:
+        refuse_unused("without --statistics", *_OF_STATISTICS)
+    if not of_index:
+        refuse_unused("without --index", "check")
+    if of_index:
+        refuse_unused("with --index, which makes none", "where", "statistics", "workers", "on_error")
+        _print_index(release, check=check, as_json=as_json)
+        return
     dataset = DeepAccident(**release)
-    summary = overview(dataset, dataset.find(*where) if where else None)
+    chosen = dataset.find(*where) if where else None
+    if chosen == [] and out is not None:
+        raise click.UsageError("no scenario matches --where, so there is nothing to write; change it or omit --out")
+    if statistics:
+        _statistics(dataset, chosen, out, interactions=interactions, as_json=as_json, **engine_of(release))
+        return
+    if chosen == [] and not as_json:
+        click.echo(f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for")
+        return
+    summary = overview(dataset, chosen)
     click.echo(summary.to_json() if as_json else summary.to_text())
+    if chosen is not None and not as_json:
+        click.echo("\n".join(["", *(scenario["token"] for scenario in chosen)]))
+
+
+def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:
+    from deepaccident_devkit.files import writable_folder
+    from deepaccident_devkit.render.statistics import PictureFormat, save_statistics  # it imports matplotlib
+    from deepaccident_devkit.statistics import dataset_statistics
+
+    folder = None if out is None else writable_folder(out)
+    found = dataset_statistics(dataset, chosen, **how)
+    written: list[Path] = write_report(found, folder, "statistics.json")
+    if folder:
+        written += save_statistics(found, folder, get_args(PictureFormat))
+    say_report(found, written, folder, as_json=as_json)
+
+
+def _print_index(release: dict[str, Any], *, check: bool, as_json: bool) -> None:
+    from deepaccident_devkit.tables import index_report
+
+    version = release["version"] if was_given("version") else None
+    report = index_report(release["dataroot"], version=version, index_dir=release["index_dir"], check_files=check)
+    click.echo(report.to_json() if as_json else report.to_text())

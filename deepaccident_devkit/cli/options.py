@@ -257,11 +257,21 @@ def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
     return names if alone in AGENTS else alone
 
 
+index_check_parameter = click.option(
+    "--check", is_flag=True, help="Compare the content of each label, calib and meta file and of the tables, not times."
+)
+
+
+def was_given(parameter: str) -> bool:
+    """Whether the call of the verb that runs has this option, be it with its default."""
+    return click.get_current_context().get_parameter_source(parameter) is not ParameterSource.DEFAULT
+
+
 def refuse_unused(why: str, *parameters: str) -> None:
     """End with a usage error if one of these options of the verb that runs was given, because it changes nothing."""
     context = click.get_current_context()
     for option in context.command.params:
-        if option.name in parameters and context.get_parameter_source(option.name) is not ParameterSource.DEFAULT:
+        if option.name in parameters and was_given(option.name):
             raise click.UsageError(f"{option.opts[0]} changes nothing {why}; leave it out", context)
 
 

@@ -1,29 +1,8 @@
 """Finding scenarios by their attributes: `da.find(...)`, the texts of `--where`, and the groups of `--by`.
 
-**Fields.** A filter names a column of the scenario table, or something that is derived from the table. `--by` of
-`deepaccident evaluate` takes the names marked ∗, with the same values; and `accident_visibility` of each sample.
-
-| field | values |
-|---|---|
-| `token`, `name`, `folder`, `scenario_type`∗ (short: `type`) | as the release names them |
-| `town`∗, `weather`∗, `time_of_day`∗ | `Town03`; `HardRain`; `Noon`, `Sunset`, `Night` |
-| `weather_group`∗, `time_of_day_group`∗ | `Clear`, `Cloudy`, `Rainy`; `Daytime`, `Night` (the released evaluation's) |
-| `road_type`∗, `spawn_side`∗ | `four-way junction`, `three-way junction`; `left`, `right`, `opposite` |
-| `ego_direction`∗, `other_direction`∗ | `straight`, `left`, `right` |
-| `trajectory_type`∗ | `straight_straight` (at four-way junctions alone), else `one_of_the_agents_turning` |
-| `split`∗ | `train`, `val`, `test` |
-| `signalized`∗, `designed_accident`∗ | true, false: traffic lights; an `_accident` folder |
-| `collision`∗ | true, false: whether meta names a collision; unknown without meta |
-| `collision_status`∗ | `no_collision`, `collides_with_pedestrian`, `collides_between_vehicles` |
-| `collision_ids`, `collision_classes`, `collision_agents` | of the colliding pair, one of which must match |
-| `contact_side`∗, `spawn_relation`∗, `impact` | as meta names them: `front_side` (or `front`); `same`; a number |
-| `closing_speed` | m/s with which the pair approaches at the last frame (`da.collision`) |
-| `min_ttc`, `min_pet`, `min_gap` | of moving pairs: least time to collision, post-encroachment time (s), gap (m) |
-| `max_drac` | the most deceleration that a moving pair needs to avoid a crash (m/s²) |
-| `accident_type`∗ | 1 to 12, the paper's design that the accident realises; unknown (none) for any other end |
-| `num_frames` (short: `length`) | recorded frames |
-| `accident_visibility` | `visible`, `partial`, `invisible`: whether ego sees it coming (`v2x.accident_visibility`) |
-| `velocity_frame`∗, `first_frame_token`, `last_frame_token` | as in the table |
+**Fields.** A filter names a column of the scenario table, or something that is derived from the table; `deepaccident
+info --fields` lists them with their values. `--by` of `deepaccident evaluate` takes those of few values, and
+`accident_visibility` of each sample.
 
 **Moving pairs** are those of `da.interactions` of which each moves faster than 0.5 m/s at some frame: who passes parked
 cars is left out, who hits a car that waits is not. The sign of a post-encroachment time does not count. A scenario in

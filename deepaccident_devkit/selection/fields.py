@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import FieldError, NotAvailableError
 from deepaccident_devkit.interactions import InteractionPairs, Interactions, interactions_of
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
 from deepaccident_devkit.tables.specs import table_spec
-from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.text import columns_text, possible_text
 from deepaccident_devkit.v2x import accident_visibility, collision
 from deepaccident_devkit.v2x.accident_visibility import VISIBILITIES
 
@@ -40,6 +40,7 @@ class Field:
     Attributes:
         name: as a filter names it.
         kind: of its values; a number is whole, a measure is a float.
+        doc: what it means, for people.
         read: its value of a scenario, None where unknown; several in a tuple, of which a filter wants one.
         known: the values it can have in the whole release; empty where that is not known or not limited.
         costly: whether reading it opens more than the scenario's record.
@@ -49,11 +50,19 @@ class Field:
 
     name: str
     kind: Kind
+    doc: str
     read: _Read
     known: Sequence[str | int] = ()
     costly: bool = False
     groups: bool = False
     read_all: _ReadAll | None = None
+
+    @property
+    def shown(self) -> str:
+        """The values that it can have, as a filter has them."""
+        if self.kind != "word" or not self.known:
+            return {"flag": "true, false", "number": "numbers", "measure": "numbers"}.get(self.kind, "words")
+        return ", ".join(map(str, self.known))
 
     def values(self, dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterable[Value | tuple[Value, ...]]:
         """Its values of scenarios, in their order."""
@@ -76,6 +85,13 @@ def full_name(name: str) -> str:
     return _SHORT.get(name.lower(), name.lower())
 
 
+def fields_text() -> str:
+    """All fields as a table: names, short ones too, values and meanings."""
+    short = {name: f"{name}, {other}" for other, name in _SHORT.items()}
+    rows = [(short.get(each.name, each.name), each.shown, each.doc) for each in FIELDS.values()]
+    return columns_text([("field", "values", "meaning"), *rows], left=3)
+
+
 def group_texts(dataset: Dataset, scenario: ScenarioRecord) -> dict[str, str | None]:
     """The values of a scenario for all fields that results can be grouped by, as texts; None unknown."""
     return {name: _text(field.read(dataset, scenario)) for name, field in FIELDS.items() if field.groups}
@@ -95,7 +111,9 @@ def _column(column: Column) -> Field:
     def read(_: Dataset, scenario: ScenarioRecord) -> Any:
         return scenario[column.field]  # type: ignore[literal-required]
 
-    return Field(column.field, kind, read, known, groups=column.field in _FEW or bool(known) or kind == "flag")
+    return Field(
+        column.field, kind, column.kind.doc, read, known, groups=column.field in _FEW or bool(known) or kind == "flag"
+    )
 
 
 def _of_collision(name: str) -> _Read:
@@ -168,7 +186,7 @@ def _of_moving_pairs(name: str) -> Field:
     def read(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
         return next(read_all(dataset, [scenario]))
 
-    return Field(name, "measure", read, costly=True, read_all=read_all)
+    return Field(name, "measure", _OF_MOVING_PAIRS[name], read, costly=True, read_all=read_all)
 
 
 def _least(values: FloatArray) -> float:
@@ -180,6 +198,12 @@ _MEASURES: Final[Mapping[str, Callable[[InteractionPairs, BoolArray], float]]] =
     "min_pet": lambda pairs, moving: _least(np.abs(pairs.pet[moving])),
     "min_gap": lambda pairs, moving: _least(pairs.min_gap[moving]),
     "max_drac": lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0)),
+}
+_OF_MOVING_PAIRS: Final = {
+    "min_ttc": "Least time to collision of moving pairs (s).",
+    "min_pet": "Least post-encroachment time of moving pairs (s).",
+    "min_gap": "Least gap between moving pairs (m).",
+    "max_drac": "The most deceleration that a moving pair needs to avoid a crash (m/s²).",
 }
 _SHORT = {"type": "scenario_type", "length": "num_frames"}
 _WORTH_A_BAR: Final = 32
@@ -196,32 +220,82 @@ _KNOWN: dict[str, Sequence[str | int]] = {
     "accident_type": range(1, 13),
 }
 _DERIVED = (
-    Field("weather_group", "word", _weather_group, tuple(_WEATHER_GROUPS.values()), groups=True),
-    Field("time_of_day_group", "word", _time_of_day_group, ("Daytime", "Night"), groups=True),
-    Field("trajectory_type", "word", _trajectory_type, (STRAIGHT, TURNING), groups=True),
-    Field("collision", "flag", _ended_in_collision, groups=True),
+    Field(
+        "weather_group",
+        "word",
+        "The released evaluation's three.",
+        _weather_group,
+        tuple(_WEATHER_GROUPS.values()),
+        groups=True,
+    ),
+    Field(
+        "time_of_day_group",
+        "word",
+        "The released evaluation's two.",
+        _time_of_day_group,
+        ("Daytime", "Night"),
+        groups=True,
+    ),
+    Field(
+        "trajectory_type",
+        "word",
+        "Straight_straight at four-way junctions alone.",
+        _trajectory_type,
+        (STRAIGHT, TURNING),
+        groups=True,
+    ),
+    Field(
+        "collision", "flag", "Whether meta names a collision; unknown without meta.", _ended_in_collision, groups=True
+    ),
     Field(
         "collision_status",
         "word",
+        "Who collides.",
         _collision_status,
         ("no_collision", "collides_with_pedestrian", "collides_between_vehicles"),
         groups=True,
     ),
-    Field("collision_ids", "number", _of_collision("ids")),
-    Field("collision_classes", "word", _of_collision("classes"), taxonomy.CATEGORIES),
-    Field("collision_agents", "word", _of_collision("agents"), taxonomy.VEHICLE_AGENTS),
-    Field("spawn_relation", "word", _of_collision("spawn_relation"), groups=True),
+    Field("collision_ids", "number", "Actors of the colliding pair, one of which must match.", _of_collision("ids")),
+    Field(
+        "collision_classes",
+        "word",
+        "Those of the colliding pair, one of which must match.",
+        _of_collision("classes"),
+        taxonomy.CATEGORIES,
+    ),
+    Field(
+        "collision_agents",
+        "word",
+        "Those of the colliding pair, one of which must match.",
+        _of_collision("agents"),
+        taxonomy.VEHICLE_AGENTS,
+    ),
+    Field("spawn_relation", "word", "As meta names it.", _of_collision("spawn_relation"), groups=True),
     Field(
         "contact_side",
         "word",
+        "As meta names it.",
         _of_collision("contact_side"),
         ("front_side", "rear_side", "left_side", "right_side"),
         groups=True,
     ),
-    Field("impact", "measure", _of_collision("impact")),
-    Field("closing_speed", "measure", _closing_speed, costly=True),
+    Field("impact", "measure", "As meta has it.", _of_collision("impact")),
+    Field(
+        "closing_speed",
+        "measure",
+        "Speed with which the pair approaches at the last frame (m/s).",
+        _closing_speed,
+        costly=True,
+    ),
     *map(_of_moving_pairs, _MEASURES),
-    Field("accident_visibility", "word", _accident_visibility, VISIBILITIES, costly=True),
+    Field(
+        "accident_visibility",
+        "word",
+        "Whether ego sees the accident coming.",
+        _accident_visibility,
+        VISIBILITIES,
+        costly=True,
+    ),
 )
 FIELDS: Final = {
     field.name: field

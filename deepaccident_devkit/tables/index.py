@@ -188,7 +188,7 @@ def _refuse_newer(folder: Path) -> None:
         raise IndexStoreError(
             f"{folder / MANIFEST_FILE}: a newer devkit's index (schema version {version}, this devkit's is "
             f"{SCHEMA_VERSION}); update the devkit, give another index_dir=, or remove the index with: "
-            "deepaccident index clear DATAROOT"
+            "deepaccident index DATAROOT --clear"
         )
 
 

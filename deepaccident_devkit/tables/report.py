@@ -1,4 +1,4 @@
-"""What indexes a release has on disk: the text behind `deepaccident index info`."""
+"""What indexes a release has on disk: the text behind `deepaccident info --index`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field

@@ -75,7 +75,7 @@ def read_shard(path: Path) -> dict[str, dict[str, Any]]:
     with pa.OSFile(str(path), "rb") as source:
         read = read_streams(source, specs)
     if read is None:
-        raise IndexStoreError(f"{path}: not a shard; remove the index with: deepaccident index clear DATAROOT")
+        raise IndexStoreError(f"{path}: not a shard; remove the index with: deepaccident index DATAROOT --clear")
     return {
         spec.name: rows | {name: of(rows) for name, of in _FROM_OTHERS.get(spec.name, {}).items()}
         for spec, rows in zip(specs, read, strict=True)

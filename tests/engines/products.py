@@ -15,7 +15,7 @@ COMMANDS = {
     "evaluate": "evaluate accident {release} --results {results}/motion --split train --resamples 20 "
     "--out {out}/bundle",
     "predict": "baseline predict {release} --split train --task accident --out {out}/predictions",
-    "stats": "stats {release} --format png --out {out}/stats",
+    "stats": "info {release} --statistics --out {out}/stats",
     "synth": "synth {out}/made --scenarios 3 --frames 3 --size 64x36 --seed 5",
 }
 """Name → command line."""

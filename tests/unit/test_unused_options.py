@@ -26,8 +26,8 @@ CASES = [
         "--prevented needs the scores of whole recordings, which --protocol field does not have; give --protocol clean",
     ),
     (EVALUATE.format("detection") + " --samples all --horizon 3", "--horizon changes nothing with --samples all"),
-    ("evaluate validate results --split val", "--split changes nothing without --dataroot"),
-    ("evaluate validate results --on-error raise", "--on-error changes nothing without --dataroot"),
+    ("evaluate check results --split val", "--split changes nothing without --dataroot"),
+    ("evaluate check results --on-error raise", "--on-error changes nothing without --dataroot"),
     ("baseline predict release --out out --latency 0.2", "--latency changes nothing with --agents single"),
     ("baseline predict release --out out --agents all --seed 3", "--seed changes nothing without --pose-noise"),
     ("baseline predict release --out out --samples all --scope all", "--scope changes nothing with --samples all"),
@@ -39,7 +39,7 @@ CASES = [
     ("split release --overwrite", "--overwrite changes nothing without --out"),
     ("synth out --spec mine.yaml --unplanned 0.5", "--unplanned changes nothing with --spec or --view hidden"),
     ("synth --spec mine.yaml --check --layout B", "--layout changes nothing with --check"),
-    ("stats release --format png", "--format is for figures; give --out FOLDER too"),
+    ("info release --out out", "--out changes nothing without --statistics"),
 ]
 
 

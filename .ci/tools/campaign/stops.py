@@ -44,7 +44,7 @@ VERBS = (
     Verb("synth", "synth {out}/made --scenarios 2 --frames 3 --sensors none --seed 1 --workers 1"),
     Verb("split", f"split {_RELEASE} --out {{out}} --overwrite"),
     Verb("split", f"split {_RELEASE} --out {{out}}/mine.txt --overwrite"),
-    Verb("stats", f"stats {_RELEASE} --out {{out}}/statistics --format png"),
+    Verb("info --statistics", f"info {_RELEASE} --statistics --out {{out}}/statistics"),
     Verb(
         "evaluate",
         f"evaluate accident {_EVALUATE} --scope accident --horizon 0.5 --protocol boxes --resamples 20 "

@@ -36,7 +36,7 @@ _NUMBERS: Final = np.dtype(
 """How a `Member` is stored."""
 _FRAME: Final = slice(-7, -4)
 """Where the name of a frame's file has its number."""
-_REMEDY: Final = "remove it with: deepaccident index clear DATAROOT"
+_REMEDY: Final = "remove it with: deepaccident index DATAROOT --clear"
 
 
 class Member(NamedTuple):

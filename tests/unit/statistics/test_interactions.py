@@ -31,6 +31,7 @@ def test_pairs_and_scenarios_are_in_their_bins(da_b: DeepAccident) -> None:
 
 
 def test_the_verb_counts_them(da_b: DeepAccident) -> None:
-    result = CliRunner().invoke(deepaccident, ["stats", str(da_b.dataroot), "--interactions"], catch_exceptions=False)
+    words = ["info", str(da_b.dataroot), "--statistics", "--interactions"]
+    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     assert result.exit_code == 0
     assert result.output.rstrip("\n") == dataset_statistics(da_b, interactions=True).to_text()

@@ -212,13 +212,13 @@ def test_a_newer_devkits_index_is_refused_and_kept(root: Path, tmp_path: Path) -
     before = contents(root)
     sentence = (
         rf"{path}: a newer devkit's index \(schema version {SCHEMA_VERSION + 1}, this devkit's is {SCHEMA_VERSION}\); "
-        r"update the devkit, give another index_dir=, or remove the index with: deepaccident index clear DATAROOT"
+        r"update the devkit, give another index_dir=, or remove the index with: deepaccident index DATAROOT --clear"
     )
     with pytest.raises(IndexStoreError, match=sentence):
         opened(root)
     assert contents(root) == before
     assert len(opened(root, tmp_path / "own").scenario) == 2
-    assert CliRunner().invoke(deepaccident, ["index", "clear", str(root)]).exit_code == 0
+    assert CliRunner().invoke(deepaccident, ["index", str(root), "--clear"]).exit_code == 0
     assert len(opened(root).scenario) == 2
 
 

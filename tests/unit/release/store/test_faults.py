@@ -215,7 +215,9 @@ def test_a_damaged_list_is_made_again(small: Path, tmp_path: Path) -> None:
     content = file.read_bytes()
     file.write_bytes(content[:200])
     opened_store.cache_clear()
-    with pytest.raises(IndexStoreError, match=r"cannot be read .*; remove it with: deepaccident index clear DATAROOT"):
+    with pytest.raises(
+        IndexStoreError, match=r"cannot be read .*; remove it with: deepaccident index DATAROOT --clear"
+    ):
         Members(file)
     open_dataroot(small, tmp_path / "index", workers=1)
     assert file.read_bytes() == content
