@@ -244,7 +244,7 @@ def test_an_address_says_what_is_looked_at(pages: Browser, served: Served, datas
     pages.script("go(2); document.getElementById('layer-trails').click(); enlarge('2')")
     pages.script("document.getElementById('cloud-infrastructure').click(); zoom(2)")
     pages.script("const s = cards[0].select; s.value = 'Back'; s.dispatchEvent(new Event('change'))")
-    pages.wait("location.search.includes('view=')")
+    pages.wait("['changed=', 'pictures=', 'view='].every((each) => location.search.includes(each))")
     looks = """return [state.frame, state.large, state.follow, state.clouds, state.layers, cards[0].chosen,
         [ground.x, ground.y, ground.scale].map((each) => each.toFixed(1)), location.search]"""
     seen = pages.script(looks)

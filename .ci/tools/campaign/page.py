@@ -12,7 +12,7 @@ from campaign.worker import MEGABYTES, SECONDS, Outcome
 _HEAD = """# What damaged files and killed processes do
 
 For everybody who reads files of strangers, or works on a machine where jobs are killed and disks get full: what was
-tried, and what became of it. 5 minutes. [SECURITY.md](../SECURITY.md) says what the devkit guarantees.
+tried, and what became of it. 10 minutes. [SECURITY.md](../SECURITY.md) says what the devkit guarantees.
 
 ## Changed files
 
