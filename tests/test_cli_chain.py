@@ -44,7 +44,7 @@ def folder(release: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["motion", "accident.json", "detection.json"])
 def test_results_are_valid_and_of_the_split(release: Path, folder: Path, name: str) -> None:
-    told = deepaccident("evaluate", "validate", folder / "all" / name, "--dataroot", release, "--split", "train")
+    told = deepaccident("evaluate", "check", folder / "all" / name, "--dataroot", release, "--split", "train")
     assert "all 20 samples have a prediction, and nothing else has" in told
 
 

@@ -48,7 +48,7 @@ def test_the_page_shows_all_that_was_made(made_demo: tuple[Path, str]) -> None:
     assert [link for link in links if not link.startswith("#") and not (out / link).is_file()] == []
     anchors = {each.get("id") for each in page.all("section")}
     assert {link[1:] for link in links if link.startswith("#")} == anchors
-    ((single, five),) = re.findall(r"single vehiclefive agentsIoU \(%\)(\d+\.\d)(\d+\.\d)", page.text)
+    ((single, five),) = re.findall(r"single vehiclefive agents\s*IoU \(%\)(\d+\.\d)(\d+\.\d)", page.text)
     assert float(five) > float(single)
 
 

@@ -173,7 +173,6 @@ def test_the_code_on_protocols_runs(in_labels_demo: Path) -> None:
     result = names["halves"][0].compute()
     assert [value for each in result.ranges.values() for value in (each.iou, each.pq)] == [100] * 4
     assert names["group"].samples > 0
-    assert (in_labels_demo / "motion.json").is_file()
 
 
 def test_the_code_on_evaluating_runs(in_labels_demo: Path, capsys: pytest.CaptureFixture[str]) -> None:

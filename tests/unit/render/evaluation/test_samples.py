@@ -52,7 +52,7 @@ def test_outcomes_of_cells_are_coloured(da_motion: DeepAccident, tokens: list[st
 
 @pytest.mark.parametrize("task", ["motion", "accident", "detection", "warning"])
 def test_samples_of_stored_results_are_ranked_and_drawn(task: Any, da_motion: DeepAccident, tmp_path: Path) -> None:
-    protocol = "released" if task in ("motion", "detection") else "boxes"
+    protocol = {"accident": "boxes", "warning": "clean"}.get(task, "released")
     run, results = stored_run(da_motion, EvaluationSetup(task=task, protocol=protocol), tmp_path / "results")
     figures = sample_figures(run, da_motion, results)
     if task == "warning":
