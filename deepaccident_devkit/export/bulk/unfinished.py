@@ -108,7 +108,9 @@ class Unfinished:
         """
         journals = {path.name.removesuffix(_PATHS): path for path in sorted(self.folder.glob(f"[!.]*{_PATHS}"))}
         others = journals.keys() - {unit.name for unit in units}
-        kept = {path for name in journals.keys() - others if others for path in _noted(journals[name])}
+        if not others:  # then no journal need be read
+            return
+        kept = {path for name in journals.keys() - others for path in _noted(journals[name])}
         above = {parent.as_posix() for path in kept for parent in PurePosixPath(path).parents}
         for name in sorted(others):
             self._remove_paths(_noted(journals[name]) - kept - above)

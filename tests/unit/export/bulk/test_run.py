@@ -518,6 +518,13 @@ class TestDamage:
         assert contents(written(small, tmp_path / "out").folder) == contents(whole)
         assert kept.exists()
 
+    def test_a_second_journal_of_a_unit_removes_nothing(self, small: DeepAccident, whole: Path, tmp_path: Path) -> None:
+        """As a program leaves it that copies a folder over itself."""
+        stopped(small, tmp_path / "out", 2)
+        for journal in (tmp_path / "out" / ".deepaccident-parts" / "tiny").glob("*.paths"):
+            shutil.copy(journal, journal.with_name(f"{journal.name.removesuffix('.paths')} (1).paths"))
+        assert contents(written(small, tmp_path / "out").folder) == contents(whole)
+
 
 def test_wrong_workers_make_no_folder(small: DeepAccident, tmp_path: Path) -> None:
     with pytest.raises(ChoiceError, match="workers: expected a number of at least 1"):
