@@ -21,9 +21,15 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntA
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import GeometryError, NotAvailableError
 from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import Skipped, accident_of
+from deepaccident_devkit.safety.accidents import (
+    Skipped,
+    accident_of,
+    each_scenario,
+    reasons_text,
+    skipped_rows,
+    those_of,
+)
 from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
-from deepaccident_devkit.safety.scenarios import each_scenario, reasons_text, skipped_rows, those_of
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, AgentName, short_name
 from deepaccident_devkit.text import columns_text
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.interactions.masses import MASS_UNCERTAINTY
+from deepaccident_devkit.interactions.config import MASS_UNCERTAINTY
 from deepaccident_devkit.safety.accidents import Accident
 from deepaccident_devkit.safety.contact import Pair, contact_times, impacts, pair_of
 

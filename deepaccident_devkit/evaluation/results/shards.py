@@ -20,8 +20,14 @@ from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
-from deepaccident_devkit.evaluation.results.faults import ContentError, at, told_of
-from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, MotionForm, check_token
+from deepaccident_devkit.evaluation.results.header import (
+    RESULTS_FILE,
+    ContentError,
+    MotionForm,
+    at,
+    check_token,
+    told_of,
+)
 from deepaccident_devkit.evaluation.results.motion_arrays import (
     PATHS,
     check_sample,

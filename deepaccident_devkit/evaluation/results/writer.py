@@ -13,8 +13,7 @@ from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results.entries import EntryWriter
-from deepaccident_devkit.evaluation.results.faults import ContentError
-from deepaccident_devkit.evaluation.results.header import MotionForm, check_token, json_meta
+from deepaccident_devkit.evaluation.results.header import ContentError, MotionForm, check_token, json_meta
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, ResultsTask, Stored
 from deepaccident_devkit.evaluation.results.shards import ShardWriter
 from deepaccident_devkit.files import path_of, replacing, replacing_folder

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
-from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
-from deepaccident_devkit.files import path_of
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.files import path_of, remove_in
 from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.parallel import Places, Store, run_batch
+from deepaccident_devkit.parallel import Places, Store, run_batch, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
+
 
 Task = TypeVar("Task")
 EvaluatorT = TypeVar("EvaluatorT", bound=Evaluator[Any])
@@ -170,3 +174,49 @@ def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:
     raise EvaluationError(
         f"load: {workers} workers cannot import it ({reason}); put it into a module of its own, or choose workers=1"
     )
+
+
+_COUNTS = "counts"
+
+
+def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
+    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
+
+    `command` says which evaluation that is.
+    """
+    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
+
+
+def checkpoint_path(
+    out: str | os.PathLike[str],
+    setup: EvaluationSetup,
+    tokens: Collection[str],
+    fingerprints: Mapping[str, str],
+) -> Path:
+    """The folder beside `out` in which such a run keeps its counts.
+
+    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
+    and another devkit have another folder, and so never go on with these counts.
+
+    Args:
+        out: the folder that the finished evaluation goes to.
+        setup: task and rules.
+        tokens: the samples.
+        fingerprints: of the predictions and of the labels.
+    """
+    name = digest_of(
+        {
+            "devkit": __version__,
+            "setup": setup.as_dict(),
+            "tokens": sorted(tokens),
+            "fingerprints": dict(fingerprints),
+        }
+    )
+    return evaluation_store(out).folder / _COUNTS / name
+
+
+def remove_checkpoints(out: str | os.PathLike[str]) -> None:
+    """Remove all such folders beside `out`, once what they were for is written."""
+    store = evaluation_store(out)
+    remove_in(store.folder, _COUNTS)
+    store.remove()

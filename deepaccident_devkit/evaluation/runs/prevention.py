@@ -15,13 +15,12 @@ import numpy as np
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
-from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
-from deepaccident_devkit.evaluation.metrics.breakdowns import breakdown
+from deepaccident_devkit.evaluation.metrics.breakdowns import EVERYTHING, breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import LATENCIES
-from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
+from deepaccident_devkit.evaluation.metrics.warning.evaluator import PreventedEvaluator
 from deepaccident_devkit.evaluation.metrics.warning.prevention import (
     NOMINAL,
     SETTINGS,

@@ -24,9 +24,8 @@ from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, Box
 from deepaccident_devkit.evaluation.metrics.alarms.raised import LABEL_STEP, by_sureness, position_difference
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
-from deepaccident_devkit.evaluation.metrics.frames import frames_there, labels_at_present
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.geometry import Boxes

@@ -24,8 +24,8 @@ from deepaccident_devkit.safety import (
     outcome_shares,
 )
 from deepaccident_devkit.safety.avoidability import GROUPS, group_of
+from deepaccident_devkit.safety.contact import SecondaryContact
 from deepaccident_devkit.safety.outcomes import delta_v_ranges
-from deepaccident_devkit.safety.secondary import SecondaryContact
 
 AVOIDED = OUTCOMES.index("avoided")
 

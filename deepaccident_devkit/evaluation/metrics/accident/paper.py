@@ -33,14 +33,17 @@ from deepaccident_devkit.evaluation.metrics.alarms.reading import (
 )
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.frames import (
+from deepaccident_devkit.evaluation.metrics.predictions import (
+    Accident,
+    MotionOutput,
+    Prediction,
     check_output,
     check_protocol,
+    checked_prediction,
     first_frames,
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, Prediction, checked_prediction
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import settle_choices

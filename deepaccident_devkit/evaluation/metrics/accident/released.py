@@ -31,14 +31,15 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
 from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.frames import (
+from deepaccident_devkit.evaluation.metrics.predictions import (
+    MotionOutput,
+    Prediction,
     check_output,
     check_protocol,
     first_frames,
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, Prediction
 from deepaccident_devkit.evaluation.metrics.trajectories import (
     Paths,
     instance_paths,

@@ -2,7 +2,7 @@
 
 from deepaccident_devkit.evaluation.metrics.detection.boxes import DetectedBoxes, detection_truth
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
-from deepaccident_devkit.evaluation.metrics.detection.matches import DetectionMatches, detection_matches
+from deepaccident_devkit.evaluation.metrics.detection.frame_counts import DetectionMatches, detection_matches
 from deepaccident_devkit.evaluation.metrics.detection.protocols import (
     DETECTION_PROTOCOLS,
     DetectionProtocol,

@@ -13,7 +13,7 @@ from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntAr
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.detection.matching import ERRORS
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings, plain
-from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
+from deepaccident_devkit.evaluation.metrics.numbers import TaskResult
 from deepaccident_devkit.text import columns_text
 
 

@@ -14,7 +14,7 @@ from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
+from deepaccident_devkit.evaluation.metrics.numbers import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.metrics.warning.recordings import (
     GIVEN,

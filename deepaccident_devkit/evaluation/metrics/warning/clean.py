@@ -14,8 +14,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
-from deepaccident_devkit.evaluation.metrics.warning.cost import MINUTE
-from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
+from deepaccident_devkit.evaluation.metrics.warning.recordings import MINUTE, ScoreSeries
 
 WINDOW: Final = 3.0
 """Seconds before the impact in which the headline compares scores."""

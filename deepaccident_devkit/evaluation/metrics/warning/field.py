@@ -16,17 +16,17 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
+from deepaccident_devkit.evaluation.metrics.numbers import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.recordings import (
     GIVEN,
     PREDICTORS,
+    ScoreSeries,
     by_group,
     drives_of,
     left_out_notes,
     parts_of,
     series_of,
 )
-from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 from deepaccident_devkit.text import choice
 
 FieldCode = Literal["ustring", "dsta", "drive", "dad"]

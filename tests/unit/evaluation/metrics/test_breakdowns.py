@@ -11,12 +11,12 @@ from generated_bundles import motion_counts
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.metrics.attributes import (
+from deepaccident_devkit.evaluation.metrics.breakdowns import (
     NO_IMPACT,
     SampleAttributes,
+    breakdown,
     sample_attributes,
 )
-from deepaccident_devkit.evaluation.metrics.breakdowns import breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator

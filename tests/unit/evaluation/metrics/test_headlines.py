@@ -7,9 +7,8 @@ import pytest
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
-from deepaccident_devkit.evaluation.metrics.headlines import headline_numbers, headlines, value_text
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
+from deepaccident_devkit.evaluation.metrics.numbers import headline_numbers, headlines, numbers_of, value_text
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
 
 RUNS = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]

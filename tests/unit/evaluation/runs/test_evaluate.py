@@ -11,20 +11,19 @@ from report_page import Page
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import AccidentEvaluator, Resampling, accident_context, sample_attributes
-from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS
+from deepaccident_devkit.evaluation.metrics.breakdowns import WITHIN_RECORDINGS
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter
 from deepaccident_devkit.evaluation.runs import (
     BREAKDOWNS,
     EvaluationRun,
     Partial,
     SampleSelection,
-    evaluate,
     evaluate_results,
+    evaluation_run,
     scenario_hashes,
 )
-from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, remove_checkpoints
-from deepaccident_devkit.evaluation.runs.evaluate import _partial, check_metas
-from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of
+from deepaccident_devkit.evaluation.runs.evaluation_run import _partial, breakdowns_of, check_metas
+from deepaccident_devkit.evaluation.runs.many_samples import checkpoint_path, remove_checkpoints
 from deepaccident_devkit.evaluation.runs.selection import Coverage
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
 from deepaccident_devkit.splits import save_selection
@@ -40,7 +39,7 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_arguments: Any, **_named: Any) -> None:
         pytest.fail("was evaluated")
 
-    monkeypatch.setattr(evaluate, "evaluate_samples", refused)
+    monkeypatch.setattr(evaluation_run, "evaluate_samples", refused)
 
 
 class TestRun:
@@ -204,7 +203,7 @@ class TestBrokenOff:
     @pytest.fixture
     def broken_after(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], list[str]]:
         """Break a run off after so many samples; gives the tokens that were loaded."""
-        original = evaluate.SampleLoader.__call__
+        original = evaluation_run.SampleLoader.__call__
 
         def start(count: int | None) -> list[str]:
             loaded: list[str] = []
@@ -215,7 +214,7 @@ class TestBrokenOff:
                 loaded.append(token)
                 return original(loader, token)
 
-            monkeypatch.setattr(evaluate.SampleLoader, "__call__", load)
+            monkeypatch.setattr(evaluation_run.SampleLoader, "__call__", load)
             return loaded
 
         return start

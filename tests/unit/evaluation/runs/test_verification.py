@@ -23,8 +23,8 @@ from deepaccident_devkit.evaluation.runs import (
     summary_text,
     verify_bundle,
 )
-from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
+from deepaccident_devkit.evaluation.runs.verification import ABSENT, Difference, differing
 
 Write = Callable[..., Results]
 SUMMARY_CHANGED = "files.json: metrics_summary.json"

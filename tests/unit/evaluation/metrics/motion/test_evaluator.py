@@ -9,7 +9,6 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
-from deepaccident_devkit.evaluation.metrics.frames import cells_within
 from deepaccident_devkit.evaluation.metrics.motion import (
     MOTION_PROTOCOLS,
     MotionEvaluator,
@@ -23,7 +22,7 @@ from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     vpq,
     vpq_counts,
 )
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, cells_within, instances_of
 from deepaccident_devkit.evaluation.metrics.trajectories import (
     TrajectoryRules,
     instance_paths,

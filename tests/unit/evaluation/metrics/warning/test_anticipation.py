@@ -15,8 +15,7 @@ from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context
 from deepaccident_devkit.evaluation.metrics.alarms import truth
 from deepaccident_devkit.evaluation.metrics.alarms.truth import constant_velocity_alarms
-from deepaccident_devkit.evaluation.metrics.headlines import headlines
-from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
+from deepaccident_devkit.evaluation.metrics.numbers import headlines, numbers_of
 from deepaccident_devkit.evaluation.metrics.warning import (
     AnticipationResult,
     CleanScores,

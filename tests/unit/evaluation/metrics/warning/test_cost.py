@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.warning import false_alarm_cost
-from deepaccident_devkit.evaluation.metrics.warning.cost import AlarmRuns
+from deepaccident_devkit.evaluation.metrics.warning.recordings import AlarmRuns
 
 ALARMS = arrays(bool, st.tuples(st.integers(0, 4), st.integers(0, 9)))
 ROWS = np.array([[1, 1, 0, 1, 1, 1], [0, 0, 0, 0, 0, 0], [1, 0, 1, 0, 1, 1]]) > 0
