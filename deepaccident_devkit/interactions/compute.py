@@ -54,8 +54,7 @@ class ActorMotion(FrozenArrays):
     @property
     def present(self) -> BoolArray:
         """(A, F) whether somebody annotated the actor."""
-        there: BoolArray = ~np.isnan(self.boxes[..., 0])
-        return there
+        return np.asarray(~np.isnan(self.boxes[..., 0]))
 
 
 def actor_motion(tracks: ScenarioTracks, num_frames: int, config: InteractionConfig) -> ActorMotion:
@@ -105,8 +104,7 @@ def _accelerations(speed: FloatArray) -> FloatArray:
     change = np.concatenate([edge, np.diff(speed, axis=1) / FRAME_PERIOD, edge], axis=1)
     around = np.stack([change[:, :-1], change[:, 1:]])
     known = ~np.isnan(around)
-    rates: FloatArray = np.where(known, around, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return rates
+    return np.asarray(np.where(known, around, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
 
 
 _AT_ONCE = 1 << 17
@@ -201,8 +199,7 @@ def _counts(motion: ActorMotion, pairs: IntArray) -> BoolArray:
     """(P, F) where both of each pair are there and at least one moves."""
     first, second = pairs.T
     present, moves = motion.present, motion.moves
-    counts: BoolArray = present[first] & present[second] & (moves[first] | moves[second])
-    return counts
+    return np.asarray(present[first] & present[second] & (moves[first] | moves[second]))
 
 
 def _may_be_under(motion: ActorMotion, pairs: IntArray, config: InteractionConfig) -> BoolArray:
@@ -265,8 +262,7 @@ def _moves_as_one(motion: ActorMotion, pairs: IntArray, gap: FloatArray, config:
     speed = relative_speed(motion.velocity[pairs[:, 0]], motion.velocity[pairs[:, 1]])
     with np.errstate(invalid="ignore"):
         alone = (gap > 0) | ((speed > config.standing_speed) & ~np.isnan(gap))
-    as_one: BoolArray = alone.sum(axis=1) == 0
-    return as_one
+    return np.asarray(alone.sum(axis=1) == 0)
 
 
 def _filled(values: FloatArray, filler: float) -> FloatArray:
@@ -275,13 +271,11 @@ def _filled(values: FloatArray, filler: float) -> FloatArray:
 
 def _least(values: FloatArray) -> FloatArray:
     """(L,) least of (L, F), infinite if there is none."""
-    least: FloatArray = values.min(axis=1, initial=np.inf)
-    return least
+    return np.asarray(values.min(axis=1, initial=np.inf))
 
 
 def _first_least(values: FloatArray) -> IntArray:
     """(L,) positions of the first least of (L, F)."""
     if not values.size:
         return np.zeros(len(values), dtype=np.int64)
-    positions: IntArray = values.argmin(axis=1)
-    return positions
+    return np.asarray(values.argmin(axis=1))

@@ -52,8 +52,7 @@ def masses_of(categories: ArrayLike, sizes: ArrayLike, class_masses: Mapping[str
     volumes = checked("sizes", sizes, (len(codes), 3)).prod(axis=1)
     masses = np.array(_masses_in_order(class_masses))
     medians = np.array([np.prod(_MEDIAN_SIZES[name]) for name in CATEGORIES])
-    result: FloatArray = masses[codes] * np.clip(volumes / medians[codes], _LEAST, _MOST)
-    return result
+    return np.asarray(masses[codes] * np.clip(volumes / medians[codes], _LEAST, _MOST))
 
 
 def _masses_in_order(class_masses: Mapping[str, float]) -> Sequence[float]:

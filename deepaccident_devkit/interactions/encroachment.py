@@ -262,16 +262,14 @@ def _parts(track: FloatArray) -> BoolArray:
     """(F − 1,) whether a piece begins at each frame but the last: it moves to the next one, or came from the last."""
     moves = np.abs(np.diff(track, axis=0)).max(axis=1) > _STILL
     before = np.append(True, moves[:-1])
-    starts: BoolArray = moves | before
-    return starts
+    return np.asarray(moves | before)
 
 
 def _near(first: Pieces, second: Pieces) -> BoolArray:
     """(N, M) whether the circles around two pieces meet."""
     apart = first.boxes[:, None, :2] - second.boxes[None, :, :2]
     reach = first.radius[:, None] + second.radius
-    near: BoolArray = (apart**2).sum(axis=-1) <= reach**2
-    return near
+    return np.asarray((apart**2).sum(axis=-1) <= reach**2)
 
 
 def _crossing(first: Pieces, second: Pieces, one: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:

@@ -20,13 +20,15 @@ from deepaccident_devkit.files import place_in
 from deepaccident_devkit.interactions.compute import actor_motion, measured_pairs, pair_summaries
 from deepaccident_devkit.interactions.config import InteractionConfig
 from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names, interaction_specs
-from deepaccident_devkit.parallel import Places, Progress, Store, in_order, run_unordered
+from deepaccident_devkit.parallel import Places, Store, in_order, run_unordered
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.tables.streams import read_streams, streams
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 
 logger = logging.getLogger(__name__)
@@ -175,10 +177,7 @@ def interactions_of(
     dataset: Dataset,
     scenarios: Sequence[RowArgument] | None = None,
     config: InteractionConfig | None = None,
-    *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: Progress = False,
+    **how: Unpack[Engine],
 ) -> Iterator[Interactions]:
     """`interactions` of many scenarios, all by default, in their order; those that are not kept are made in parallel.
 
@@ -186,9 +185,7 @@ def interactions_of(
         dataset: the release.
         scenarios: tokens or records.
         config: thresholds and assumptions; None for the default.
-        workers: processes; None chooses by the amount of work.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         TokenError: no such scenario.
@@ -202,11 +199,9 @@ def interactions_of(
     made = run_unordered(
         partial(interactions, dataset, config=config),
         absent,
-        workers=workers,
-        executor=executor,
         label="interactions",
-        progress=progress,
         places=Places(reads=dataset.places),
+        **how,
     )
     return _in_turn(dataset, tokens, set(absent), in_order(made))
 

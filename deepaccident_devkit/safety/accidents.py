@@ -145,17 +145,9 @@ def accidents_of(
     Raises:
         TokenError: no such scenario.
     """
-    found: list[Accident] = []
-    skipped: list[Skipped] = []
-    for scenario in dataset.scenario if scenarios is None else scenarios:
-        try:
-            accident = accident_of(dataset, scenario)
-        except NotAvailableError as error:
-            skipped.append(Skipped(scenario=dataset.get("scenario", scenario)["token"], reason=str(error)))
-            continue
-        if accident is not None:
-            found.append(accident)
-    return found, skipped
+    chosen = range(len(dataset.scenario)) if scenarios is None else (dataset.getind("scenario", s) for s in scenarios)
+    found = [tried(accident_of, dataset, dataset.scenario[row]) for row in chosen]
+    return [*those_of(Accident, found)], [*those_of(Skipped, found)]
 
 
 def recorded_path(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> FloatArray:

@@ -250,8 +250,7 @@ def _contact_possible(ends: FloatArray) -> BoolArray:
     apart = np.hypot(change[_Mark.X], change[_Mark.Y])
     relative = apart + change[_Mark.TURN] + change[_Mark.SPEED] * change[_Mark.TIME] / 2
     most = np.where(change[_Mark.STRETCH] == 0, np.minimum(relative, change[_Mark.WAY]), change[_Mark.WAY])
-    possible: BoolArray = begin[_Mark.GAP] + end[_Mark.GAP] <= most
-    return possible
+    return np.asarray(begin[_Mark.GAP] + end[_Mark.GAP] <= most)
 
 
 def _nodes(pair: Pair, window: tuple[float, float]) -> FloatArray:

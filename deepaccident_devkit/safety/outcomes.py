@@ -114,8 +114,7 @@ def delta_v_of(masses: ArrayLike, relative_speeds: ArrayLike) -> FloatArray:
         GeometryError: the masses have another shape.
     """
     both = checked("masses", masses, (2,))
-    result: FloatArray = np.asarray(relative_speeds)[..., None] * (both[::-1] / both.sum())
-    return result
+    return np.asarray(np.asarray(relative_speeds)[..., None] * (both[::-1] / both.sum()))
 
 
 def delta_v_ranges(masses: ArrayLike, relative_speeds: ArrayLike) -> FloatArray:

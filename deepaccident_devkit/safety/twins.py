@@ -219,8 +219,7 @@ class TwinDiff(FrozenArrays):
     @property
     def speed_differences(self) -> FloatArray:
         """(N, F) by how much an actor is faster in the twin, m/s."""
-        differences: FloatArray = self.speeds[1] - self.speeds[0]
-        return differences
+        return np.asarray(self.speeds[1] - self.speeds[0])
 
     @property
     def in_both(self) -> BoolArray:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import FloatArray, known
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.text import choice
@@ -143,7 +143,7 @@ def headlines(task: str, result: object) -> tuple[Headline, ...]:
     return tuple(
         Headline(
             name=row.name.replace("*", key),
-            value=_known(value),
+            value=known(value),
             unit=row.unit,
             higher_is_better=_HIGHER_IS_BETTER[row.better],
             path=row.path.replace("*", key),
@@ -151,11 +151,6 @@ def headlines(task: str, result: object) -> tuple[Headline, ...]:
         for row in _ROWS[task]
         for key, value in _found(result, row.path)
     )
-
-
-def headline_numbers(task: str, result: object) -> dict[str, float | None]:
-    """Name → value of `headlines`; raises ChoiceError if there is no such task."""
-    return {each.name: each.value for each in headlines(task, result)}
 
 
 def value_text(value: float | None, unit: Unit, *, signed: bool = False) -> str:
@@ -180,10 +175,6 @@ def _found(result: object, path: str) -> Iterator[tuple[str, Any]]:
     elif hasattr(result, head):
         value = getattr(result, head)
         yield from _found(value, rest) if rest else [("", value)]
-
-
-def _known(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
 
 
 _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
@@ -250,9 +241,9 @@ def range_of(path: str, alone: FloatArray) -> tuple[float, float]:
     unit = next((unit for pattern, unit in _UNITS.items() if _is_one_of(path, (pattern,))), None)
     if unit is not None:
         return -math.inf if _is_one_of(path, _SIGNED) else 0.0, LIMITS.get(unit, math.inf)
-    known = alone[np.isfinite(alone)]
-    least = known.min(initial=0.0)
-    return (0.0, 1.0 if known.max(initial=0.0) <= 1 else math.inf) if least >= 0 else (-math.inf, math.inf)
+    there = alone[np.isfinite(alone)]
+    least = there.min(initial=0.0)
+    return (0.0, 1.0 if there.max(initial=0.0) <= 1 else math.inf) if least >= 0 else (-math.inf, math.inf)
 
 
 def _is_one_of(path: str, patterns: tuple[str, ...]) -> bool:

@@ -9,6 +9,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
@@ -35,13 +36,15 @@ from deepaccident_devkit.evaluation.results.header import (
 )
 from deepaccident_devkit.evaluation.results.motion_arrays import paths_of, stored_output, stored_paths
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, MotionFile, ResultsFile, ResultsTask
-from deepaccident_devkit.evaluation.results.shards import OpenShards, ShardCheck, check_shard, read_manifest
+from deepaccident_devkit.evaluation.results.shards import OpenShards, check_shard, read_manifest
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import NO_NAME, fault_text, irregular_text, read_bytes
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 
 class _Texts(msgspec.Struct):
@@ -185,8 +188,8 @@ class MotionContents:
         Raises:
             ResultsError: names shard, token and array.
         """
-        tasks = [ShardCheck(self._root, shard, self.form) for shard in self._manifest.shards]
-        run_batch(check_shard, tasks, label="shards", places=Places(reads=(self._root,)), **how)
+        check = partial(check_shard, self._root, self.form)
+        run_batch(check, self._manifest.shards, label="shards", places=Places(reads=(self._root,)), **how)
 
 
 Contents = EntryContents | MotionContents
@@ -329,17 +332,12 @@ class Results:
 
     def check(
         self,
-        *,
-        workers: int | None = 1,
-        executor: Executor | None = None,
-        progress: bool = False,
+        **how: Unpack[Engine],
     ) -> None:
         """Read and check everything: do so before long work and before publishing.
 
         Args:
-            workers: processes for the shards of motion; None takes what the work is worth.
-            executor: any executor of `concurrent.futures` to run on, in place of own workers.
-            progress: whether to show a bar.
+            **how: `workers` (1 if not given), `executor` and `progress`, as `parallel.Engine` says.
 
         Raises:
             ResultsError: names the shard, the token and the array of the first fault, or the file was changed.
@@ -349,7 +347,8 @@ class Results:
             now = content_fingerprint(read_bytes(self._file, "results"))
         if now != self.fingerprint:
             raise ResultsError(f"{self._file}: was changed after it was opened; open it again")
-        self._contents.check(workers=workers, executor=executor, progress=progress)
+        how = {"workers": 1, **how}
+        self._contents.check(**how)
 
     @property
     def _file(self) -> Path:

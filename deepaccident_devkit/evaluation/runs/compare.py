@@ -15,7 +15,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, ShortRepr
+from deepaccident_devkit.arrays import FloatArray, ShortRepr, known
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
@@ -200,9 +200,9 @@ def compare_bundles(
     _check_truth(*bundles, scenarios)
     setup = bundles[0].setup
     results = [evaluator.compute(tokens) for evaluator in evaluators]
-    known = {each.path: each for result in results for each in headlines(setup.task, result)}
+    shown = {each.path: each for result in results for each in headlines(setup.task, result)}
     first, second = (numbers_of(result) for result in results)
-    names = list(dict.fromkeys([*(name for name in known if name in {**first, **second}), *first, *second]))
+    names = list(dict.fromkeys([*(name for name in shown if name in {**first, **second}), *first, *second]))
     values = np.array([[numbers.get(name, math.nan) for name in names] for numbers in (first, second)])
     clusters = _clusters(evaluators[0], tokens), _clusters(evaluators[1], tokens)
     test = paired_test(evaluators[0], clusters, dict(zip(names, values[1] - values[0], strict=True)), chosen)
@@ -220,22 +220,22 @@ def compare_bundles(
         resampling=chosen,
         swaps=len(test.swaps.swapped),
         all_swaps=test.swaps.complete,
-        numbers=_compared(names, values, test, known, len(scenarios)),
+        numbers=_compared(names, values, test, shown, len(scenarios)),
     )
 
 
 def _compared(
-    names: list[str], values: FloatArray, test: PairedTest, known: Mapping[str, Headline], scenarios: int
+    names: list[str], values: FloatArray, test: PairedTest, shown: Mapping[str, Headline], scenarios: int
 ) -> tuple[ComparedNumber, ...]:
-    main = next(iter(known), None)
-    families: list[Family] = ["main" if name == main else "headlines" if name in known else "other" for name in names]
+    main = next(iter(shown), None)
+    families: list[Family] = ["main" if name == main else "headlines" if name in shown else "other" for name in names]
     tested = np.array([family == "headlines" for family in families]) & np.isfinite(test.p)
     adjusted = test.p.copy()
     adjusted[tested] = holm(test.p[tested])
     together = {"main": 1, "headlines": max(int(tested.sum()), 1)}
     compared = []
     for at, (name, family) in enumerate(zip(names, families, strict=True)):
-        headline = known.get(name)
+        headline = shown.get(name)
         real = family != "other" and bool(adjusted[at] <= 1 - test.resampling.confidence)
         better = _better(test.differences[at], headline) if real else None
         decision = "for exploration" if family == "other" else f"{better} is better" if better else "they differ"
@@ -244,14 +244,14 @@ def _compared(
                 number=name,
                 headline=None if headline is None else headline.name,
                 unit=None if headline is None else headline.unit,
-                a=_finite(values[0, at]),
-                b=_finite(values[1, at]),
-                difference=_finite(test.differences[at]),
-                low=_finite(test.low[at]),
-                high=_finite(test.high[at]),
+                a=known(values[0, at]),
+                b=known(values[1, at]),
+                difference=known(test.differences[at]),
+                low=known(test.low[at]),
+                high=known(test.high[at]),
                 family=family,
-                p=_finite(test.p[at]),
-                adjusted_p=_finite(adjusted[at]),
+                p=known(test.p[at]),
+                adjusted_p=known(adjusted[at]),
                 real=real,
                 better=better,
                 decision=decision if real or family == "other" else undecided(test, at, together[family], scenarios),
@@ -264,10 +264,6 @@ def _better(difference: float, headline: Headline | None) -> str | None:
     if headline is None or headline.higher_is_better is None:
         return None
     return "b" if (difference > 0) == headline.higher_is_better else "a"
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _clusters(evaluator: Evaluator[Any], tokens: list[str]) -> Clusters:

@@ -47,7 +47,9 @@ from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 
 SUMMARY_FORMAT: Final = "DeepAccident metrics summary"
@@ -216,24 +218,22 @@ class EvaluationRun:
         self,
         by: Sequence[str] | None = None,
         resampling: Resampling | None = None,
-        *,
-        workers: int | None = 1,
-        executor: Executor | None = None,
+        **how: Unpack[Engine],
     ) -> EvaluationRun:
         """The same run with results by these attributes, in place of those it has.
 
         Args:
             by: of `attributes.ATTRIBUTES`; one that is given twice counts once. None for `breakdowns_of` the task.
             resampling: how intervals are made; None for the defaults.
-            workers: processes, which share the attributes among them; None takes what the work is worth.
-            executor: any executor of `concurrent.futures` to run on, in place of own workers.
+            **how: `workers` (1 if not given), `executor` and `progress`, as `parallel.Engine` says.
 
         Raises:
             ChoiceError: no such attribute.
         """
         chosen = breakdowns_of(self.setup.task) if by is None else map(attribute_name, by)
         work = partial(breakdown, self.evaluator, self.attributes, resampling=resampling)
-        found = run_batch(work, list(dict.fromkeys(chosen)), workers=workers, executor=executor)
+        how = {"workers": 1, **how}
+        found = run_batch(work, list(dict.fromkeys(chosen)), **how)
         return replace(self, breakdowns=tuple(found))
 
     def summary(self) -> dict[str, Any]:
@@ -343,17 +343,15 @@ def default_selection(
     )
 
 
-def evaluate_results(  # noqa: PLR0913 - of what, by which rules, on what, and where counts are kept
+def evaluate_results(
     dataset: Dataset,
     results: Results | str | os.PathLike[str],
     setup: EvaluationSetup,
     selection: SampleSelection | str | os.PathLike[str] = "val",
     *,
     allow_partial: bool = False,
-    workers: int | None = None,
-    executor: Executor | None = None,
     out: str | os.PathLike[str] | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> EvaluationRun:
     """Evaluate a results file. It is checked wholly before any long work; any number of workers gives the same bits.
 
@@ -364,12 +362,10 @@ def evaluate_results(  # noqa: PLR0913 - of what, by which rules, on what, and w
         selection: which samples; the name of a split for what `default_selection` has of it.
         allow_partial: whether to evaluate the samples that are in both where the results lack some, or have others;
             if some are missing, all output is marked as partial.
-        workers: processes; None takes what the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         out: the folder that the run will be saved to (`save_run`): counts are kept beside it, a run that broke off goes
             on with them if nothing that they depend on has changed, and several processes that are given it share the
             samples. None for no such counts.
-        progress: whether to show bars.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Returns:
         The run, without breakdowns: `EvaluationRun.broken_down` adds them.
@@ -388,15 +384,15 @@ def evaluate_results(  # noqa: PLR0913 - of what, by which rules, on what, and w
     tokens = _covered_tokens(dataset, loader.results, chosen, covered, allow_partial=allow_partial)
     if setup.task in _OF_ACCIDENTS:
         check_metas(dataset, tokens, chosen.split)
-    engine: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
-    loader.results.check(**engine)
-    hashes = scenario_hashes(dataset, set(map(scenario_of, tokens)), workers=workers, executor=executor)
+    how = {"workers": None, **how}
+    loader.results.check(**how)
+    hashes = scenario_hashes(
+        dataset, set(map(scenario_of, tokens)), workers=how["workers"], executor=how.get("executor")
+    )
     prints = {"results": loader.results.fingerprint, "release": fingerprint(hashes)}
     checkpoint = None if out is None else checkpoint_path(out, setup, tokens, prints)
     samples = {token: token for token in tokens}
-    evaluator = evaluate_samples(
-        setup.evaluator(), samples, loader, checkpoint=checkpoint, places=loader.places, **engine
-    )
+    evaluator = evaluate_samples(setup.evaluator(), samples, loader, checkpoint=checkpoint, places=loader.places, **how)
     return EvaluationRun(
         setup=setup,
         selection=chosen,

@@ -19,7 +19,9 @@ from deepaccident_devkit.parallel import Places, Store, run_batch, unfinished_fo
 from deepaccident_devkit.release.fingerprints import digest_of
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 
 Task = TypeVar("Task")
@@ -33,11 +35,9 @@ def evaluate_samples(
     samples: Mapping[str, Task],
     load: Callable[[Task], Sequence[Any]],
     *,
-    workers: int | None = None,
-    executor: Executor | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
-    progress: bool = False,
     places: Places | None = None,
+    **how: Unpack[Engine],
 ) -> EvaluatorT:
     """Update an evaluator with many samples; the result is the same, to the bit, for any number of workers.
 
@@ -48,13 +48,12 @@ def evaluate_samples(
         samples: token → whatever `load` needs, such as a file's name; small, since it goes to the workers.
         load: gives what `evaluator.update` takes after the token: prediction, label and so on. With several workers a
             function of a module that they can import, or `functools.partial` of one (a dataset may be bound to it).
-        workers: processes; None takes what the work is worth, and this one alone if others cannot import `load`.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         checkpoint: a folder in which counts are kept, eight samples at a time: what was counted there with the same
             settings is not evaluated again, and several processes that are given it share the samples. It is for one
             set of predictions and labels; remove it when these change. None for none.
-        progress: whether to show a bar.
         places: what workers on other hosts must see.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says; if others cannot import `load`, this
+            process works alone, unless a number of workers is asked for.
 
     Returns:
         The evaluator itself.
@@ -73,17 +72,12 @@ def evaluate_samples(
         _Batch(evaluator.fresh(), tuple(left[first : first + _BATCH]), load, store)
         for first in range(0, len(left), _BATCH)
     ]
-    if executor is None and workers != 1 and batches:
+    workers = how.get("workers")
+    if how.get("executor") is None and workers != 1 and batches:
         workers = _workers_that_can(batches[0], workers)
-    how: dict[str, Any] = {
-        "workers": workers,
-        "executor": executor,
-        "label": f"samples, {_BATCH} at once",
-        "progress": progress,
-        "places": places,
-    }
+    run = {**how, "workers": workers, "label": f"samples, {_BATCH} at once", "places": places}
     failed: dict[str, EvaluationError] = {}
-    for part, faults in _done(batches, store, how):
+    for part, faults in _done(batches, store, run):
         evaluator.merge(part)
         for token, fault in faults.items():
             fault.__cause__ = None if failed else fault.__cause__  # it holds what was being loaded

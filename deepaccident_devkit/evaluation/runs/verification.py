@@ -32,7 +32,9 @@ from deepaccident_devkit.files import path_of
 from deepaccident_devkit.reading import shortened
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 
 ABSENT: Final = "absent"
@@ -152,9 +154,7 @@ def verify_bundle(
     *,
     results: Results | str | os.PathLike[str] | None = None,
     split: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> Verification:
     """Evaluate again what a bundle is of, and compare everything with it; numbers must be equal to the bit.
 
@@ -166,9 +166,7 @@ def verify_bundle(
         dataset: the release; where `read_bundle(folder).dataroot` says, or another copy of it.
         results: the predictions; None for the bundle's own copy.
         split: the split file, if the bundle is of one; else None.
-        workers: processes; None takes what the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show bars.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         ResultsError: there is no bundle of this devkit's format, no results to evaluate, or a path must be given.
@@ -177,11 +175,10 @@ def verify_bundle(
     check_repeated(bundle, {"dataroot": dataset.dataroot, "results": results, "split": split})
     given = bundle.results_path if results is None else results
     opened = given if isinstance(given, Results) else read_results(given)
-    engine: dict[str, Any] = {"workers": workers, "executor": executor}
     found = list(_compared(FILES_FILE, bundle.checksums, partial(checksums_of, bundle.folder)))
     notes, run = [], None
     try:
-        run = _again(bundle, dataset, opened, split, engine, progress=progress)
+        run = _again(bundle, dataset, opened, split, how)
     except DeepAccidentError as error:
         found.append(Difference(where="all numbers", stored="evaluated", found=ABSENT))
         notes.append(f"cannot be evaluated again: {error}")
@@ -222,19 +219,18 @@ def _again(
     dataset: Dataset,
     results: Results,
     split: str | os.PathLike[str] | None,
-    engine: Mapping[str, Any],
-    *,
-    progress: bool,
+    how: Engine,
 ) -> EvaluationRun:
     summary, selection = bundle.summary, bundle.selection
     if split is not None:
         selection = replace(selection, split=os.fspath(split))
     partly = summary["partial"] is not None or bool(summary["counts"]["left_out"])
-    run = evaluate_results(dataset, results, bundle.setup, selection, allow_partial=partly, progress=progress, **engine)
+    run = evaluate_results(dataset, results, bundle.setup, selection, allow_partial=partly, **how)
     breakdowns, prevented = summary["breakdowns"], summary.get("prevented")
+    how = {"workers": None, **how, "progress": False}
     if breakdowns:
-        run = run.broken_down(list(breakdowns), _resampling(next(iter(breakdowns.values()))), **engine)
-    return run if prevented is None else with_prevented(run, dataset, _resampling(prevented), **engine)
+        run = run.broken_down(list(breakdowns), _resampling(next(iter(breakdowns.values()))), **how)
+    return run if prevented is None else with_prevented(run, dataset, _resampling(prevented), **how)
 
 
 def _resampling(part: Any) -> Resampling:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final, Protocol, runtime_checkable
 
@@ -23,6 +23,7 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentResu
 from deepaccident_devkit.evaluation.metrics.alarms.raised import named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.reading import InstanceAccident, accident_of
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.choices import protocol_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import (
     Accident,
@@ -35,7 +36,6 @@ from deepaccident_devkit.evaluation.metrics.predictions import (
 from deepaccident_devkit.evaluation.metrics.trajectories import longest
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import choice
 
 Truth = MotionLabels | BoxTruth | AccidentContext
 """What an evaluator takes as label: motion labels, or for a protocol without rasters its own truth."""
@@ -44,9 +44,6 @@ Truth = MotionLabels | BoxTruth | AccidentContext
 @runtime_checkable
 class AccidentProtocol(Protocol):
     """A frozen dataclass with one field for each choice; `PROTOCOLS` has those with names."""
-
-    def settings(self) -> dict[str, Any]:
-        """All choices that affect the numbers, as JSON can hold them."""
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds; raises EvaluationError if it cannot be evaluated by this protocol."""
@@ -83,15 +80,12 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
             ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
-        self.protocol = _protocol(protocol)
+        self.protocol = protocol_of(protocol, AccidentProtocol, PROTOCOLS)  # type: ignore[type-abstract]  # isinstance
 
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol and its choices."""
-        return {
-            "protocol": type(self.protocol).__name__,
-            "choices": self.protocol.settings(),
-        }
+        return {"protocol": type(self.protocol).__name__, "choices": asdict(self.protocol)}  # type: ignore[call-overload]
 
     def update(
         self,
@@ -149,12 +143,6 @@ def _known(label: Truth | None, context: AccidentContext | None) -> tuple[Motion
         f"label: expected MotionLabels, or for protocol='boxes' a BoxTruth or an AccidentContext, found "
         f"{type(label).__name__}; give what dataset.motion_labels(token) has of the sample"
     )
-
-
-def _protocol(protocol: object) -> AccidentProtocol:
-    if isinstance(protocol, AccidentProtocol):
-        return protocol
-    return PROTOCOLS[choice("protocol", protocol, PROTOCOLS)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

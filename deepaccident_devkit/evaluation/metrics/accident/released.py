@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -109,10 +109,6 @@ class ReleasedAccidents:
                 )
         if self.errors_at is not None and self.errors_at not in DISTANCES:
             raise ConfigError(f"errors_at: expected one of {', '.join(map(str, DISTANCES))}, found {self.errors_at!r}")
-
-    def settings(self) -> dict[str, Any]:
-        """All that decides the numbers, as JSON can hold it."""
-        return asdict(self)
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.

@@ -12,8 +12,6 @@ from deepaccident_devkit.evaluation.metrics.detection.result import (
     DetectionResult,
     NuScenesSummary,
     nuscenes_summary,
-    released_dict,
-    released_text,
 )
 
 __all__ = [
@@ -28,6 +26,4 @@ __all__ = [
     "detection_protocol",
     "detection_truth",
     "nuscenes_summary",
-    "released_dict",
-    "released_text",
 ]

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray, ShortRepr
+from deepaccident_devkit.evaluation.metrics.choices import protocol_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     SegmentationCounts,
@@ -48,7 +49,7 @@ from deepaccident_devkit.motion import (
     predict_instances,
     trajectories,
 )
-from deepaccident_devkit.text import choice, settle_choices
+from deepaccident_devkit.text import settle_choices
 
 RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
 """Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted."""
@@ -95,9 +96,7 @@ ranges: so `paper` is the released code, except that a number with nothing to co
 
 def motion_protocol(protocol: str | MotionProtocol) -> MotionProtocol:
     """A protocol by its name, or as it is given; raises ChoiceError."""
-    if isinstance(protocol, MotionProtocol):
-        return protocol
-    return MOTION_PROTOCOLS[choice("protocol", protocol, MOTION_PROTOCOLS)]
+    return protocol_of(protocol, MotionProtocol, MOTION_PROTOCOLS)
 
 
 _PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
@@ -225,7 +224,9 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
         """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
 
-        See `overlaps.separate_selected_as_released` for the mistake; `compute(selected)` is the correct result.
+        A mistake that is kept for comparison: it has one entry a *frame*, of all samples one after the other, and takes
+        those whose number is a *sample's*, so that most of what it sums up belongs to others. `compute(selected)` is
+        the correct result.
 
         Args:
             order: all samples in the order evaluated.

@@ -189,22 +189,6 @@ def panoptic_quality(iou: float, true_positive: float, false_positive: float, fa
     )
 
 
-def separate_selected_as_released(
-    counts: Sequence[VpqCounts], selected: Sequence[int]
-) -> tuple[PanopticQuality, PanopticQuality]:
-    """The released VPQ "of some samples", by scenario attribute: a mistake that is kept for comparison.
-
-    The released code has one entry a *frame*, of all samples one after the other, and takes those whose number is a
-    *sample's*: so most of what it sums up belongs to others. `vpq` of the selected samples is what it means to be.
-
-    Args:
-        counts: of all samples in the order evaluated.
-        selected: numbers of samples.
-    """
-    frames = [_frame(each, frame) for each in counts for frame in range(len(each.iou))]
-    return vpq([frames[number] for number in selected])
-
-
 def _checked_maps(prediction: AnyArray, label: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Two sets of instance maps (T, H, W); raises GeometryError."""
     predicted, true = as_numbers("prediction", prediction, dtype=None), as_numbers("label", label, dtype=None)
@@ -217,16 +201,6 @@ def _quality_of(counts: Sequence[VpqCounts], index: int) -> PanopticQuality:
     names = ("iou", "true_positive", "false_positive", "false_negative")
     return panoptic_quality(
         *(math.fsum(value for each in counts for value in getattr(each, name)[:, index].tolist()) for name in names)
-    )
-
-
-def _frame(counts: VpqCounts, index: int) -> VpqCounts:
-    one = slice(index, index + 1)
-    return VpqCounts(
-        iou=counts.iou[one],
-        true_positive=counts.true_positive[one],
-        false_positive=counts.false_positive[one],
-        false_negative=counts.false_negative[one],
     )
 
 

@@ -25,12 +25,11 @@ from deepaccident_devkit.evaluation.metrics.warning.prevention import (
     PreventionCurve,
     PreventionFigures,
 )
-from deepaccident_devkit.evaluation.metrics.warning.recordings import AlarmCost, ScoreSeries, false_alarm_cost
+from deepaccident_devkit.evaluation.metrics.warning.recordings import ScoreSeries
 
 __all__ = [
     "WARNING_PROTOCOLS",
     "AccidentOutcomes",
-    "AlarmCost",
     "AnticipationFigures",
     "AnticipationResult",
     "CleanScores",
@@ -46,7 +45,6 @@ __all__ = [
     "PreventionFigures",
     "ScoreSeries",
     "WarningEvaluator",
-    "false_alarm_cost",
     "field_figures",
     "printed_figures",
 ]

@@ -246,5 +246,4 @@ def _area(ranks: IntArray, positive: BoolArray, weight: FloatArray) -> float:
 
 
 def _shares(part: FloatArray, whole: FloatArray) -> FloatArray:
-    shares: FloatArray = np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0)
-    return shares
+    return np.asarray(np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0))

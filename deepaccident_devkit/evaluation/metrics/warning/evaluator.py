@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -16,6 +16,7 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.metrics.choices import protocol_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
@@ -47,7 +48,6 @@ from deepaccident_devkit.evaluation.metrics.warning.recordings import (
     sample_counts,
 )
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.text import choice
 
 Protocol = CleanWarnings | FieldWarnings
 Result = AnticipationResult | FieldResult
@@ -80,12 +80,12 @@ class WarningEvaluator(Evaluator[Any]):
             ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
-        self.protocol = _protocol(protocol)
+        self.protocol = protocol_of(protocol, Protocol, WARNING_PROTOCOLS)  # type: ignore[arg-type]  # a union is a kind too
 
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices."""
-        return self.protocol.settings()
+        return asdict(self.protocol)
 
     def update(
         self,
@@ -147,12 +147,6 @@ class WarningEvaluator(Evaluator[Any]):
     def has_intervals(self) -> bool:
         """The protocol `field` has none: its numbers take long, and are only for comparison with published ones."""
         return not isinstance(self.protocol, FieldWarnings)
-
-
-def _protocol(protocol: object) -> Protocol:
-    if isinstance(protocol, CleanWarnings | FieldWarnings):
-        return protocol
-    return WARNING_PROTOCOLS[choice("protocol", protocol, WARNING_PROTOCOLS)]
 
 
 _WALKING: Final = ", pedestrian"

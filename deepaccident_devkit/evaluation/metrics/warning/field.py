@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import ClassVar, Final, Literal, get_args
 
 import numpy as np
 
@@ -266,8 +266,7 @@ def _time_at_r80(levels: _Points) -> float:
 
 
 def _over(part: IntArray | FloatArray, whole: IntArray) -> FloatArray:
-    shares: FloatArray = np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0)
-    return shares
+    return np.asarray(np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0))
 
 
 def _nothing(code: FieldCode, why: str) -> FieldFigures:
@@ -304,10 +303,6 @@ class FieldWarnings:
 
     A recording's score is as of `CleanWarnings`, of all its alarms, since dash-cam sets know recordings alone.
     """
-
-    def settings(self) -> dict[str, Any]:
-        """No choices: it is as those codes are."""
-        return {}
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""

@@ -65,8 +65,7 @@ class OutcomeTable(FrozenArrays):
         """(C,) which of the W + 1 rows a first alarm at each frame has; the last one for frames of no sample."""
         place = np.searchsorted(self.frame, frames)
         there = np.append(self.frame, _NO_FRAME)[place] == frames
-        rows: IntArray = np.where(there, place, len(self.frame))
-        return rows
+        return np.where(there, place, len(self.frame))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -266,8 +265,7 @@ class ScoredEnds:
         """(K,) braking seconds a minute of each setting; NaN without a recording that has no accident."""
         minutes = self.minutes(weight)
         seconds = self._at(threshold).seconds @ weight[self.normal]
-        costs: FloatArray = np.array([ratio(each, minutes) for each in seconds.tolist()])[_REACTION_OF]
-        return costs
+        return np.asarray(np.array([ratio(each, minutes) for each in seconds.tolist()])[_REACTION_OF])
 
     def quiet_braking(self, weight: FloatArray) -> float:
         """The lowest threshold within the budget at the nominal reaction; infinite if there is none, NaN without cost.

@@ -15,8 +15,8 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr
-from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.raised import (
     Pair,
     named_alarms,
@@ -33,7 +33,7 @@ from deepaccident_devkit.evaluation.metrics.alarms.truth import (
     Involvement,
 )
 from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
-from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -63,13 +63,11 @@ class ScoreSeries(FrozenArrays):
     @property
     def valid(self) -> BoolArray:
         """(N, T) whether there is a score that counts: all from the impact on do not exist."""
-        there: BoolArray = ~np.isnan(self.scores) & (np.arange(self.scores.shape[1]) < self.toa[:, None])
-        return there
+        return np.asarray(~np.isnan(self.scores) & (np.arange(self.scores.shape[1]) < self.toa[:, None]))
 
     def highest(self) -> FloatArray:
         """(N,) the highest score of each recording; −inf without any."""
-        highest: FloatArray = np.max(self.scores, axis=1, initial=-np.inf, where=self.valid)
-        return highest
+        return np.asarray(np.max(self.scores, axis=1, initial=-np.inf, where=self.valid))
 
     def before(self, seconds: float) -> FloatArray:
         """(N, M) scores at the M moments of the last seconds before `toa`, the latest first; NaN without a score."""
@@ -77,8 +75,7 @@ class ScoreSeries(FrozenArrays):
         column = np.ceil(self.toa[:, None] - moments - _SLACK).astype(np.int64)
         there = (column >= 0) & (column < self.scores.shape[1])
         rows = np.arange(len(self.toa))[:, None]
-        scores: FloatArray = np.where(there, np.where(self.valid, self.scores, np.nan)[rows, column * there], np.nan)
-        return scores
+        return np.where(there, np.where(self.valid, self.scores, np.nan)[rows, column * there], np.nan)
 
     def first(self, thresholds: FloatArray) -> IntArray:
         """(N, K) the first column with a score of at least each of K thresholds; T where there is none."""
@@ -90,32 +87,10 @@ class ScoreSeries(FrozenArrays):
         """(N, K) seconds from the first score of at least each of K thresholds to `toa`; NaN where there is none."""
         first = self.first(thresholds).astype(np.float64)
         first[first >= self.scores.shape[1]] = np.nan
-        leads: FloatArray = (self.toa[:, None] - first) / self.fps
-        return leads
+        return np.asarray((self.toa[:, None] - first) / self.fps)
 
 
 MINUTE: Final = 60.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AlarmCost(ShortRepr):
-    """What the alarms of recordings without an accident cost. NaN: no frame.
-
-    Attributes:
-        episodes: runs of alarmed frames.
-        alarm_seconds: their time.
-        time_share: share of the frames that are in alarm.
-        episodes_per_minute: of recording.
-        braking_seconds: what is left of each run after the reaction time.
-        braking_seconds_per_minute: of recording.
-    """
-
-    episodes: int
-    alarm_seconds: float
-    time_share: float
-    episodes_per_minute: float
-    braking_seconds: float
-    braking_seconds_per_minute: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -148,8 +123,7 @@ class AlarmRuns(FrozenArrays):
     def braking_seconds(self, reaction: float) -> FloatArray:
         """(N,) seconds in which a driver brakes who obeys: of each run max(0, its duration − the reaction time)."""
         left = np.maximum(self.length / self.fps - reaction, 0.0)
-        seconds: FloatArray = np.bincount(self.row, left, self.shape[0]).astype(np.float64)
-        return seconds
+        return np.asarray(np.bincount(self.row, left, self.shape[0]).astype(np.float64))
 
     def first_lasting(self, reaction: float) -> IntArray:
         """(N,) first column of the first run that outlasts the reaction, so that it costs something; T for none."""
@@ -157,44 +131,6 @@ class AlarmRuns(FrozenArrays):
         first = np.full(self.shape[0], self.shape[1], dtype=np.int64)
         np.minimum.at(first, self.row[lasting], self.begin[lasting])
         return first
-
-
-def false_alarm_cost(
-    alarm: BoolArray, reaction: float, *, fps: float = 10.0, frames: BoolArray | None = None
-) -> AlarmCost:
-    """The cost of the alarms in recordings without an accident.
-
-    Args:
-        alarm: (N, T) whether each frame is in alarm.
-        reaction: seconds from an alarm to the brake.
-        fps: columns a second.
-        frames: (N, T) which frames there are; None for all.
-
-    Raises:
-        EvaluationError: the arrays have other shapes, or a frame that is not there is in alarm.
-        ConfigError: the reaction is below 0, or there is no frame a second.
-    """
-    raised = np.asarray(alarm, dtype=bool)
-    there = np.ones_like(raised) if frames is None else np.asarray(frames, dtype=bool)
-    if raised.ndim != 2 or there.shape != raised.shape:
-        raise EvaluationError(f"alarm, frames: expected shape (N, T) each, found {raised.shape} and {there.shape}")
-    if (raised & ~there).any():
-        raise EvaluationError("alarm: expected alarms at frames that are there alone; set the others to False")
-    if not (0 <= reaction < math.inf and 0 < fps < math.inf):
-        raise ConfigError(f"reaction, fps: expected seconds from 0 and a rate above 0, found {reaction!r} and {fps!r}")
-    runs = AlarmRuns.of(raised, fps)
-    alarmed = int(runs.length.sum())
-    count = int(there.sum())
-    minutes = count / fps / MINUTE
-    braking = math.fsum(runs.braking_seconds(reaction).tolist())
-    return AlarmCost(
-        episodes=len(runs.row),
-        alarm_seconds=alarmed / fps,
-        time_share=ratio(alarmed, count),
-        episodes_per_minute=ratio(len(runs.row), minutes),
-        braking_seconds=braking,
-        braking_seconds_per_minute=ratio(braking, minutes),
-    )
 
 
 Kind = Literal["accident", "twins", "others"]

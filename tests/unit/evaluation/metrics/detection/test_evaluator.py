@@ -15,8 +15,6 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     DetectionEvaluator,
     detection_truth,
     nuscenes_summary,
-    released_dict,
-    released_text,
 )
 from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.geometry import Boxes
@@ -249,12 +247,7 @@ def test_classes_that_are_nowhere() -> None:
     assert counted.mean_average_precision == pytest.approx(left_out.mean_average_precision / 6)
 
 
-def test_the_released_names_and_text() -> None:
-    names = list(released_dict(two_samples().compute()))
-    assert names[:2] == ["CARLA/car_3D_average_distance_mAP", "CARLA/car_mATE"]
-    assert released_text(two_samples("released_iou").compute()).count("IOU matching threshold") == 12
-    with pytest.raises(ChoiceError, match="no report of 1 ranges and 3 thresholds"):
-        released_text(two_samples("paper").compute())
+def test_a_summary_is_of_one_range() -> None:
     with pytest.raises(ChoiceError, match="of one range"):
         nuscenes_summary(two_samples("released_iou").compute())
 

@@ -18,7 +18,6 @@ from deepaccident_devkit.evaluation.metrics.motion import (
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     VpqRules,
     segmentation_counts,
-    separate_selected_as_released,
     vpq,
     vpq_counts,
 )
@@ -313,9 +312,6 @@ def test_the_released_breakdown_takes_other_samples_frames() -> None:
     assert (right.ranges["100x100"].iou, wrong.ranges["100x100"].iou) == (100.0, 100.0)
     with pytest.raises(EvaluationError, match="1 samples have no prediction, such as d"):
         evaluator.selected_as_released(["a", "d"], {"a"})
-    counts = [vpq_counts(np.stack([maps] * 5), label.instance) for maps in (boxes(), boxes(_1=100), boxes(_1=100))]
-    assert separate_selected_as_released(counts, [2])[1].pq == 0.0
-    assert separate_selected_as_released(counts, [2, 7])[1].pq == 1 / 1.5
 
 
 def test_what_cannot_be_compared_is_refused() -> None:
