@@ -363,11 +363,6 @@ def test_results_are_as_json_holds_them() -> None:
     assert result.as_dict()["groups"]["ego_involved"]["recordings"] == {"accident": 3, "twins": 3, "others": 0}
 
 
-def test_settings_are_the_protocols_choices() -> None:
-    assert WarningEvaluator().settings == {"scores_of": "pair", "threshold": None}
-    assert WarningEvaluator("field").settings == {}
-
-
 def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     def row(draws: int) -> float:
         monkeypatch.setattr(anticipation, "RANDOM_DRAWS", draws)
