@@ -34,7 +34,7 @@ from deepaccident_devkit.interactions import (
     time_to_collision,
     time_to_collision_1d,
 )
-from deepaccident_devkit.interactions.store import FOLDER
+from deepaccident_devkit.interactions.scenario import FOLDER
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 CHECKOUT = "SSMS_ON_PLANE"

@@ -240,7 +240,7 @@ def golden_detection() -> str:
 
     def evaluate(protocol: DetectionProtocol) -> DetectionResult:
         counts = [
-            {"token": f"{position:06d}", **frame_counts(*frame, protocol).as_dict()}
+            {"token": f"{position:06d}", **frame_counts(*frame, protocol)}
             for position, frame in enumerate(frames(GOLDEN))
         ]
         return detection_result(counts, protocol)

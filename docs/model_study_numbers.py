@@ -11,7 +11,7 @@ import numpy as np
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.evaluation import DetectedBoxes, Evaluator, MotionOutput, Resampling
-from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
+from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio, total
 from deepaccident_devkit.evaluation.metrics.intervals import (
     LEAST_CLUSTERS,

@@ -16,7 +16,7 @@ from model_study_numbers import Evaluators, HiddenActors, scene_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
+from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.export.torch import V2XDataset, collate

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from deepaccident_devkit.evaluation.results import RESULT_SCHEMAS
-from deepaccident_devkit.interactions.records import interaction_specs
+from deepaccident_devkit.interactions.table import interaction_specs
 from deepaccident_devkit.tables.schema import columns_markdown, json_schemas
 
 FOLDER = Path(__file__).parent

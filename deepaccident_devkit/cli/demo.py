@@ -20,7 +20,7 @@ from deepaccident_devkit.cli.options import use_threads_sparingly
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
-from deepaccident_devkit.evaluation.metrics.headlines import headlines
+from deepaccident_devkit.evaluation.metrics.numbers import headlines
 from deepaccident_devkit.evaluation.results import ResultsTask, read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup

@@ -26,7 +26,7 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING, attribute_name
+from deepaccident_devkit.evaluation.metrics.breakdowns import ATTRIBUTES, EVERYTHING, attribute_name
 from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (

@@ -19,8 +19,7 @@ from deepaccident_devkit.evaluation.metrics.accident import (
     box_truth,
     foreseen_accident,
 )
-from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes, sample_attributes
-from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, breakdown
+from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, SampleAttributes, breakdown, sample_attributes
 from deepaccident_devkit.evaluation.metrics.detection import (
     DetectedBoxes,
     DetectionEvaluator,
@@ -31,8 +30,13 @@ from deepaccident_devkit.evaluation.metrics.detection import (
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult, motion_counts
-from deepaccident_devkit.evaluation.metrics.motion.losses import LostInstance, lost_instances
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import segmentation_counts, vpq, vpq_counts
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
+    LostInstance,
+    lost_instances,
+    segmentation_counts,
+    vpq,
+    vpq_counts,
+)
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.metrics.segmentation import BevSegmentationEvaluator, BevSegmentationResult
 from deepaccident_devkit.evaluation.metrics.trajectories import match_trajectories

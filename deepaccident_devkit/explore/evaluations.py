@@ -10,8 +10,8 @@ from typing import Any, Final
 import msgspec
 
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING
-from deepaccident_devkit.evaluation.metrics.headlines import LIMITS, value_text
+from deepaccident_devkit.evaluation.metrics.breakdowns import ATTRIBUTES, EVERYTHING
+from deepaccident_devkit.evaluation.metrics.numbers import LIMITS, value_text
 from deepaccident_devkit.evaluation.runs import Bundle
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE, Line
 from deepaccident_devkit.explore.scenarios import UNKNOWN

@@ -14,7 +14,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.headlines import headlines, value_text
+from deepaccident_devkit.evaluation.metrics.numbers import headlines, value_text
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.selection import scenario_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 from urllib.parse import urlencode
 
 from deepaccident_devkit.errors import TokenError
-from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes, attribute_name, sample_attributes
+from deepaccident_devkit.evaluation.metrics.breakdowns import SampleAttributes, attribute_name, sample_attributes
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.choices import MOST_WORD

@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.explore.background import Job, Jobs
 from deepaccident_devkit.interactions import interactions_of
 from deepaccident_devkit.safety import lead_times
-from deepaccident_devkit.safety.scenarios import each_scenario, those_of
+from deepaccident_devkit.safety.accidents import each_scenario, those_of
 from deepaccident_devkit.selection.fields import FIELDS, group_texts, measures_of_moving_pairs
 from deepaccident_devkit.text import natural_order
 

@@ -3,9 +3,8 @@
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
 from deepaccident_devkit.interactions.approach import modified_ttc, nearest_approach
-from deepaccident_devkit.interactions.config import InteractionConfig
+from deepaccident_devkit.interactions.config import CLASS_MASSES, InteractionConfig, masses_of
 from deepaccident_devkit.interactions.encroachment import conflict_area_pet, post_encroachment_time
-from deepaccident_devkit.interactions.masses import CLASS_MASSES, masses_of
 from deepaccident_devkit.interactions.measures import (
     closing_speed,
     closing_speed_of_boxes,

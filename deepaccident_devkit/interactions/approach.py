@@ -139,8 +139,7 @@ def _first_touch(
         distance = shares[0][:, side] * ways[0] + shares[1][:, side] * ways[1] + gap[:, side, None]
         with np.errstate(invalid="ignore"):
             touch &= np.abs(distance) <= reach[:, side, None] + _TOLERANCE
-    least: FloatArray = np.where(touch, times, np.inf).min(axis=1)
-    return least
+    return np.asarray(np.where(touch, times, np.inf).min(axis=1))
 
 
 def _along_sides(shares: list[FloatArray], values: FloatArray) -> FloatArray:
@@ -158,8 +157,7 @@ def _stops(speeds: FloatArray, rates: FloatArray) -> FloatArray:
 def _travelled(times: FloatArray, speeds: FloatArray, rates: FloatArray, stops: FloatArray) -> FloatArray:
     """Way along the heading at times, which stays where it stops; of infinite times those of 0."""
     until = np.minimum(np.where(np.isfinite(times), times, 0.0), stops)
-    way: FloatArray = speeds * until + rates * until**2 / 2
-    return way
+    return np.asarray(speeds * until + rates * until**2 / 2)
 
 
 def _roots(square: FloatArray, linear: FloatArray, constant: FloatArray) -> FloatArray:
@@ -174,5 +172,4 @@ def _roots(square: FloatArray, linear: FloatArray, constant: FloatArray) -> Floa
 def _first_least(gaps: FloatArray, times: FloatArray) -> AnyArray:
     """Positions (…) along the last axis of the least gaps, of equal ones (to a rounding) the earliest."""
     least = gaps.min(axis=-1, keepdims=True)
-    positions: AnyArray = np.where(gaps <= least + _TOLERANCE * 1e-3, times, np.inf).argmin(axis=-1)
-    return positions
+    return np.asarray(np.where(gaps <= least + _TOLERANCE * 1e-3, times, np.inf).argmin(axis=-1))

@@ -1,4 +1,4 @@
-"""The columns of a scenario's interactions, from the motion of its actors."""
+"""The columns of a scenario's interactions, from the motion of all actors at all frames in dense arrays."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.geometry import time_to_collision
+from deepaccident_devkit.geometry.conflicts import normals
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
 from deepaccident_devkit.interactions.approach import modified_ttc
-from deepaccident_devkit.interactions.config import InteractionConfig
+from deepaccident_devkit.interactions.config import InteractionConfig, masses_of
+from deepaccident_devkit.interactions.encroachment import pieces_of, recorded_pet
 from deepaccident_devkit.interactions.measures import (
     closing_speed_of_boxes,
     delta_v,
@@ -22,9 +24,88 @@ from deepaccident_devkit.interactions.measures import (
     time_integrated,
     time_to_collision_1d,
 )
-from deepaccident_devkit.interactions.motion import ActorMotion
-from deepaccident_devkit.interactions.recorded import pieces_of, recorded_pet
+from deepaccident_devkit.tables import displacement_velocities
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.v2x.tracks import ScenarioTracks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ActorMotion(FrozenArrays):
+    """A actors at F frames, seen from above; world, right-handed, SI units. NaN where nobody annotated an actor.
+
+    Attributes:
+        ids: (A,) CARLA ids, ascending.
+        masses: (A,) kilograms, assumed.
+        boxes: (A, F, 5) x, y, length, width, yaw.
+        velocity: (A, F, 2) over the ground; NaN where neither a label nor a displacement says it.
+        speed: (A, F) along the heading.
+        acceleration: (A, F) along the heading: by the speeds one frame before and after; 0 without such.
+        moves: (A, F) whether an actor is there and faster than `standing_speed`.
+    """
+
+    ids: IntArray
+    masses: FloatArray
+    boxes: FloatArray
+    velocity: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
+    moves: BoolArray
+
+    @property
+    def present(self) -> BoolArray:
+        """(A, F) whether somebody annotated the actor."""
+        return np.asarray(~np.isnan(self.boxes[..., 0]))
+
+
+def actor_motion(tracks: ScenarioTracks, num_frames: int, config: InteractionConfig) -> ActorMotion:
+    """The actors of a scenario at its frames 1 to `num_frames`."""
+    boxes = tracks.boxes
+    ids, last = np.unique(tracks.actor_id[::-1], return_index=True)
+    actor = np.searchsorted(ids, tracks.actor_id)
+    place = (actor, tracks.index - 1)
+    dense = np.full((len(ids), num_frames, 5), np.nan)
+    dense[place] = np.column_stack([boxes.center[:, :2], boxes.size[:, :2], boxes.yaw])
+    velocity = np.full((len(ids), num_frames, 2), np.nan)
+    velocity[place] = _velocities(tracks)
+    speed = (velocity * normals(dense[..., 4])).sum(axis=-1)
+    rows = len(boxes) - 1 - last
+    with np.errstate(invalid="ignore"):
+        moves: BoolArray = np.hypot(velocity[..., 0], velocity[..., 1]) > config.standing_speed
+    return ActorMotion(
+        ids=ids,
+        masses=masses_of(boxes.category[rows], _median_sizes(boxes.size, actor, len(ids)), config.class_masses),
+        boxes=dense,
+        velocity=velocity,
+        speed=speed,
+        acceleration=_accelerations(speed),
+        moves=moves,
+    )
+
+
+def _velocities(tracks: ScenarioTracks) -> FloatArray:
+    """(M, 2) the tracks' velocities, displacements where these are unknown."""
+    velocity = tracks.boxes.velocity[:, :2]
+    unknown: BoolArray = np.isnan(velocity.sum(axis=1))
+    if not unknown.any():
+        return velocity
+    together = np.zeros(len(velocity), dtype=np.int64)
+    moved = displacement_velocities(tracks.boxes.center, together, tracks.actor_id, tracks.index)
+    return np.where(unknown[:, None], moved[:, :2], velocity)
+
+
+def _median_sizes(sizes: FloatArray, actor: IntArray, count: int) -> FloatArray:
+    """(A, 3) medians: a pedestrian's box changes its size with the steps."""
+    return np.array([np.median(sizes[actor == each], axis=0) for each in range(count)]).reshape(-1, 3)
+
+
+def _accelerations(speed: FloatArray) -> FloatArray:
+    """(A, F) mean change of the speed to and from each frame, of what is known of both; 0 where nothing is."""
+    edge = np.full((len(speed), 1), np.nan)
+    change = np.concatenate([edge, np.diff(speed, axis=1) / FRAME_PERIOD, edge], axis=1)
+    around = np.stack([change[:, :-1], change[:, 1:]])
+    known = ~np.isnan(around)
+    return np.asarray(np.where(known, around, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
+
 
 _AT_ONCE = 1 << 17
 """Pairs times frames that are looked at together."""
@@ -118,8 +199,7 @@ def _counts(motion: ActorMotion, pairs: IntArray) -> BoolArray:
     """(P, F) where both of each pair are there and at least one moves."""
     first, second = pairs.T
     present, moves = motion.present, motion.moves
-    counts: BoolArray = present[first] & present[second] & (moves[first] | moves[second])
-    return counts
+    return np.asarray(present[first] & present[second] & (moves[first] | moves[second]))
 
 
 def _may_be_under(motion: ActorMotion, pairs: IntArray, config: InteractionConfig) -> BoolArray:
@@ -182,8 +262,7 @@ def _moves_as_one(motion: ActorMotion, pairs: IntArray, gap: FloatArray, config:
     speed = relative_speed(motion.velocity[pairs[:, 0]], motion.velocity[pairs[:, 1]])
     with np.errstate(invalid="ignore"):
         alone = (gap > 0) | ((speed > config.standing_speed) & ~np.isnan(gap))
-    as_one: BoolArray = alone.sum(axis=1) == 0
-    return as_one
+    return np.asarray(alone.sum(axis=1) == 0)
 
 
 def _filled(values: FloatArray, filler: float) -> FloatArray:
@@ -192,13 +271,11 @@ def _filled(values: FloatArray, filler: float) -> FloatArray:
 
 def _least(values: FloatArray) -> FloatArray:
     """(L,) least of (L, F), infinite if there is none."""
-    least: FloatArray = values.min(axis=1, initial=np.inf)
-    return least
+    return np.asarray(values.min(axis=1, initial=np.inf))
 
 
 def _first_least(values: FloatArray) -> IntArray:
     """(L,) positions of the first least of (L, F)."""
     if not values.size:
         return np.zeros(len(values), dtype=np.int64)
-    positions: IntArray = values.argmin(axis=1)
-    return positions
+    return np.asarray(values.argmin(axis=1))

@@ -119,8 +119,7 @@ def delta_v(
     Plastic and central: they go on together. Masses (…,) in kilograms; `masses_of` assumes some.
     """
     shares = np.stack([second_mass, first_mass], axis=-1) / (first_mass + second_mass)[..., None]
-    result: FloatArray = shares * relative_speed(first_velocity, second_velocity)[..., None]
-    return result
+    return np.asarray(shares * relative_speed(first_velocity, second_velocity)[..., None])
 
 
 def impact_heading(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -200,8 +199,7 @@ def _known(values: FloatArray, source: FloatArray) -> FloatArray:
 
 
 def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
-    result: FloatArray = (one * other).sum(axis=-1)
-    return result
+    return np.asarray((one * other).sum(axis=-1))
 
 
 def _length(vectors: FloatArray) -> FloatArray:

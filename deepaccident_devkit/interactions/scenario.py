@@ -1,25 +1,145 @@
-"""The interactions of a scenario, or of many: computed from the tracks, or read where they are kept."""
+"""The interactions of a scenario, or of many: computed from the tracks, or read where they are kept.
+
+They are kept in files, one a scenario, in the folder of the tables, so that they go when these are made again.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import closing
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.interactions.compute import measured_pairs, pair_summaries
+from deepaccident_devkit.errors import IndexStoreError
+from deepaccident_devkit.files import place_in
+from deepaccident_devkit.interactions.compute import actor_motion, measured_pairs, pair_summaries
 from deepaccident_devkit.interactions.config import InteractionConfig
-from deepaccident_devkit.interactions.motion import actor_motion
-from deepaccident_devkit.interactions.store import keep, kept_path, read_kept
-from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names
-from deepaccident_devkit.parallel import Places, Progress, in_order, run_unordered
+from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names, interaction_specs
+from deepaccident_devkit.parallel import Places, Store, in_order, run_unordered
+from deepaccident_devkit.tables.columns import NULL_INTEGER
+from deepaccident_devkit.tables.streams import read_streams, streams
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
+
+
+logger = logging.getLogger(__name__)
+
+FOLDER: Final = "interactions"
+VERSION: Final = "1"
+"""Counted up where the same tracks give other numbers, so that kept files are made again."""
+
+
+def kept_path(dataset: Dataset, scenario: str) -> Path:
+    """Where the interactions of a scenario are kept; raises OutputFolderError if that is behind a link."""
+    return _store(dataset).path(scenario)
+
+
+def read_kept(dataset: Dataset, scenario: str, config: InteractionConfig) -> Interactions | None:
+    """The kept interactions of a scenario; None if there are none of this version, or the file is damaged."""
+    import pyarrow as pa
+
+    content = _store(dataset).kept(scenario, _key(config), "index")
+    if content is None:
+        return None
+    tables = read_streams(pa.BufferReader(content), list(interaction_specs().values()))
+    return None if tables is None else _from_columns(dataset, scenario, config, tables)
+
+
+def keep(dataset: Dataset, found: Interactions) -> bool:
+    """Write the file of a scenario's interactions; whether that could be done."""
+    if not dataset.tables_folder.is_dir():  # made again meanwhile
+        return False
+    content = streams(list(zip(interaction_specs().values(), _to_columns(dataset, found), strict=True)))
+    try:
+        _store(dataset).keep(found.scenario, _key(found.config), content)
+    except OSError as error:
+        logger.debug("%s: interactions are not kept: %s", found.scenario, error)
+        return False
+    return True
+
+
+def _store(dataset: Dataset) -> Store:
+    """Nobody locks it: two processes write the same file, one after the other."""
+    folder = place_in(dataset.tables_folder, FOLDER, opened=True)
+    return Store(folder, folder, "keeps interactions", IndexStoreError)
+
+
+def _key(config: InteractionConfig) -> str:
+    return f"{VERSION} {config!r}"
+
+
+def _to_columns(dataset: Dataset, found: Interactions) -> list[dict[str, Any]]:
+    """The stored columns of both tables; keys count in the tables of the index."""
+    first_frame, actors, first_actor = _keys(dataset, found.scenario)
+    pairs = found.pairs
+
+    def rows(ids: Any) -> dict[str, Any]:
+        positions = np.searchsorted(actors, ids) + first_actor
+        return {"first_row": positions[:, 0], "second_row": positions[:, 1]}
+
+    def frame_row(frames: Any) -> Any:
+        return np.where(frames > 0, frames - 1 + first_frame, NULL_INTEGER)
+
+    return [
+        {
+            "frame_row": frame_row(found.frame),
+            **rows(found.actor_ids),
+            **{name: getattr(found, name) for name in array_names(Interactions)},
+        },
+        {
+            "scenario_row": np.full(len(pairs), dataset.getind("scenario", found.scenario)),
+            **rows(pairs.actor_ids),
+            "min_ttc_frame_row": frame_row(pairs.min_ttc_frame),
+            "min_gap_frame_row": frame_row(pairs.min_gap_frame),
+            **{name: getattr(pairs, name) for name in array_names(InteractionPairs)},
+        },
+    ]
+
+
+def _from_columns(
+    dataset: Dataset, scenario: str, config: InteractionConfig, tables: Sequence[dict[str, Any]]
+) -> Interactions:
+    first_frame, actors, first_actor = _keys(dataset, scenario)
+    rows, pairs = tables
+
+    def ids(table: dict[str, Any]) -> Any:
+        return actors[np.column_stack([table["first_row"], table["second_row"]]) - first_actor]
+
+    def frames(keys: Any) -> Any:
+        return np.where(keys >= 0, keys.astype(np.int64) - first_frame + 1, 0)
+
+    return Interactions(
+        scenario=scenario,
+        config=config,
+        labelled=True,
+        frame=frames(rows["frame_row"]),
+        actor_ids=ids(rows),
+        pairs=InteractionPairs(
+            scenario=scenario,
+            actor_ids=ids(pairs),
+            min_ttc_frame=frames(pairs["min_ttc_frame_row"]),
+            min_gap_frame=frames(pairs["min_gap_frame_row"]),
+            **{name: pairs[name] for name in array_names(InteractionPairs)},
+        ),
+        **{name: rows[name] for name in array_names(Interactions)},
+    )
+
+
+def _keys(dataset: Dataset, scenario: str) -> tuple[int, Any, int]:
+    """The row of a scenario's first frame, the ids of its actors, and the row of the first of these."""
+    row = dataset.getind("scenario", scenario)
+    instances = dataset.columns("instance")
+    first, last = instances["scenario_row"].searchsorted((row, row + 1))
+    return dataset.columns("scenario")["first_frame_row"].item(row), instances["actor_id"][first:last], int(first)
 
 
 def interactions(dataset: Dataset, scenario: RowArgument, config: InteractionConfig | None = None) -> Interactions:
@@ -57,10 +177,7 @@ def interactions_of(
     dataset: Dataset,
     scenarios: Sequence[RowArgument] | None = None,
     config: InteractionConfig | None = None,
-    *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: Progress = False,
+    **how: Unpack[Engine],
 ) -> Iterator[Interactions]:
     """`interactions` of many scenarios, all by default, in their order; those that are not kept are made in parallel.
 
@@ -68,9 +185,7 @@ def interactions_of(
         dataset: the release.
         scenarios: tokens or records.
         config: thresholds and assumptions; None for the default.
-        workers: processes; None chooses by the amount of work.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         TokenError: no such scenario.
@@ -84,11 +199,9 @@ def interactions_of(
     made = run_unordered(
         partial(interactions, dataset, config=config),
         absent,
-        workers=workers,
-        executor=executor,
         label="interactions",
-        progress=progress,
         places=Places(reads=dataset.places),
+        **how,
     )
     return _in_turn(dataset, tokens, set(absent), in_order(made))
 

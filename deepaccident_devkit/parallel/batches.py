@@ -34,12 +34,12 @@ class Engine(TypedDict, total=False):
     Attributes:
         workers: processes; 1 for this one alone, None for as many as the work is worth.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        progress: whether to show a bar; or a function, as of `run_unordered`.
     """
 
     workers: int | None
     executor: Executor | None
-    progress: bool
+    progress: Progress
 
 
 _SAME_SIGNAL: Final = 0.1

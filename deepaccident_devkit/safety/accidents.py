@@ -1,10 +1,11 @@
-"""`Accident`: the recorded motion of two actors that collide, from the labels of all agents."""
+"""`Accident`: the recorded motion of two actors that collide; `each_scenario`: one computation on many scenarios."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
@@ -12,10 +13,19 @@ from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray, Short
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.interactions import CLASS_MASSES, masses_of
+from deepaccident_devkit.parallel import Places, in_order, run_unordered
+from deepaccident_devkit.reports import Row
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, AgentName
 from deepaccident_devkit.v2x.collisions import colliding_pair
 from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.tables.records import ScenarioRecord
+
 
 _FEWEST: Final = 2
 """Frames that show both of a pair, with which there is a motion."""
@@ -135,17 +145,9 @@ def accidents_of(
     Raises:
         TokenError: no such scenario.
     """
-    found: list[Accident] = []
-    skipped: list[Skipped] = []
-    for scenario in dataset.scenario if scenarios is None else scenarios:
-        try:
-            accident = accident_of(dataset, scenario)
-        except NotAvailableError as error:
-            skipped.append(Skipped(scenario=dataset.get("scenario", scenario)["token"], reason=str(error)))
-            continue
-        if accident is not None:
-            found.append(accident)
-    return found, skipped
+    chosen = range(len(dataset.scenario)) if scenarios is None else (dataset.getind("scenario", s) for s in scenarios)
+    found = [tried(accident_of, dataset, dataset.scenario[row]) for row in chosen]
+    return [*those_of(Accident, found)], [*those_of(Skipped, found)]
 
 
 def recorded_path(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> FloatArray:
@@ -163,3 +165,68 @@ def agents_by_actor(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
     names = agents_of(dataset, scenario)
     ids = (dataset.agent.get(f"{scenario}/{name}")["actor_id"] for name in names)
     return {actor: name for actor, name in zip(ids, names, strict=True) if actor is not None}
+
+
+Result = TypeVar("Result")
+_RUN_LENGTH: Final = 64
+"""Scenarios that are looked at together: some tenths of a second."""
+
+
+def skipped_rows(skipped: Iterable[Skipped]) -> list[Row]:
+    """The table of what is left out."""
+    return [("scenario", "reason"), *((each.scenario, each.reason) for each in skipped)]
+
+
+def reasons_text(title: str, skipped: Iterable[Skipped]) -> str:
+    """A line a reason under a title."""
+    return "\n".join([f"{title}:", *(f"  {each.reason}" for each in skipped)])
+
+
+def each_scenario(
+    work: Callable[[Dataset, Any], Result | None],
+    dataset: Dataset,
+    scenarios: Iterable[RowArgument] | None = None,
+    *,
+    label: str,
+    at_once: int = _RUN_LENGTH,
+    **how: Unpack[Engine],
+) -> list[Result | Skipped | None]:
+    """Apply a computation to scenarios, each once, in the order of the release.
+
+    Args:
+        work: an importable function of the devkit (or a `functools.partial` of one) of a release and a scenario's
+            record. It returns None for a scenario that it does not concern, and raises NotAvailableError for one that
+            lacks what it needs: then there is a Skipped.
+        dataset: the release.
+        scenarios: tokens or records; None for all. Raises TokenError.
+        label: text of the progress bar.
+        at_once: scenarios of a piece of work; 1 where one takes tenths of a second.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+    """
+    chosen = range(len(dataset.scenario)) if scenarios is None else [dataset.getind("scenario", s) for s in scenarios]
+    rows = sorted(set(chosen))
+    runs = [rows[first : first + at_once] for first in range(0, len(rows), at_once)]
+    sizes, places = [len(run) for run in runs], Places(reads=dataset.places)
+    parts = run_unordered(partial(_run, work, dataset), runs, sizes=sizes, places=places, label=label, **how)
+    return [each for part in in_order(parts) for each in part]
+
+
+def _run(
+    work: Callable[[Dataset, Any], Result | None], dataset: Dataset, rows: Sequence[int]
+) -> list[Result | Skipped | None]:
+    return [tried(work, dataset, dataset.scenario[row]) for row in rows]
+
+
+def tried(
+    work: Callable[[Dataset, Any], Result | None], dataset: Dataset, scenario: ScenarioRecord
+) -> Result | Skipped | None:
+    """What a computation, as `each_scenario` takes it, finds in one scenario, or why it finds nothing."""
+    try:
+        return work(dataset, scenario)
+    except NotAvailableError as error:
+        return Skipped(scenario=scenario["token"], reason=str(error))
+
+
+def those_of(kind: type[Result], found: Iterable[object]) -> tuple[Result, ...]:
+    """Of what `each_scenario` found, what is of a kind: results, or Skipped."""
+    return tuple(each for each in found if isinstance(each, kind))

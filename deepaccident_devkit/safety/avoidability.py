@@ -15,8 +15,8 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntA
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of
-from deepaccident_devkit.safety.contact import Pair, contact_made, pair_of
+from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, each_scenario, reasons_text, those_of
+from deepaccident_devkit.safety.contact import Pair, SecondaryContact, contact_made, pair_of, secondary_contacts
 from deepaccident_devkit.safety.outcomes import (
     BRAKINGS,
     MOST_MARGIN,
@@ -28,8 +28,6 @@ from deepaccident_devkit.safety.outcomes import (
     outcomes_of,
     undisturbed,
 )
-from deepaccident_devkit.safety.scenarios import each_scenario, reasons_text, those_of
-from deepaccident_devkit.safety.secondary import SecondaryContact, secondary_contacts
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import columns_text
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks

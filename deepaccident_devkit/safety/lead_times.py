@@ -21,9 +21,15 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntA
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import GeometryError, NotAvailableError
 from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import Skipped, accident_of
+from deepaccident_devkit.safety.accidents import (
+    Skipped,
+    accident_of,
+    each_scenario,
+    reasons_text,
+    skipped_rows,
+    those_of,
+)
 from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
-from deepaccident_devkit.safety.scenarios import each_scenario, reasons_text, skipped_rows, those_of
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, AgentName, short_name
 from deepaccident_devkit.text import columns_text
 
@@ -54,8 +60,7 @@ _OF_ACCIDENT: Final = (
 
 def coalition_members(partners: int) -> BoolArray:
     """Which partners are in each coalition: (2^n, n)."""
-    members: BoolArray = (np.arange(1 << partners)[:, None] >> np.arange(partners) & 1).astype(bool)
-    return members
+    return np.asarray((np.arange(1 << partners)[:, None] >> np.arange(partners) & 1).astype(bool))
 
 
 def first_together(observed: ArrayLike) -> IntArray:
@@ -79,8 +84,7 @@ def first_together(observed: ArrayLike) -> IntArray:
     for number, members in enumerate(coalitions):
         union = np.asarray(seen[..., np.concatenate([[True], members]), :, :].any(axis=-3))
         both[..., number, :] = union[..., 0, :] & union[..., 1, :]
-    first: IntArray = np.where(both.any(axis=-1), both.argmax(axis=-1) if both.shape[-1] else 0, -1)
-    return first
+    return np.where(both.any(axis=-1), both.argmax(axis=-1) if both.shape[-1] else 0, -1)
 
 
 def coalition_leads(observed: ArrayLike) -> FloatArray:
@@ -100,8 +104,7 @@ def coalition_leads(observed: ArrayLike) -> FloatArray:
 
 def leads_from(first: IntArray, frames: int) -> FloatArray:
     """Seconds from the frames that `first_together` gives (…) to the last one of so many; 0 where it gives −1."""
-    leads: FloatArray = np.where(first < 0, 0, frames - 1 - first) * FRAME_PERIOD
-    return leads
+    return np.asarray(np.where(first < 0, 0, frames - 1 - first) * FRAME_PERIOD)
 
 
 def shapley_values(leads: ArrayLike) -> FloatArray:
@@ -211,15 +214,13 @@ class LeadTimes(FrozenArrays):
     @property
     def gains(self) -> FloatArray:
         """(4,) seconds that each of `PARTNERS` adds to the ego alone; NaN for a missing one."""
-        gains: FloatArray = self.leads[_ALONE] - self.leads[0]
-        return gains
+        return np.asarray(self.leads[_ALONE] - self.leads[0])
 
     @property
     def losses(self) -> FloatArray:
         """(4,) seconds that all agents lose without each of `PARTNERS`; NaN for a missing one."""
         without = [self._everyone & ~bit for bit in _ALONE]
-        losses: FloatArray = np.where(np.isnan(self.gains), np.nan, self.together - self.leads[without])
-        return losses
+        return np.where(np.isnan(self.gains), np.nan, self.together - self.leads[without])
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON; None for what is not known, and for the first frame of a set that never observes both."""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.interactions.masses import MASS_UNCERTAINTY
+from deepaccident_devkit.interactions.config import MASS_UNCERTAINTY
 from deepaccident_devkit.safety.accidents import Accident
 from deepaccident_devkit.safety.contact import Pair, contact_times, impacts, pair_of
 
@@ -114,8 +114,7 @@ def delta_v_of(masses: ArrayLike, relative_speeds: ArrayLike) -> FloatArray:
         GeometryError: the masses have another shape.
     """
     both = checked("masses", masses, (2,))
-    result: FloatArray = np.asarray(relative_speeds)[..., None] * (both[::-1] / both.sum())
-    return result
+    return np.asarray(np.asarray(relative_speeds)[..., None] * (both[::-1] / both.sum()))
 
 
 def delta_v_ranges(masses: ArrayLike, relative_speeds: ArrayLike) -> FloatArray:

@@ -86,18 +86,6 @@ class BrakingPlans(NamedTuple):
     arcs: FloatArray
     speeds: FloatArray
 
-    @property
-    def stop_times(self) -> FloatArray:
-        """(N,) seconds at which the braking alone ends, also after the recording."""
-        times: FloatArray = self.starts + self.speeds / self.decelerations
-        return times
-
-    @property
-    def stop_arcs(self) -> FloatArray:
-        """(N,) metres along the path at which the braking alone ends."""
-        arcs: FloatArray = self.arcs + self.speeds**2 / (2 * self.decelerations)
-        return arcs
-
     def take(self, rows: IntArray) -> BrakingPlans:
         """The plans of some rows."""
         return BrakingPlans(*(each[rows] for each in self))
@@ -124,8 +112,7 @@ class ReplayStates(NamedTuple):
         """(N, 2) m/s: along the path of `motion`, which need not be the heading."""
         steps, lengths = motion.steps[:, :2], motion.lengths[:, None]
         along = np.divide(steps, lengths, out=np.zeros_like(steps), where=lengths > 0)
-        velocities: FloatArray = self.speeds[:, None] * along[self.stretches]
-        return velocities
+        return np.asarray(self.speeds[:, None] * along[self.stretches])
 
 
 def motion_of(path: ArrayLike, *, horizon: float = HORIZON) -> Motion:

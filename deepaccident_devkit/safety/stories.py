@@ -17,10 +17,17 @@ from deepaccident_devkit.arrays import ShortRepr, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, agents_by_actor
+from deepaccident_devkit.safety.accidents import (
+    Accident,
+    Skipped,
+    accident_of,
+    agents_by_actor,
+    each_scenario,
+    those_of,
+    tried,
+)
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability
 from deepaccident_devkit.safety.observation import observed_actors
-from deepaccident_devkit.safety.scenarios import each_scenario, those_of, tried
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.collisions import Contact, collision
 from deepaccident_devkit.v2x.configurations import agents_of

@@ -131,13 +131,11 @@ def matched_rows(first: Recording, second: Recording) -> dict[int, tuple[int, Ma
     Returns:
         Row of the first recording → row of the second, and by what.
     """
-    result: dict[int, tuple[int, MatchedBy]] = {}
-    rows, other_rows = ({actor: row for row, actor in enumerate(each.actor_id.tolist())} for each in (first, second))
+    result: dict[int, tuple[int, MatchedBy]] = {
+        row: (other, "agent") for row, other in _agent_rows(first, second).items()
+    }
+    rows, other_rows = _rows_by_id(first), _rows_by_id(second)
     common = [name for name in first.agents if name in second.agents]
-    for name in common:
-        row, other = rows.get(first.agents[name]), other_rows.get(second.agents[name])
-        if row is not None and other is not None:
-            result[row] = (other, "agent")
     if len(common) >= _FEWEST_AGENTS and all(first.agents[name] == second.agents[name] for name in common):
         for actor, row in rows.items():
             other = other_rows.get(actor)

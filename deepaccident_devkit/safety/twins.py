@@ -19,8 +19,14 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
 from deepaccident_devkit.reports import Report, Row, write_csv
-from deepaccident_devkit.safety.accidents import Skipped, accident_of
-from deepaccident_devkit.safety.scenarios import each_scenario, reasons_text, skipped_rows, those_of
+from deepaccident_devkit.safety.accidents import (
+    Skipped,
+    accident_of,
+    each_scenario,
+    reasons_text,
+    skipped_rows,
+    those_of,
+)
 from deepaccident_devkit.safety.twin_matching import MatchedBy, Recording, matched_rows, recording_of, shift_of, shifted
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, UNTRACKED_ID, AgentName, frame_timestamp, short_name
 from deepaccident_devkit.text import columns_text, number_text
@@ -213,8 +219,7 @@ class TwinDiff(FrozenArrays):
     @property
     def speed_differences(self) -> FloatArray:
         """(N, F) by how much an actor is faster in the twin, m/s."""
-        differences: FloatArray = self.speeds[1] - self.speeds[0]
-        return differences
+        return np.asarray(self.speeds[1] - self.speeds[0])
 
     @property
     def in_both(self) -> BoolArray:

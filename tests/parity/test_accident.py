@@ -26,8 +26,7 @@ from deepaccident_devkit.evaluation.metrics.accident.released import (
     accident_counts,
     paths_of_heads,
 )
-from deepaccident_devkit.evaluation.metrics.frames import first_frames
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, first_frames
 from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabelConfig, MotionLabels, predict_instances
 from deepaccident_devkit.motion.orientations import cells_in, to_orientation
 

@@ -7,11 +7,12 @@ from dataclasses import fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.text import choice, possible_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+Kind = TypeVar("Kind")
 Rules = TypeVar("Rules", bound="DataclassInstance")
 _WORDS: Final[Mapping[type | None, str]] = {bool: "true or false", float: "a number", str: "a word", tuple: "a list"}
 _LIKE: Final[Mapping[type, tuple[type, ...]]] = {bool: (bool,), float: (float, int), str: (str,), tuple: (tuple,)}
@@ -66,6 +67,11 @@ def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any
     if not (takes_none if value is None else fits):
         raise ChoiceError(f"switch {name}: expected {_WORDS[kind]}, such as {before!r}, found {value!r}")
     return value
+
+
+def protocol_of(given: object, kind: type[Kind], named: Mapping[str, Kind]) -> Kind:
+    """A protocol by its name, or as it is given if it is of a kind; raises ChoiceError."""
+    return given if isinstance(given, kind) else named[choice("protocol", given, named)]
 
 
 def as_tuples(value: Any) -> Any:

@@ -105,8 +105,7 @@ def match_trajectories(prediction: Paths, truth: Paths, *, gate: float = GATE) -
 def distances(first: FloatArray, second: FloatArray) -> FloatArray:
     """Between points (…, 2); without np.hypot, whose last bit is not everywhere the same."""
     apart = first - second
-    result: FloatArray = np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1])
-    return result
+    return np.asarray(np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]))
 
 
 def _continued(path: FloatArray, length: int, *, accelerating: bool) -> FloatArray:

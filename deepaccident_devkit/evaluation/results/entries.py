@@ -20,8 +20,7 @@ from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, checked_prediction
-from deepaccident_devkit.evaluation.results.faults import ContentError, at, decoded, parsed_json
-from deepaccident_devkit.evaluation.results.header import check_token
+from deepaccident_devkit.evaluation.results.header import ContentError, at, check_token, decoded, parsed_json
 from deepaccident_devkit.evaluation.results.records import AccidentEntry, BoxEntry
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.reading import shortened

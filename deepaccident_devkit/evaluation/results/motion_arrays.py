@@ -18,8 +18,7 @@ from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.evaluation.metrics.trajectories import instance_paths
-from deepaccident_devkit.evaluation.results.faults import ContentError, at
-from deepaccident_devkit.evaluation.results.header import MotionForm
+from deepaccident_devkit.evaluation.results.header import ContentError, MotionForm, at
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LinkedInstances, predict_instances, trajectories
 

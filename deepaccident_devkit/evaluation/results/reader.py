@@ -1,4 +1,4 @@
-"""`Results`: a model's predictions of many samples, read from a results file."""
+"""`Results`: a model's predictions of many samples, read strictly from a results file."""
 
 from __future__ import annotations
 
@@ -6,28 +6,119 @@ import copy
 import gc
 import hashlib
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
+from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import msgspec
+import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import NotAvailableError, ResultsError, TokenError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results.documents import read_document
-from deepaccident_devkit.evaluation.results.entries import ENTRIES, Entries
-from deepaccident_devkit.evaluation.results.faults import at, told_of
-from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, MotionForm
+from deepaccident_devkit.evaluation.results.entries import ENTRIES, Entries, entry_place, read_entries
+from deepaccident_devkit.evaluation.results.header import (
+    RESULTS_FILE,
+    ContentError,
+    MotionForm,
+    at,
+    decoded,
+    json_meta,
+    parsed_json,
+    shown,
+    told_of,
+)
 from deepaccident_devkit.evaluation.results.motion_arrays import paths_of, stored_output, stored_paths
-from deepaccident_devkit.evaluation.results.records import MotionFile, ResultsTask
-from deepaccident_devkit.evaluation.results.shards import OpenShards, ShardCheck, check_shard, read_manifest
+from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, MotionFile, ResultsFile, ResultsTask
+from deepaccident_devkit.evaluation.results.shards import OpenShards, check_shard, read_manifest
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import NO_NAME, fault_text, irregular_text, read_bytes
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
+
+
+class _Texts(msgspec.Struct):
+    """The entries of each sample, not yet read."""
+
+    results: dict[str, msgspec.Raw]
+
+
+def read_document(content: bytes, path: Path) -> tuple[ResultsFile, dict[str, Any]]:
+    """The records of a results file, and its meta.
+
+    Args:
+        content: the file's bytes.
+        path: its path, for errors.
+
+    Raises:
+        ContentError: it is no JSON, or is not as its format says; names the token and the field.
+        ResultsError: it is of another version.
+    """
+    try:
+        document: ResultsFile = decoded(content, ResultsFile)  # type: ignore[arg-type]  # a union is a kind too
+    except ContentError:
+        _tell(content, path)
+        raise
+    return document, json_meta(_strict_meta(content, document))
+
+
+def _strict_meta(content: bytes, document: ResultsFile) -> object:
+    """The meta of a document, where no name stands twice, and all that was not read is JSON as `parsed_json` has it.
+
+    The records have as many names as the text has colons outside texts. Where it has more, the strict reader says why;
+    it takes four times as long.
+    """
+    if not isinstance(document, MotionFile):
+        record = ENTRIES[document.task].record
+        entries = list(chain.from_iterable(document.results.values()))
+        optional = record.__struct_fields__[-len(record.__struct_defaults__) :]
+        kinds = Counter(chain.from_iterable(map(type, map(attrgetter(name), entries)) for name in optional))
+        ignored = [getattr(each, name) for each in entries for name in optional] if kinds[msgspec.Raw] else []
+        unread = b"[%s]" % b",".join([document.meta, *(each for each in ignored if isinstance(each, msgspec.Raw))])
+        # the file's own names, the task among them, those of samples, and those of entries
+        names = (
+            len(document.__struct_fields__) + 1 + len(document.results) + len(entries) * len(record.__struct_fields__)
+        )
+        colons = np.count_nonzero(np.frombuffer(content, np.uint8) == ord(":"))
+        with suppress(ContentError):
+            meta, *_ = parsed_json(unread)
+            if names - kinds[msgspec.UnsetType] + unread.count(b":") == colons:
+                return meta
+    return parsed_json(content)["meta"]
+
+
+def _tell(content: bytes, path: Path) -> None:
+    """Say what is wrong with a results file, by its token or with its remedy, where that is known; raises."""
+    told = parsed_json(content)
+    if not isinstance(told, dict):
+        raise ContentError(f"expected a JSON object, found {shown(told)}")
+    if "format" not in told and "results" in told:
+        raise ContentError(
+            f'has no "format" (a nuScenes results file?); put "format": "{FORMAT}", "version": {FORMAT_VERSION} and '
+            '"task": "detection" before its "meta" and "results"'
+        )
+    version = told.get("version")
+    if told.get("format") == FORMAT and type(version) is int and version != FORMAT_VERSION:
+        age, remedy = ("a newer", "update the devkit") if version > FORMAT_VERSION else ("an older", "write it again")
+        raise ResultsError(
+            f"{path}: version: {age} results format ({shown(version)}, this devkit's is {FORMAT_VERSION}); {remedy}"
+        )
+    kind = ENTRIES.get(str(told.get("task")))
+    if kind is not None and isinstance(told.get("results"), dict):
+        for token, entries in decoded(content, _Texts).results.items():
+            with at(entry_place(token)):
+                read_entries(bytes(entries), kind.record)
+
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
 Read = TypeVar("Read")
@@ -97,8 +188,8 @@ class MotionContents:
         Raises:
             ResultsError: names shard, token and array.
         """
-        tasks = [ShardCheck(self._root, shard, self.form) for shard in self._manifest.shards]
-        run_batch(check_shard, tasks, label="shards", places=Places(reads=(self._root,)), **how)
+        check = partial(check_shard, self._root, self.form)
+        run_batch(check, self._manifest.shards, label="shards", places=Places(reads=(self._root,)), **how)
 
 
 Contents = EntryContents | MotionContents
@@ -241,17 +332,12 @@ class Results:
 
     def check(
         self,
-        *,
-        workers: int | None = 1,
-        executor: Executor | None = None,
-        progress: bool = False,
+        **how: Unpack[Engine],
     ) -> None:
         """Read and check everything: do so before long work and before publishing.
 
         Args:
-            workers: processes for the shards of motion; None takes what the work is worth.
-            executor: any executor of `concurrent.futures` to run on, in place of own workers.
-            progress: whether to show a bar.
+            **how: `workers` (1 if not given), `executor` and `progress`, as `parallel.Engine` says.
 
         Raises:
             ResultsError: names the shard, the token and the array of the first fault, or the file was changed.
@@ -261,7 +347,8 @@ class Results:
             now = content_fingerprint(read_bytes(self._file, "results"))
         if now != self.fingerprint:
             raise ResultsError(f"{self._file}: was changed after it was opened; open it again")
-        self._contents.check(workers=workers, executor=executor, progress=progress)
+        how = {"workers": 1, **how}
+        self._contents.check(**how)
 
     @property
     def _file(self) -> Path:

@@ -20,8 +20,14 @@ from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
-from deepaccident_devkit.evaluation.results.faults import ContentError, at, told_of
-from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, MotionForm, check_token
+from deepaccident_devkit.evaluation.results.header import (
+    RESULTS_FILE,
+    ContentError,
+    MotionForm,
+    at,
+    check_token,
+    told_of,
+)
 from deepaccident_devkit.evaluation.results.motion_arrays import (
     PATHS,
     check_sample,
@@ -128,32 +134,17 @@ class OpenShards:
         return archive
 
 
-@dataclass(frozen=True, slots=True)
-class ShardCheck:
-    """A shard to check.
-
-    Attributes:
-        root: the folder of the results.
-        shard: which.
-        form: how predictions are stored.
-    """
-
-    root: Path
-    shard: Shard
-    form: MotionForm
-
-
-def check_shard(task: ShardCheck) -> None:
-    """Read all of a shard; raises ResultsError that names shard, token and array."""
-    shard, path = task.shard, task.root / task.shard.file
-    with told_of(task.root / RESULTS_FILE), at(shard.file):
+def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
+    """Read all of a shard of the results in a folder; raises ResultsError that names shard, token and array."""
+    path = root / shard.file
+    with told_of(root / RESULTS_FILE), at(shard.file):
         if path.stat().st_size != shard.bytes or file_checksum(path) != shard.checksum:
             raise ContentError("its bytes are not those that the checksum is of; copy it again from where it was made")
-        with opened(task.root, shard) as archive:
-            _check_members(archive, shard, task.form)
+        with opened(root, shard) as archive:
+            _check_members(archive, shard, form)
             for token in shard.tokens:
                 with at(token):
-                    check_sample(archive, token, task.form)
+                    check_sample(archive, token, form)
 
 
 def opened(root: Path, shard: Shard) -> zipfile.ZipFile:

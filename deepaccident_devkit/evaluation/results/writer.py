@@ -7,29 +7,18 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, get_args
+from typing import Any, get_args
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results.entries import EntryWriter
-from deepaccident_devkit.evaluation.results.faults import ContentError
-from deepaccident_devkit.evaluation.results.header import MotionForm, check_token, json_meta
+from deepaccident_devkit.evaluation.results.header import ContentError, MotionForm, check_token, json_meta
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, ResultsTask, Stored
 from deepaccident_devkit.evaluation.results.shards import ShardWriter
 from deepaccident_devkit.files import path_of, replacing, replacing_folder
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.text import choice
-
-
-class _Body(Protocol):
-    """The writer of a task's samples."""
-
-    def add(self, token: str, prediction: object) -> None: ...
-
-    def finish(self) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class ResultsWriter:
@@ -85,7 +74,7 @@ class ResultsWriter:
         self._check_free()
         self._tokens: set[str] = set()
         self._stack = ExitStack()
-        self._body: _Body | None = None
+        self._body: EntryWriter | ShardWriter | None = None
 
     def __repr__(self) -> str:
         """Its task and path, and how many samples it has written."""

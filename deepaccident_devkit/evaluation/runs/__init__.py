@@ -5,11 +5,7 @@ says which differences of two are real.
 """
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
-from deepaccident_devkit.evaluation.runs.checkpoints import evaluation_store
-from deepaccident_devkit.evaluation.runs.compare import compare_bundles
-from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
-from deepaccident_devkit.evaluation.runs.differences import Difference
-from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results
+from deepaccident_devkit.evaluation.runs.compare import ComparedNumber, Comparison, compare_bundles
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
     BREAKDOWNS,
     EvaluationRun,
@@ -17,12 +13,15 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     ReleaseInfo,
     ResultsInfo,
     breakdowns_of,
+    default_selection,
+    evaluate_results,
 )
+from deepaccident_devkit.evaluation.runs.many_samples import evaluation_store
 from deepaccident_devkit.evaluation.runs.prevention import prevented_accidents, with_prevented
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import Coverage, SampleSelection, coverage
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
-from deepaccident_devkit.evaluation.runs.verification import Verification, verify_bundle
+from deepaccident_devkit.evaluation.runs.verification import Difference, Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes
 
 __all__ = [

@@ -17,8 +17,8 @@ from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results.header import check_token
-from deepaccident_devkit.evaluation.runs.checkpoints import remove_checkpoints
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
+from deepaccident_devkit.evaluation.runs.many_samples import remove_checkpoints
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup

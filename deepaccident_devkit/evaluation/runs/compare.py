@@ -8,25 +8,165 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import FloatArray, ShortRepr, known
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
+from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.intervals import Clusters, Resampling
-from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
+from deepaccident_devkit.evaluation.metrics.numbers import Headline, headlines, numbers_of
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
-from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison, Family
-from deepaccident_devkit.evaluation.runs.differences import differing
 from deepaccident_devkit.evaluation.runs.paired import PairedTest, holm, paired_test, undecided
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
+from deepaccident_devkit.evaluation.runs.verification import differing
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.reading import shortened
+from deepaccident_devkit.reports import write_csv
+from deepaccident_devkit.text import columns_text
+
+Family = Literal["main", "headlines", "other"]
+"""What a number is tested with: by itself, with all other headlines, or not at all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedNumber(ShortRepr):
+    """A number of both results.
+
+    Attributes:
+        number: its path in the result: `ranges/30x30/iou`.
+        headline: its short name, if it is one of the task's headlines; else None.
+        unit: of a headline; else None.
+        a: of the first; None where it has nothing to count.
+        b: of the second; likewise.
+        difference: b − a; None if one of them is.
+        low: where the interval of the true difference begins; None for no interval.
+        high: where it ends.
+        family: `main` for the task's first headline, which is tested by itself; `headlines` for the others, which are
+            tested together; `other` for numbers that are for exploration and are not tested.
+        p: of the paired permutation test of this number for itself; None without difference or resamples.
+        adjusted_p: the same by Holm's rule over the headlines; of others like p.
+        real: whether the adjusted p is at most 1 − confidence; False for numbers that are not tested.
+        better: `a` or `b`, if a difference is real and it is known whether more is better; else None.
+        decision: for people: `b is better`, or why nothing is decided, and how many scenarios would.
+    """
+
+    number: str
+    headline: str | None
+    unit: str | None
+    a: float | None
+    b: float | None
+    difference: float | None
+    low: float | None
+    high: float | None
+    family: Family
+    p: float | None
+    adjusted_p: float | None
+    real: bool
+    better: str | None
+    decision: str
+
+
+_COLUMNS: Final = tuple(ComparedNumber.__dataclass_fields__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison(ShortRepr):
+    """Two evaluations by the same rules.
+
+    Attributes:
+        a: folder of the first.
+        b: folder of the second.
+        task: of both.
+        protocol: of both.
+        samples: compared.
+        scenarios: that they are of.
+        clusters: that these are, where an accident and its twin are one.
+        left_out: samples that only one of them has.
+        partial: marks of those that are partial themselves.
+        resampling: how differences were tested.
+        swaps: how many swaps of the two runs' counts, cluster by cluster, p is of.
+        all_swaps: whether these are all there are (apart from the sign); else they are random.
+        numbers: headlines first.
+    """
+
+    a: Path
+    b: Path
+    task: str
+    protocol: str
+    samples: int
+    scenarios: int
+    clusters: int
+    left_out: int
+    partial: tuple[str, ...]
+    resampling: Resampling
+    swaps: int
+    all_swaps: bool
+    numbers: tuple[ComparedNumber, ...]
+
+    def to_text(self) -> str:
+        """A table of the headlines, how many other numbers differ, and what to make of that."""
+        marks = [f"a, b: only the samples that both have; {self.left_out} left out"] if self.left_out else []
+        head = [
+            f"{self.task}, protocol {self.protocol}: {self.samples} samples of {self.scenarios} scenarios",
+            f"clusters: {self.clusters} (an accident and its twin are one)",
+            f"a: {self.a}",
+            f"b: {self.b}",
+            *self.partial,
+            *marks,
+        ]
+        shown = [each for each in self.numbers if each.headline]
+        percent = f"{self.resampling.confidence:.0%}"
+        rows: list[Sequence[str]] = [("number", "a", "b", "b − a", f"{percent} interval", "p", "decision")]
+        rows += [_text_row(each) for each in shown]
+        return "\n".join([*head, "", columns_text(rows), "", *self.notes()])
+
+    def notes(self) -> list[str]:
+        """Notes for readers of the table."""
+        if not self.resampling.resamples:
+            return ["no intervals and no tests: no resamples were asked for"]
+        level = 1 - self.resampling.confidence
+        main = next((each.headline for each in self.numbers if each.family == "main"), None)
+        others = [each for each in self.numbers if each.family == "other" and each.p is not None]
+        low = sum(each.p is not None and each.p <= level for each in others)
+        drawn = f"all {self.swaps:,}" if self.all_swaps else f"{self.swaps:,} random"
+        by_chance = f"between equally good runs about {level * len(others):.1f} would, by chance"
+        explored = f"for exploration: {low} of {len(others)} other numbers have a p of at most {level:.0%}; {by_chance}"
+        return [
+            f"p: share of {drawn} swaps of clusters between a and b after which they differ at least as much",
+            f"tested at {level:.0%}: {main}; and the other headlines together, whose p is adjusted by Holm's rule",
+            "scenarios that would decide: with a chance of 80 %, if the true difference is the observed one",
+            *([explored] if others else []),
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, as JSON holds it."""
+        made: dict[str, Any] = plain(asdict(self) | {"a": os.fspath(self.a), "b": os.fspath(self.b)})
+        return made | {"notes": self.notes()}
+
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write a line a number; returns the file's path."""
+        return write_csv(path, [_COLUMNS, *([getattr(each, name) for name in _COLUMNS] for each in self.numbers)])
+
+
+def _text_row(each: ComparedNumber) -> tuple[str, ...]:
+    unit = f" ({each.unit})" if each.unit and each.unit != "share" else ""
+    interval = "–" if each.low is None or each.high is None else f"[{each.low:+.3f}, {each.high:+.3f}]"
+    return (
+        f"{each.headline}{unit}",
+        *("–" if value is None else f"{value:.3f}" for value in (each.a, each.b)),
+        "–" if each.difference is None else f"{each.difference:+.3f}",
+        interval,
+        "–" if each.adjusted_p is None else f"{each.adjusted_p:.3f}",
+        each.decision,
+    )
+
 
 _SETUP: Final = ("task", "protocol", "switches", "horizon", "settings")
 _SHOWN: Final = 3
@@ -60,9 +200,9 @@ def compare_bundles(
     _check_truth(*bundles, scenarios)
     setup = bundles[0].setup
     results = [evaluator.compute(tokens) for evaluator in evaluators]
-    known = {each.path: each for result in results for each in headlines(setup.task, result)}
+    shown = {each.path: each for result in results for each in headlines(setup.task, result)}
     first, second = (numbers_of(result) for result in results)
-    names = list(dict.fromkeys([*(name for name in known if name in {**first, **second}), *first, *second]))
+    names = list(dict.fromkeys([*(name for name in shown if name in {**first, **second}), *first, *second]))
     values = np.array([[numbers.get(name, math.nan) for name in names] for numbers in (first, second)])
     clusters = _clusters(evaluators[0], tokens), _clusters(evaluators[1], tokens)
     test = paired_test(evaluators[0], clusters, dict(zip(names, values[1] - values[0], strict=True)), chosen)
@@ -80,22 +220,22 @@ def compare_bundles(
         resampling=chosen,
         swaps=len(test.swaps.swapped),
         all_swaps=test.swaps.complete,
-        numbers=_compared(names, values, test, known, len(scenarios)),
+        numbers=_compared(names, values, test, shown, len(scenarios)),
     )
 
 
 def _compared(
-    names: list[str], values: FloatArray, test: PairedTest, known: Mapping[str, Headline], scenarios: int
+    names: list[str], values: FloatArray, test: PairedTest, shown: Mapping[str, Headline], scenarios: int
 ) -> tuple[ComparedNumber, ...]:
-    main = next(iter(known), None)
-    families: list[Family] = ["main" if name == main else "headlines" if name in known else "other" for name in names]
+    main = next(iter(shown), None)
+    families: list[Family] = ["main" if name == main else "headlines" if name in shown else "other" for name in names]
     tested = np.array([family == "headlines" for family in families]) & np.isfinite(test.p)
     adjusted = test.p.copy()
     adjusted[tested] = holm(test.p[tested])
     together = {"main": 1, "headlines": max(int(tested.sum()), 1)}
     compared = []
     for at, (name, family) in enumerate(zip(names, families, strict=True)):
-        headline = known.get(name)
+        headline = shown.get(name)
         real = family != "other" and bool(adjusted[at] <= 1 - test.resampling.confidence)
         better = _better(test.differences[at], headline) if real else None
         decision = "for exploration" if family == "other" else f"{better} is better" if better else "they differ"
@@ -104,14 +244,14 @@ def _compared(
                 number=name,
                 headline=None if headline is None else headline.name,
                 unit=None if headline is None else headline.unit,
-                a=_finite(values[0, at]),
-                b=_finite(values[1, at]),
-                difference=_finite(test.differences[at]),
-                low=_finite(test.low[at]),
-                high=_finite(test.high[at]),
+                a=known(values[0, at]),
+                b=known(values[1, at]),
+                difference=known(test.differences[at]),
+                low=known(test.low[at]),
+                high=known(test.high[at]),
                 family=family,
-                p=_finite(test.p[at]),
-                adjusted_p=_finite(adjusted[at]),
+                p=known(test.p[at]),
+                adjusted_p=known(adjusted[at]),
                 real=real,
                 better=better,
                 decision=decision if real or family == "other" else undecided(test, at, together[family], scenarios),
@@ -124,10 +264,6 @@ def _better(difference: float, headline: Headline | None) -> str | None:
     if headline is None or headline.higher_is_better is None:
         return None
     return "b" if (difference > 0) == headline.higher_is_better else "a"
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _clusters(evaluator: Evaluator[Any], tokens: list[str]) -> Clusters:

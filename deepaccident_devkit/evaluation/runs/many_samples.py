@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
-from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
-from deepaccident_devkit.files import path_of
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.files import path_of, remove_in
 from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.parallel import Places, Store, run_batch
+from deepaccident_devkit.parallel import Places, Store, run_batch, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
+
 
 Task = TypeVar("Task")
 EvaluatorT = TypeVar("EvaluatorT", bound=Evaluator[Any])
@@ -29,11 +35,9 @@ def evaluate_samples(
     samples: Mapping[str, Task],
     load: Callable[[Task], Sequence[Any]],
     *,
-    workers: int | None = None,
-    executor: Executor | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
-    progress: bool = False,
     places: Places | None = None,
+    **how: Unpack[Engine],
 ) -> EvaluatorT:
     """Update an evaluator with many samples; the result is the same, to the bit, for any number of workers.
 
@@ -44,13 +48,12 @@ def evaluate_samples(
         samples: token → whatever `load` needs, such as a file's name; small, since it goes to the workers.
         load: gives what `evaluator.update` takes after the token: prediction, label and so on. With several workers a
             function of a module that they can import, or `functools.partial` of one (a dataset may be bound to it).
-        workers: processes; None takes what the work is worth, and this one alone if others cannot import `load`.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         checkpoint: a folder in which counts are kept, eight samples at a time: what was counted there with the same
             settings is not evaluated again, and several processes that are given it share the samples. It is for one
             set of predictions and labels; remove it when these change. None for none.
-        progress: whether to show a bar.
         places: what workers on other hosts must see.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says; if others cannot import `load`, this
+            process works alone, unless a number of workers is asked for.
 
     Returns:
         The evaluator itself.
@@ -69,17 +72,12 @@ def evaluate_samples(
         _Batch(evaluator.fresh(), tuple(left[first : first + _BATCH]), load, store)
         for first in range(0, len(left), _BATCH)
     ]
-    if executor is None and workers != 1 and batches:
+    workers = how.get("workers")
+    if how.get("executor") is None and workers != 1 and batches:
         workers = _workers_that_can(batches[0], workers)
-    how: dict[str, Any] = {
-        "workers": workers,
-        "executor": executor,
-        "label": f"samples, {_BATCH} at once",
-        "progress": progress,
-        "places": places,
-    }
+    run = {**how, "workers": workers, "label": f"samples, {_BATCH} at once", "places": places}
     failed: dict[str, EvaluationError] = {}
-    for part, faults in _done(batches, store, how):
+    for part, faults in _done(batches, store, run):
         evaluator.merge(part)
         for token, fault in faults.items():
             fault.__cause__ = None if failed else fault.__cause__  # it holds what was being loaded
@@ -170,3 +168,49 @@ def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:
     raise EvaluationError(
         f"load: {workers} workers cannot import it ({reason}); put it into a module of its own, or choose workers=1"
     )
+
+
+_COUNTS = "counts"
+
+
+def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
+    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
+
+    `command` says which evaluation that is.
+    """
+    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
+
+
+def checkpoint_path(
+    out: str | os.PathLike[str],
+    setup: EvaluationSetup,
+    tokens: Collection[str],
+    fingerprints: Mapping[str, str],
+) -> Path:
+    """The folder beside `out` in which such a run keeps its counts.
+
+    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
+    and another devkit have another folder, and so never go on with these counts.
+
+    Args:
+        out: the folder that the finished evaluation goes to.
+        setup: task and rules.
+        tokens: the samples.
+        fingerprints: of the predictions and of the labels.
+    """
+    name = digest_of(
+        {
+            "devkit": __version__,
+            "setup": setup.as_dict(),
+            "tokens": sorted(tokens),
+            "fingerprints": dict(fingerprints),
+        }
+    )
+    return evaluation_store(out).folder / _COUNTS / name
+
+
+def remove_checkpoints(out: str | os.PathLike[str]) -> None:
+    """Remove all such folders beside `out`, once what they were for is written."""
+    store = evaluation_store(out)
+    remove_in(store.folder, _COUNTS)
+    store.remove()

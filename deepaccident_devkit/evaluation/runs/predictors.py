@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from deepaccident_devkit.errors import EvaluationError, ResultsError
-from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
+from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN, GROUPS
 from deepaccident_devkit.evaluation.runs.bundles import read_bundle
 from deepaccident_devkit.evaluation.runs.selection import scenario_of

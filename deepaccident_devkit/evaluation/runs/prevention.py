@@ -15,13 +15,12 @@ import numpy as np
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
-from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
-from deepaccident_devkit.evaluation.metrics.breakdowns import breakdown
+from deepaccident_devkit.evaluation.metrics.breakdowns import EVERYTHING, breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import LATENCIES
-from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
+from deepaccident_devkit.evaluation.metrics.warning.evaluator import PreventedEvaluator
 from deepaccident_devkit.evaluation.metrics.warning.prevention import (
     NOMINAL,
     SETTINGS,
@@ -38,7 +37,9 @@ from deepaccident_devkit.safety import OUTCOMES, Accident, Skipped, accident_of,
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 
 Json = Mapping[str, Any]
@@ -55,10 +56,7 @@ Frames = Mapping[str, tuple[int, ...]]
 def prevented_accidents(
     dataset: Dataset,
     evaluator: Evaluator[Any],
-    *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> PreventedResult:
     """The accidents that alarms would have prevented if somebody had braked, and what false alarms cost.
 
@@ -67,27 +65,21 @@ def prevented_accidents(
     Args:
         dataset: the release that the samples are of.
         evaluator: a `WarningEvaluator` of the protocol `clean` that has counted them.
-        workers: processes; None takes what the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         EvaluationError: it is another evaluator, or of another protocol.
         TokenError: a sample is of no scenario of the release.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    engine: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
-    return prevention_evaluator(dataset, evaluator, **engine).compute()
+    return prevention_evaluator(dataset, evaluator, **how).compute()
 
 
 def with_prevented(
     run: EvaluationRun,
     dataset: Dataset,
     resampling: Resampling | None = None,
-    *,
-    workers: int | None = 1,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> EvaluationRun:
     """The same run with the accidents that its alarms would have prevented, and intervals of their numbers.
 
@@ -95,28 +87,20 @@ def with_prevented(
         run: an evaluation of warnings, protocol `clean`.
         dataset: the release that it is of.
         resampling: how intervals are made, an accident and its twin together; None for the defaults.
-        workers: processes; None takes what the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers` (1 if not given), `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         EvaluationError: the run is of another task or protocol.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    evaluator = prevention_evaluator(dataset, run.evaluator, workers=workers, executor=executor, progress=progress)
+    how = {"workers": 1, **how}
+    evaluator = prevention_evaluator(dataset, run.evaluator, **how)
     found = breakdown(evaluator, run.attributes, EVERYTHING, resampling)
     groups = tuple(replace(each, result=evaluator.compute()) for each in found.groups)
     return replace(run, prevented=replace(found, groups=groups, without_infrastructure=()))
 
 
-def prevention_evaluator(
-    dataset: Dataset,
-    evaluator: Evaluator[Any],
-    *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
-) -> PreventedEvaluator:
+def prevention_evaluator(dataset: Dataset, evaluator: Evaluator[Any], **how: Unpack[Engine]) -> PreventedEvaluator:
     """An evaluator with the same counts that computes prevented accidents; see `prevented_accidents`."""
     protocol = getattr(evaluator, "protocol", None)
     if not isinstance(protocol, CleanWarnings):
@@ -135,7 +119,7 @@ def prevention_evaluator(
         scenario: {agent: tuple(sorted(those)) for agent, those in agents.items()}
         for scenario, agents in frames.items()
     }
-    outcomes = accident_outcomes(dataset, wanted, workers=workers, executor=executor, progress=progress)
+    outcomes = accident_outcomes(dataset, wanted, **how)
     made = PreventedEvaluator(outcomes, protocol)
     for token in evaluator.tokens:
         made.add(token, counts[token])
@@ -145,19 +129,14 @@ def prevention_evaluator(
 def accident_outcomes(
     dataset: Dataset,
     frames: Mapping[str, Frames],
-    *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> AccidentOutcomes:
     """How accidents end, for each frame at which an agent can raise its first alarm; any workers give the same bits.
 
     Args:
         dataset: the release.
         frames: scenario → agents whose alarms are judged → frame numbers of their samples.
-        workers: processes; None takes what the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         TokenError: no such scenario.
@@ -167,11 +146,9 @@ def accident_outcomes(
         run_unordered(
             partial(_tables_of, dataset),
             sorted(frames.items()),
-            workers=workers,
-            executor=executor,
             label="braking",
-            progress=progress,
             places=Places(reads=dataset.places),
+            **how,
         )
     )
     tables: dict[str, OutcomeTable] = {}

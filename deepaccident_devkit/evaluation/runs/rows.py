@@ -57,18 +57,13 @@ def _which(run: EvaluationRun, token: str) -> Row:
 def _motion_cells(result: MotionResult, counts: Counts, _rules: object) -> Cells:
     yield "frames", result.frames
     for (name, part), cells in zip(result.ranges.items(), counts["cells"], strict=True):
+        instances = part.true_positive, part.false_positive, part.false_negative
         yield f"iou_{name}", part.iou
         yield f"pq_{name}", part.pq
-        yield from zip((f"{each}_{name}" for each in ("tp", "fp", "fn")), _instances(part), strict=True)
+        yield from zip((f"{each}_{name}" for each in ("tp", "fp", "fn")), instances, strict=True)
         yield from zip((f"cells_{each}_{name}" for each in ("tp", "fp", "fn")), cells, strict=True)
-    for name in ("paths", "path_true_positive", "path_false_positive", "path_false_negative"):
-        yield name, getattr(result, name)
-    for name in ("min_ade", "min_fde", "miss_rate"):
-        yield name, getattr(result, name)
-
-
-def _instances(part: Any) -> tuple[int, int, int]:
-    return part.true_positive, part.false_positive, part.false_negative
+    counts_of_paths = ("paths", "path_true_positive", "path_false_positive", "path_false_negative")
+    yield from ((name, getattr(result, name)) for name in (*counts_of_paths, "min_ade", "min_fde", "miss_rate"))
 
 
 def _accident_cells(result: AccidentResult, _counts: Counts, _rules: object) -> Cells:

@@ -24,9 +24,8 @@ from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, Box
 from deepaccident_devkit.evaluation.metrics.alarms.raised import LABEL_STEP, by_sureness, position_difference
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
-from deepaccident_devkit.evaluation.metrics.frames import frames_there, labels_at_present
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.geometry import Boxes
@@ -35,7 +34,9 @@ from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 Group = Literal["place", "time", "size", "class"]
 NOTHING_WRONG: Final = "Nothing looks wrong with the predictions."
@@ -157,8 +158,7 @@ def check_sanity(
     tokens: Collection[str],
     *,
     samples: int | None = None,
-    workers: int | None = 1,
-    executor: Executor | None = None,
+    **how: Unpack[Engine],
 ) -> SanityReport:
     """Whether predictions look as if a classic mistake (`MISTAKES`) was made in all of them; or empty, or constant.
 
@@ -170,8 +170,7 @@ def check_sanity(
         setup: the rules that they are evaluated by.
         tokens: the samples that are evaluated, each with a prediction.
         samples: how many of them are looked at, always the same; None for 20, or 60 of accident lists.
-        workers: processes.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        **how: `workers` (1 if not given), `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         ConfigError: `samples` is less than 1.
@@ -187,12 +186,12 @@ def check_sanity(
     listed = sorted(alarmed or tokens)
     drawn = np.random.default_rng(0).permutation(len(listed))[:count]
     loader = SampleLoader(dataset, results, setup)
+    how = {"workers": 1, **how}
     seen = run_batch(
         partial(_seen, loader),
         [listed[each] for each in drawn],
-        workers=workers,
-        executor=executor,
         places=loader.places,
+        **how,
     )
     candidates = _candidates(seen, results.task)
     suspected = [each for each in candidates if each.suspected]

@@ -1,10 +1,10 @@
-"""`verify_bundle`: an evaluation run again, and what its bundle says in another way."""
+"""`verify_bundle`: an evaluation run again, and how what its bundle says differs (`differing`)."""
 
 from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,15 +25,81 @@ from deepaccident_devkit.evaluation.runs.bundles import (
     checksums_of,
     read_bundle,
 )
-from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
-from deepaccident_devkit.evaluation.runs.evaluate import evaluate_results
-from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
+from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, evaluate_results
 from deepaccident_devkit.evaluation.runs.prevention import with_prevented
 from deepaccident_devkit.evaluation.runs.rows import sample_rows
 from deepaccident_devkit.files import path_of
+from deepaccident_devkit.reading import shortened
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
+
+
+ABSENT: Final = "absent"
+"""Stands for a missing value."""
+_LONGEST: Final = 60
+"""Characters of a value that a line shows."""
+_LONGEST_PLACE: Final = 300
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Difference(ShortRepr):
+    """What a bundle says, and what was found.
+
+    Attributes:
+        where: its file and its place there, such as `metrics_summary.json: metrics/apa`.
+        stored: what the bundle says.
+        found: what was found.
+    """
+
+    where: str
+    stored: Any
+    found: Any
+
+    def text(self) -> str:
+        """In a line."""
+        where = shortened(self.where if self.where.isprintable() else ascii(self.where), _LONGEST_PLACE)
+        return f"{where}: stored {_short(self.stored)}, found {_short(self.found)}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """By name."""
+        return {"where": self.where, "stored": self.stored, "found": self.found}
+
+
+def differing(stored: Any, found: Any, *, without: Collection[str] = ()) -> Iterator[tuple[str, Any, Any]]:
+    """The paths at which two values differ that JSON can hold, and what is there; numbers must be exactly equal.
+
+    Args:
+        stored: one of them.
+        found: the other.
+        without: paths that do not count, with all below them.
+    """
+    yield from _differing(stored, found, "", frozenset(without))
+
+
+def _differing(stored: Any, found: Any, path: str, without: frozenset[str]) -> Iterator[tuple[str, Any, Any]]:
+    if path in without:
+        return
+    parts: Mapping[Any, tuple[Any, Any]] | None = None
+    if isinstance(stored, Mapping) and isinstance(found, Mapping):
+        names = dict.fromkeys([*stored, *found])
+        parts = {name: (stored.get(name, ABSENT), found.get(name, ABSENT)) for name in names}
+    elif isinstance(stored, list) and isinstance(found, list) and len(stored) == len(found):
+        parts = dict(enumerate(zip(stored, found, strict=True)))
+    if parts is None:
+        if type(stored) is not type(found) or stored != found:
+            yield path, stored, found
+        return
+    for name, (one, other) in parts.items():
+        yield from _differing(one, other, f"{path}/{name}" if path else str(name), without)
+
+
+def _short(value: Any) -> str:
+    text = value if value == ABSENT else repr(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+
 
 _SHOWN: Final = 20
 """Differences that the text lists."""
@@ -88,9 +154,7 @@ def verify_bundle(
     *,
     results: Results | str | os.PathLike[str] | None = None,
     split: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> Verification:
     """Evaluate again what a bundle is of, and compare everything with it; numbers must be equal to the bit.
 
@@ -102,9 +166,7 @@ def verify_bundle(
         dataset: the release; where `read_bundle(folder).dataroot` says, or another copy of it.
         results: the predictions; None for the bundle's own copy.
         split: the split file, if the bundle is of one; else None.
-        workers: processes; None takes what the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show bars.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         ResultsError: there is no bundle of this devkit's format, no results to evaluate, or a path must be given.
@@ -113,11 +175,10 @@ def verify_bundle(
     check_repeated(bundle, {"dataroot": dataset.dataroot, "results": results, "split": split})
     given = bundle.results_path if results is None else results
     opened = given if isinstance(given, Results) else read_results(given)
-    engine: dict[str, Any] = {"workers": workers, "executor": executor}
     found = list(_compared(FILES_FILE, bundle.checksums, partial(checksums_of, bundle.folder)))
     notes, run = [], None
     try:
-        run = _again(bundle, dataset, opened, split, engine, progress=progress)
+        run = _again(bundle, dataset, opened, split, how)
     except DeepAccidentError as error:
         found.append(Difference(where="all numbers", stored="evaluated", found=ABSENT))
         notes.append(f"cannot be evaluated again: {error}")
@@ -158,19 +219,18 @@ def _again(
     dataset: Dataset,
     results: Results,
     split: str | os.PathLike[str] | None,
-    engine: Mapping[str, Any],
-    *,
-    progress: bool,
+    how: Engine,
 ) -> EvaluationRun:
     summary, selection = bundle.summary, bundle.selection
     if split is not None:
         selection = replace(selection, split=os.fspath(split))
     partly = summary["partial"] is not None or bool(summary["counts"]["left_out"])
-    run = evaluate_results(dataset, results, bundle.setup, selection, allow_partial=partly, progress=progress, **engine)
+    run = evaluate_results(dataset, results, bundle.setup, selection, allow_partial=partly, **how)
     breakdowns, prevented = summary["breakdowns"], summary.get("prevented")
+    how = {"workers": None, **how, "progress": False}
     if breakdowns:
-        run = run.broken_down(list(breakdowns), _resampling(next(iter(breakdowns.values()))), **engine)
-    return run if prevented is None else with_prevented(run, dataset, _resampling(prevented), **engine)
+        run = run.broken_down(list(breakdowns), _resampling(next(iter(breakdowns.values()))), **how)
+    return run if prevented is None else with_prevented(run, dataset, _resampling(prevented), **how)
 
 
 def _resampling(part: Any) -> Resampling:

@@ -10,7 +10,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from deepaccident_devkit.evaluation.metrics.headlines import value_text
+from deepaccident_devkit.evaluation.metrics.numbers import value_text
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
 from deepaccident_devkit.explore.comparing import (
     ComparedSample,

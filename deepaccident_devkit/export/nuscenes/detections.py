@@ -25,7 +25,7 @@ from deepaccident_devkit.evaluation.results.entries import (
     entry_place,
     read_entries,
 )
-from deepaccident_devkit.evaluation.results.faults import ContentError, at, shown
+from deepaccident_devkit.evaluation.results.header import ContentError, at, shown
 from deepaccident_devkit.evaluation.results.records import FORMAT, BoxEntry
 from deepaccident_devkit.export.keyframes import KEY_STEP
 from deepaccident_devkit.export.nuscenes.names import token

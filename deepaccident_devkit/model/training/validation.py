@@ -9,7 +9,7 @@ from dataclasses import replace
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation import DetectionEvaluator, MotionEvaluator, detection_truth
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.motion.protocol import MOTION_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.motion.evaluator import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import merged_evaluator
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.predicting import PredictConfig, predictions

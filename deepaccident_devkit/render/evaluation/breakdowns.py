@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
-from deepaccident_devkit.evaluation.metrics.headlines import LIMITS, Headline, headlines
+from deepaccident_devkit.evaluation.metrics.numbers import LIMITS, Headline, headlines
 from deepaccident_devkit.render.axes import axes_or_new
 from deepaccident_devkit.render.colors import AGENT_COLORS, ESTIMATE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars

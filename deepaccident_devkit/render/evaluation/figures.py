@@ -13,11 +13,10 @@ import numpy as np
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
-from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING, WITHIN_RECORDINGS
-from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown
+from deepaccident_devkit.evaluation.metrics.breakdowns import EVERYTHING, WITHIN_RECORDINGS, Breakdown
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
-from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
 from deepaccident_devkit.evaluation.metrics.motion.evaluator import MotionEvaluator
+from deepaccident_devkit.evaluation.metrics.numbers import Headline, headlines
 from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.render.axes import detached_figure

@@ -7,8 +7,8 @@ from itertools import cycle
 from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult
+from deepaccident_devkit.evaluation.metrics.motion.evaluator import RANGES
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import panoptic_quality
-from deepaccident_devkit.evaluation.metrics.motion.protocol import RANGES
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SERIES_COLORS

@@ -11,9 +11,8 @@ from deepaccident_devkit.arrays import BoolArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.metrics.accident import compared_accidents
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.frames import frames_there, labels_at_present
-from deepaccident_devkit.evaluation.metrics.headlines import headlines
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.metrics.numbers import headlines
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader

@@ -7,11 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
-from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
+from deepaccident_devkit.evaluation.metrics.breakdowns import EVERYTHING, Breakdown, Group
 from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
-from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
 from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
+from deepaccident_devkit.evaluation.metrics.numbers import Headline, headlines
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.evaluation.runs.prevention import prevention_tables

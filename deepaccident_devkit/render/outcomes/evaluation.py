@@ -10,8 +10,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.evaluation.metrics.accident import ComparedAccidents
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.frames import labels_at_present
-from deepaccident_devkit.evaluation.metrics.predictions import Prediction
+from deepaccident_devkit.evaluation.metrics.predictions import Prediction, labels_at_present
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.render.axes import figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above

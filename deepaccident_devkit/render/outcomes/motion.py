@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, IntArray, ShortRepr
-from deepaccident_devkit.evaluation.metrics.frames import cells_within, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.metrics.motion import MotionProtocol
+from deepaccident_devkit.evaluation.metrics.motion.evaluator import RANGES, motion_protocol
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_matches
-from deepaccident_devkit.evaluation.metrics.motion.protocol import RANGES, motion_protocol
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.metrics.predictions import (
+    MotionOutput,
+    cells_within,
+    frames_there,
+    labels_at_present,
+)
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.colors import BEYOND_COLOR, OUTCOME_COLORS

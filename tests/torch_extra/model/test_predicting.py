@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     read_results,
 )
-from deepaccident_devkit.evaluation.metrics.motion.protocol import MOTION_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.motion.evaluator import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
 from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.detection import TaskMaps, detection_targets

@@ -11,8 +11,7 @@ from interaction_scenes import BIKE, PEDESTRIAN, straight, tracks_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.interactions import CLASS_MASSES, InteractionConfig, gaps_of_pairs, time_to_collision
-from deepaccident_devkit.interactions.compute import Measured, measured_pairs, pair_summaries
-from deepaccident_devkit.interactions.motion import ActorMotion, actor_motion
+from deepaccident_devkit.interactions.compute import ActorMotion, Measured, actor_motion, measured_pairs, pair_summaries
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 DEFAULT = InteractionConfig()

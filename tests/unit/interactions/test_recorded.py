@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from interaction_scenes import straight
 
 from deepaccident_devkit.interactions import gaps_of_pairs
-from deepaccident_devkit.interactions.recorded import pieces_of, recorded_pet
+from deepaccident_devkit.interactions.encroachment import pieces_of, recorded_pet
 
 
 def track(path, size=(4.0, 2.0)) -> np.ndarray:

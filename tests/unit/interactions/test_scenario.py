@@ -10,8 +10,8 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, TokenError
-from deepaccident_devkit.interactions import InteractionConfig, Interactions, interactions_of, scenario, store
-from deepaccident_devkit.interactions.records import interaction_specs
+from deepaccident_devkit.interactions import InteractionConfig, Interactions, interactions_of, scenario
+from deepaccident_devkit.interactions.table import interaction_specs
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
@@ -67,9 +67,9 @@ def test_a_file_that_is_no_good_is_made_again(
     own: DeepAccident, computed: list[str], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     token = own.scenario[0]["token"]
-    path = store.kept_path(own, token)
+    path = scenario.kept_path(own, token)
     if fault == "older":
-        monkeypatch.setattr(store, "VERSION", "0")
+        monkeypatch.setattr(scenario, "VERSION", "0")
     first = own.interactions(token)
     content = path.read_bytes()
     match fault:
@@ -83,7 +83,7 @@ def test_a_file_that_is_no_good_is_made_again(
             shard = next((own.tables_folder.parent / "shards").rglob("*.arrow"))
             shutil.copyfile(shard, path)
         case "older":
-            monkeypatch.setattr(store, "VERSION", "1")
+            monkeypatch.setattr(scenario, "VERSION", "1")
         case "folder":
             path.unlink()
             path.mkdir()
@@ -95,7 +95,7 @@ def test_a_file_that_is_no_good_is_made_again(
 
 
 def test_where_nothing_can_be_written_it_is_computed_each_time(own: DeepAccident, computed: list[str]) -> None:
-    (own.tables_folder / store.FOLDER).write_text("in the way")
+    (own.tables_folder / scenario.FOLDER).write_text("in the way")
     token = own.scenario[0]["token"]
     assert_same(own.interactions(token), own.interactions(token))
     assert len(computed) == 2
@@ -104,7 +104,7 @@ def test_where_nothing_can_be_written_it_is_computed_each_time(own: DeepAccident
 def test_it_goes_with_the_tables_and_with_the_index(own_release: Path, own: DeepAccident) -> None:
     token = own.scenario[0]["token"]
     own.interactions(token)
-    kept = store.kept_path(own, token)
+    kept = scenario.kept_path(own, token)
     meta = next(own_release.glob("*/*/meta/*.txt"))
     meta.write_text(meta.read_text().replace("four-way", "three-way"))
     again = DeepAccident("v1", own_release, verbose=False)
@@ -124,10 +124,10 @@ def test_many_at_once_are_as_one_by_one(own: DeepAccident, computed: list[str]) 
         interactions_of(own, ["x/y"])
     found = list(interactions_of(own))
     assert [each.scenario for each in found] == tokens == computed
-    shutil.rmtree(own.tables_folder / store.FOLDER)
+    shutil.rmtree(own.tables_folder / scenario.FOLDER)
     narrow = list(interactions_of(own, tokens[:2], InteractionConfig(max_ttc=1)))
     assert [each.config.max_ttc for each in narrow] == [1, 1]
-    assert not (own.tables_folder / store.FOLDER).exists()
+    assert not (own.tables_folder / scenario.FOLDER).exists()
 
 
 @pytest.mark.slow
@@ -136,7 +136,7 @@ def test_processes_may_make_the_same_files_at_once(own: DeepAccident) -> None:
     found = list(interactions_of(own, tokens, workers=2))
     for token, each in zip(tokens, found, strict=True):
         assert_same(each, own.interactions(token))
-    kept = [path.name for path in (own.tables_folder / store.FOLDER).rglob("*") if path.is_file()]
+    kept = [path.name for path in (own.tables_folder / scenario.FOLDER).rglob("*") if path.is_file()]
     assert len(kept) == 2
 
 
@@ -187,4 +187,4 @@ def test_a_scenario_without_labels_has_none(tmp_path: Path) -> None:
     assert (found.labelled, len(found), len(found.pairs)) == (False, 0, 0)
     assert repr(found) == f"Interactions({bare['token']}: no labels)"
     assert found.to_arrow().num_rows == found.pairs.to_arrow().num_rows == 0
-    assert not store.kept_path(da, bare["token"]).exists()
+    assert not scenario.kept_path(da, bare["token"]).exists()

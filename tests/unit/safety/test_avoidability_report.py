@@ -23,9 +23,9 @@ from deepaccident_devkit.safety import (
     avoidability_report,
     outcome_shares,
 )
-from deepaccident_devkit.safety.avoidability import GROUPS, group_of
+from deepaccident_devkit.safety.avoidability import group_of
+from deepaccident_devkit.safety.contact import SecondaryContact
 from deepaccident_devkit.safety.outcomes import delta_v_ranges
-from deepaccident_devkit.safety.secondary import SecondaryContact
 
 AVOIDED = OUTCOMES.index("avoided")
 
@@ -200,11 +200,3 @@ def test_of_a_release(own_release: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert [each.accident.scenario for each in one.accidents] == [scenarios[2]["token"]]
     with pytest.raises(TokenError, match="nowhere"):
         avoidability_report(dataset, ["nowhere"])
-
-
-@pytest.mark.slow
-def test_two_workers_give_what_one_gives(da_b: DeepAccident) -> None:
-    one, two = (avoidability_report(da_b, workers=workers) for workers in (1, 2))
-    assert one.to_json() == two.to_json()
-    assert [each.scenario for each in one.skipped] == [each.scenario for each in two.skipped]
-    assert GROUPS[0] in one.to_text()

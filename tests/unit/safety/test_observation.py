@@ -117,12 +117,17 @@ def test_rules_are_checked_and_say_what_they_are() -> None:
         "at least 5 LiDAR points; at 3 frames in a row; remembered for 1 s"
     )
     assert ObservationRule().text == "at least 5 LiDAR points"
-    with pytest.raises(ChoiceError, match="kind: expected one of points, released, annotated, found 'seen'"):
-        ObservationRule(kind="seen")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="least_points: expected a whole number from 1, found 0"):
-        ObservationRule(least_points=0)
-    with pytest.raises(ConfigError, match="sustained: expected a whole number"):
-        ObservationRule(sustained=1.5)  # type: ignore[arg-type]
+    for error, words, refused in (
+        (
+            ChoiceError,
+            "kind: expected one of points, released, annotated, found 'seen'",
+            lambda: ObservationRule(kind="seen"),
+        ),
+        (ConfigError, "least_points: expected a whole number from 1, found 0", lambda: ObservationRule(least_points=0)),
+        (ConfigError, "sustained: expected a whole number", lambda: ObservationRule(sustained=1.5)),
+    ):
+        with pytest.raises(error, match=words):
+            refused()
     for memory in (-0.1, 0.25, float("inf"), float("nan")):
         with pytest.raises(ConfigError, match=r"memory: expected seconds from 0 in steps of 0\.1"):
             ObservationRule(memory=memory)

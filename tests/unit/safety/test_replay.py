@@ -46,7 +46,7 @@ def test_who_hardly_moved_at_the_end_stands_afterwards(step: float, moves: bool)
 def test_braking_from_constant_speed() -> None:
     motion = motion_of(straight((0, 0), 0.3, 20, 51))
     plans = braking_plans(motion, [1.0], [5.0])
-    assert (plans.arcs[0], plans.speeds[0], plans.stop_times[0], plans.stop_arcs[0]) == pytest.approx((20, 20, 5, 60))
+    assert (plans.arcs[0], plans.speeds[0], plans.starts[0]) == pytest.approx((20, 20, 1))
     states = at(motion, np.array([0.9, 1.0, 2.0, 4.9, 6.0, 8.0]), start=1.0)
     np.testing.assert_allclose(states.arcs, [18, 20, 37.5, 60 - 5 * 0.1**2 / 2, 60, 60])
     np.testing.assert_allclose(states.speeds, [20, 20, 15, 0.5, 0, 0], atol=1e-9)

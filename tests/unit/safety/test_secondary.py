@@ -6,7 +6,7 @@ from replayed_accidents import CAR, rear_end, straight
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.geometry import Boxes, quaternions
-from deepaccident_devkit.safety.secondary import secondary_contacts
+from deepaccident_devkit.safety.contact import secondary_contacts
 from deepaccident_devkit.v2x.tracks import ScenarioTracks
 
 CASE = rear_end(20, 10)

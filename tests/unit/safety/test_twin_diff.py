@@ -199,11 +199,6 @@ def test_two_normal_scenarios_are_nothing_to_compare(own_release: Path) -> None:
         twin_diff(da, accident["token"])
 
 
-@pytest.mark.slow
-def test_two_workers_compare_the_same(da_b: DeepAccident) -> None:
-    assert twin_report(da_b, workers=2).to_json() == twin_report(da_b, workers=1).to_json()
-
-
 def test_the_command(da_motion: DeepAccident, tmp_path: Path) -> None:
     root, normal = str(da_motion.dataroot), da_motion.find(collision=False)[0]["token"]
     all_of_them = CliRunner().invoke(deepaccident, ["safety", "twins", root], catch_exceptions=False)

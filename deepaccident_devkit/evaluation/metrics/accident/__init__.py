@@ -1,8 +1,13 @@
 """How well accidents are foreseen, by three protocols."""
 
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.metrics.accident.compared import ComparedAccidents, compared_accidents
-from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS, AccidentEvaluator, AccidentProtocol
+from deepaccident_devkit.evaluation.metrics.accident.evaluator import (
+    PROTOCOLS,
+    AccidentEvaluator,
+    AccidentProtocol,
+    ComparedAccidents,
+    compared_accidents,
+)
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
 from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, AccidentResult, AccidentsWithin

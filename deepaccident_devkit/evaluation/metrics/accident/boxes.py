@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -94,10 +94,6 @@ class BoxAccidents:
 
     reading: AccidentReading = field(default_factory=AccidentReading)
     scoring: ClassVar[Scoring] = Scoring()
-
-    def settings(self) -> dict[str, Any]:
-        """All choices, as JSON can hold them."""
-        return asdict(self)
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.

@@ -1,22 +1,41 @@
-"""`AccidentEvaluator`: how well accidents are foreseen, and the interface of a protocol for it."""
+"""`AccidentEvaluator`: how well accidents are foreseen, the interface of a protocol for it, and what it compares."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final, Protocol, runtime_checkable
 
+import numpy as np
+
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
+from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents, surest_within
+from deepaccident_devkit.evaluation.metrics.accident.released import (
+    DrawnPaths,
+    ReleasedAccidents,
+    collision,
+    padded_paths,
+)
 from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentResult
+from deepaccident_devkit.evaluation.metrics.alarms.raised import named_alarms
+from deepaccident_devkit.evaluation.metrics.alarms.reading import InstanceAccident, accident_of
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.choices import protocol_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.metrics.predictions import Prediction, checked_prediction
+from deepaccident_devkit.evaluation.metrics.predictions import (
+    Accident,
+    MotionOutput,
+    Prediction,
+    checked_prediction,
+    frames_there,
+    labels_at_present,
+)
+from deepaccident_devkit.evaluation.metrics.trajectories import longest
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Truth = MotionLabels | BoxTruth | AccidentContext
 """What an evaluator takes as label: motion labels, or for a protocol without rasters its own truth."""
@@ -25,9 +44,6 @@ Truth = MotionLabels | BoxTruth | AccidentContext
 @runtime_checkable
 class AccidentProtocol(Protocol):
     """A frozen dataclass with one field for each choice; `PROTOCOLS` has those with names."""
-
-    def settings(self) -> dict[str, Any]:
-        """All choices that affect the numbers, as JSON can hold them."""
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds; raises EvaluationError if it cannot be evaluated by this protocol."""
@@ -64,15 +80,12 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
             ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
-        self.protocol = _protocol(protocol)
+        self.protocol = protocol_of(protocol, AccidentProtocol, PROTOCOLS)  # type: ignore[type-abstract]  # isinstance
 
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol and its choices."""
-        return {
-            "protocol": type(self.protocol).__name__,
-            "choices": self.protocol.settings(),
-        }
+        return {"protocol": type(self.protocol).__name__, "choices": asdict(self.protocol)}  # type: ignore[call-overload]
 
     def update(
         self,
@@ -132,7 +145,97 @@ def _known(label: Truth | None, context: AccidentContext | None) -> tuple[Motion
     )
 
 
-def _protocol(protocol: object) -> AccidentProtocol:
-    if isinstance(protocol, AccidentProtocol):
-        return protocol
-    return PROTOCOLS[choice("protocol", protocol, PROTOCOLS)]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedAccidents(ShortRepr):
+    """The accidents of one sample, in the present ego frame; those read off maps have no `ids`.
+
+    Attributes:
+        true: the accident to come, by the protocol; None without one.
+        predicted: the accidents foreseen, one for each alarm, or for each prediction with one.
+        unplaced: seconds to an impact within the horizon that no place is known of (`BoxTruth.unplaced`); None without.
+    """
+
+    true: Accident | None
+    predicted: tuple[Accident, ...]
+    unplaced: float | None = None
+
+
+def compared_accidents(
+    prediction: Prediction, label: MotionLabels | None, context: AccidentContext, protocol: AccidentProtocol
+) -> ComparedAccidents:
+    """Which accidents a protocol sees in a prediction and in the truth.
+
+    Args:
+        prediction: what a model says; of one that `protocol.counts` takes.
+        label: the sample's motion labels, where the protocol compares with those.
+        context: other facts on the sample.
+        protocol: one of the devkit's; of another one, explicit accidents are as given, and the truth is the context's.
+
+    Raises:
+        EvaluationError: the prediction is neither motion nor accidents, or the protocol lacks its truth.
+    """
+    given = checked_prediction(prediction)
+    if isinstance(protocol, ReleasedAccidents):
+        return _released(given, label, protocol)
+    if isinstance(protocol, PaperAccidents):
+        return _paper(given, label, protocol)
+    true = None if context.truth is None else context.truth.accident
+    if not isinstance(protocol, BoxAccidents):
+        return ComparedAccidents(true=true, predicted=() if isinstance(given, MotionOutput) else tuple(given))
+    if context.truth is None:
+        raise EvaluationError(
+            "context: the protocol 'boxes' needs its truth; make it with accident_context(…, horizon)"
+        )
+    alarms = named_alarms(given, label, context.truth, protocol.reading)
+    unplaced = context.truth.unplaced if context.truth.is_unplaced else None
+    return ComparedAccidents(true=true, predicted=tuple(alarm for alarm, _ in alarms), unplaced=unplaced)
+
+
+def _released(
+    given: MotionOutput | list[Accident], label: MotionLabels | None, rules: ReleasedAccidents
+) -> ComparedAccidents:
+    if label is None or not isinstance(given, MotionOutput):
+        raise EvaluationError("the released protocol compares motion: give a MotionOutput and the motion labels")
+    frames = frames_there(label)
+    truth, _ = rules.truth_paths(labels_at_present(label), frames)
+    points = longest(truth.paths) or len(truth.drawn)
+    last = points - 1
+    moments = [last] if rules.last_frame_only else [*range(last + 1)]
+    step = label.config.step * FRAME_PERIOD
+
+    def found(paths: DrawnPaths, gap: float) -> Accident | None:
+        padded = padded_paths(paths, points)
+        one = collision(padded, moments, gap, rules.level)
+        if one is None:
+            return None
+        positions = np.array([padded.paths[name][one.frame] for name in one.pair])
+        return Accident(positions=positions, time=one.frame * step)
+
+    predictions = rules.prediction_paths(given, frames)
+    if rules.empty_first_ends and not predictions[0].paths:
+        predictions = []
+    return ComparedAccidents(
+        true=found(truth, rules.truth_gap), predicted=_there(found(each, rules.prediction_gap) for each in predictions)
+    )
+
+
+def _paper(
+    given: MotionOutput | list[Accident], label: MotionLabels | None, rules: PaperAccidents
+) -> ComparedAccidents:
+    if label is None:
+        raise EvaluationError("label: the accident protocol 'paper' needs the sample's motion labels")
+    frames, labels, step = frames_there(label), label.config.rules, label.config.step * FRAME_PERIOD
+    shown = rules.truth_map(given, labels_at_present(label), frames)
+    true = _accident(accident_of(shown, label.config.grid, labels, rules.reading), step)
+    if isinstance(given, MotionOutput):
+        read = rules.read_predictions(given, frames, labels)
+        return ComparedAccidents(true=true, predicted=_there(_accident(each, step) for each in read))
+    return ComparedAccidents(true=true, predicted=tuple(surest_within(given, (frames - 0.5) * step)))
+
+
+def _accident(found: InstanceAccident, step: float) -> Accident | None:
+    return None if found.contact is None else Accident(positions=found.positions, time=found.contact.frame * step)
+
+
+def _there(accidents: Iterable[Accident | None]) -> tuple[Accident, ...]:
+    return tuple(each for each in accidents if each is not None)

@@ -6,7 +6,7 @@ Each choice is a field of `PaperAccidents`, `AccidentReading` or `Scoring`; docs
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
@@ -33,14 +33,17 @@ from deepaccident_devkit.evaluation.metrics.alarms.reading import (
 )
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.frames import (
+from deepaccident_devkit.evaluation.metrics.predictions import (
+    Accident,
+    MotionOutput,
+    Prediction,
     check_output,
     check_protocol,
+    checked_prediction,
     first_frames,
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, Prediction, checked_prediction
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import settle_choices
@@ -90,10 +93,6 @@ class PaperAccidents:
         settle_choices(self, _CHOICES)
         if not 0 < self.match_distance < np.inf:
             raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
-
-    def settings(self) -> dict[str, Any]:
-        """All choices, as JSON can hold them."""
-        return asdict(self)
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -31,14 +31,15 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
 from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.frames import (
+from deepaccident_devkit.evaluation.metrics.predictions import (
+    MotionOutput,
+    Prediction,
     check_output,
     check_protocol,
     first_frames,
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, Prediction
 from deepaccident_devkit.evaluation.metrics.trajectories import (
     Paths,
     instance_paths,
@@ -108,10 +109,6 @@ class ReleasedAccidents:
                 )
         if self.errors_at is not None and self.errors_at not in DISTANCES:
             raise ConfigError(f"errors_at: expected one of {', '.join(map(str, DISTANCES))}, found {self.errors_at!r}")
-
-    def settings(self) -> dict[str, Any]:
-        """All that decides the numbers, as JSON can hold it."""
-        return asdict(self)
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.

@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE, even
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
-from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
+from deepaccident_devkit.evaluation.metrics.numbers import TaskResult
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 
 DISTANCES: Final = (5.0, 10.0, 15.0)

@@ -92,8 +92,7 @@ def _padded(corners: IntArray, group: IntArray) -> FloatArray:
     count = np.bincount(group)
     first = np.cumsum(count) - count
     which = np.minimum(np.arange(count.max()), count[:, None] - 1)
-    padded: FloatArray = corners[first[:, None] + which].astype(np.float64)
-    return padded
+    return np.asarray(corners[first[:, None] + which].astype(np.float64))
 
 
 def _distances(first: FloatArray, second: FloatArray) -> FloatArray:

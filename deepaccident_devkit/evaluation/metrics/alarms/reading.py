@@ -86,8 +86,7 @@ class InstanceTracks(FrozenArrays):
 
     def at(self, frame: int, identities: tuple[int, int]) -> FloatArray:
         """(2, 2) where two instances are at a moment; NaN where they are not."""
-        positions: FloatArray = self.center[frame, self.identity.searchsorted(identities)]
-        return positions
+        return np.asarray(self.center[frame, self.identity.searchsorted(identities)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from deepaccident_devkit.evaluation.metrics.detection.boxes import DetectedBoxes, detection_truth
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
-from deepaccident_devkit.evaluation.metrics.detection.matches import DetectionMatches, detection_matches
+from deepaccident_devkit.evaluation.metrics.detection.frame_counts import DetectionMatches, detection_matches
 from deepaccident_devkit.evaluation.metrics.detection.protocols import (
     DETECTION_PROTOCOLS,
     DetectionProtocol,
@@ -12,8 +12,6 @@ from deepaccident_devkit.evaluation.metrics.detection.result import (
     DetectionResult,
     NuScenesSummary,
     nuscenes_summary,
-    released_dict,
-    released_text,
 )
 
 __all__ = [
@@ -28,6 +26,4 @@ __all__ = [
     "detection_protocol",
     "detection_truth",
     "nuscenes_summary",
-    "released_dict",
-    "released_text",
 ]

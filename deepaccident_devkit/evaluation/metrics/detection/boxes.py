@@ -129,8 +129,7 @@ class BoxColumns:
     @property
     def bottom(self) -> AnyArray:
         """(N,) height of the lower faces, metres, of the boxes' own precision."""
-        result: AnyArray = self.center[:, 2] - self.size[:, 2] / 2
-        return result
+        return np.asarray(self.center[:, 2] - self.size[:, 2] / 2)
 
     @property
     def footprint(self) -> FloatArray:

@@ -45,9 +45,8 @@ class Cell:
     errors: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Points:
-    """The curves of a cell in each of D draws.
+class Points(NamedTuple):
+    """The curves of a cell in each of D draws; of one draw without the first axis.
 
     Attributes:
         precision: (D, P).
@@ -58,16 +57,7 @@ class Points:
 
     precision: FloatArray
     recall: FloatArray
-    average: FloatArray
-    errors: FloatArray
-
-
-class _Curve(NamedTuple):
-    """One of them."""
-
-    precision: FloatArray
-    recall: FloatArray
-    average: float
+    average: FloatArray | float
     errors: FloatArray
 
 
@@ -82,8 +72,7 @@ def curves(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Points:
     if protocol.curve == "released":
         return _released(cell, protocol, times)
     made = [_CURVES[protocol.curve](each, protocol) for each in _drawn(cell, protocol, times)]
-    columns = (np.array(column, dtype=np.float64) for column in zip(*made, strict=True))
-    return Points(**dict(zip(_Curve._fields, columns, strict=True)))
+    return Points(*(np.array(column, dtype=np.float64) for column in zip(*made, strict=True)))
 
 
 def recall_matches(truths: IntArray, points: int) -> IntArray:
@@ -200,12 +189,12 @@ def _drawn(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Iterator
         )
 
 
-def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> _Curve:
+def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> Points:
     truths = int(cell.truths.sum())
     levels = np.linspace(0, 1, protocol.points)
     found, counted = np.cumsum(cell.tp), np.cumsum(cell.detected - cell.spent)
     if not found.size or not found[-1] or not truths:
-        return _Curve(precision=np.zeros(len(levels)), recall=levels, average=0.0, errors=np.ones(4))
+        return Points(precision=np.zeros(len(levels)), recall=levels, average=0.0, errors=np.ones(4))
     recall = found / truths
     precision = np.interp(
         levels, recall, np.divide(found, counted, out=np.zeros(len(found)), where=counted > 0), right=0
@@ -214,7 +203,7 @@ def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> _Curve:
     first = round(protocol.min_recall * (protocol.points - 1)) + 1
     above = np.maximum(precision[first:] - protocol.min_precision, 0)
     last = int(np.searchsorted(levels, recall[-1], side="right")) - 1
-    return _Curve(
+    return Points(
         precision=precision,
         recall=levels,
         average=_mean(above) / (1 - protocol.min_precision),
@@ -237,7 +226,7 @@ def _interpolated_errors(cell: Cell, scores: FloatArray, first: int, last: int) 
     return np.where(numbers[-1] > 0, means, nan)
 
 
-def _voc(cell: Cell, protocol: DetectionProtocol) -> _Curve:
+def _voc(cell: Cell, protocol: DetectionProtocol) -> Points:
     truths = int(cell.truths.sum())
     levels = np.linspace(0, 1, protocol.points)
     found, counted = np.cumsum(cell.tp), np.cumsum(cell.detected - cell.spent)
@@ -248,10 +237,10 @@ def _voc(cell: Cell, protocol: DetectionProtocol) -> _Curve:
     needed = np.maximum(np.ceil(levels * truths - 1e-9).astype(np.int64), 1)
     sampled = np.append(at_tp, np.zeros(1))[np.minimum(needed - 1, len(at_tp))]
     average = fsum(at_tp.tolist()) / truths if truths else 0.0
-    return _Curve(precision=sampled, recall=levels, average=average, errors=np.full(4, nan))
+    return Points(precision=sampled, recall=levels, average=average, errors=np.full(4, nan))
 
 
-_CURVES: Final[Mapping[str, Callable[[Cell, DetectionProtocol], _Curve]]] = {"nuscenes": _nuscenes, "voc": _voc}
+_CURVES: Final[Mapping[str, Callable[[Cell, DetectionProtocol], Points]]] = {"nuscenes": _nuscenes, "voc": _voc}
 
 
 def _ratio(part: AnyArray, whole: IntArray, otherwise: float) -> FloatArray:

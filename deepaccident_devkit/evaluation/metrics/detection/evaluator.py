@@ -11,7 +11,7 @@ from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import EvaluationError, GeometryError
 from deepaccident_devkit.evaluation.metrics.detection.boxes import DetectedBoxes, columns_of
 from deepaccident_devkit.evaluation.metrics.detection.curves import Cell, Points, curves
-from deepaccident_devkit.evaluation.metrics.detection.frame_counts import frame_counts
+from deepaccident_devkit.evaluation.metrics.detection.frame_counts import COLUMNS, frame_counts
 from deepaccident_devkit.evaluation.metrics.detection.matching import ERRORS
 from deepaccident_devkit.evaluation.metrics.detection.protocols import DetectionProtocol, detection_protocol
 from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult, mean_of
@@ -19,8 +19,6 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
 
-_EVENTS: Final = ("detections", "tp", "spent", "excused", "matches", "errors")
-"""The columns of `frame_counts.FrameCounts` that name detections by their rows."""
 _MOST_VALUES: Final = 2**20
 """Of one array over rows and draws: how many draws are made together."""
 
@@ -84,7 +82,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
                     "transform them, or choose frame="
                 )
         counts = frame_counts(columns_of(prediction.boxes, prediction.scores), columns_of(truth), self.protocol)
-        self.add(token, {"token": token, **counts.as_dict()})
+        self.add(token, {"token": token, **counts})
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
         """The metrics of some samples' counts, in any order."""
@@ -98,7 +96,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
 
 
 def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) -> DetectionResult:
-    """The metrics of some samples' counts (`FrameCounts.as_dict`, each with its `token`), in any order."""
+    """The metrics of some samples' counts (`frame_counts`, each with its `token`), in any order."""
     ledger = Ledger(list(counts), protocol)
     return next(_results(ledger, protocol, np.ones((1, len(ledger)), dtype=np.int64)))
 
@@ -179,7 +177,7 @@ class Ledger:
         self._scores, self._sample = scores[order], sample[order]
         groups = len(protocol.classes) * len(protocol.ranges)
         self.truths: IntArray = _joined([each["truths"] for each in counts], np.int64).reshape(-1, groups)
-        self._events = {name: self._by_key([each[name] for each in counts]) for name in _EVENTS}
+        self._events = {name: self._by_key([each[name] for each in counts]) for name in COLUMNS}
         group, row, _ = self._events["detections"]
         if len(group) and not 0 <= group[0] <= group[-1] < groups:  # else one number could ask for gigabytes
             raise EvaluationError(
@@ -193,7 +191,7 @@ class Ledger:
         return len(self.order)
 
     def cell(self, group: int, level: int) -> Cell:
-        """A class within a range (`frame_counts.FrameCounts`) at a threshold."""
+        """A class within a range (`frame_counts`) at a threshold."""
         levels, ranges = len(self._protocol.thresholds), len(self._protocol.ranges)
         key = group * levels + level
         detected, tp, spent = (

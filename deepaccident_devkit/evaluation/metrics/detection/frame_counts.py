@@ -1,17 +1,21 @@
-"""What one sample adds to the metrics: small columns of whole numbers, its scores, and the errors of its matches."""
+"""What one sample adds to the metrics: small columns of whole numbers, its scores, and the errors of its matches.
+
+`DetectionMatches` says which detection is which true box, to look at; the metrics do not use it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import isnan
 from typing import Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats, readonly
-from deepaccident_devkit.evaluation.metrics.detection.boxes import BoxColumns
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_floats, readonly
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.metrics.detection.boxes import BoxColumns, DetectedBoxes, columns_of
 from deepaccident_devkit.evaluation.metrics.detection.matching import (
     Reach,
     costs,
@@ -21,50 +25,13 @@ from deepaccident_devkit.evaluation.metrics.detection.matching import (
     nearest_by_score,
     nearest_by_truth,
 )
-from deepaccident_devkit.evaluation.metrics.detection.protocols import DetectionProtocol
+from deepaccident_devkit.evaluation.metrics.detection.protocols import DetectionProtocol, detection_protocol
+from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES
 
+COLUMNS: Final = {"detections": 2, "tp": 2, "spent": 2, "excused": 3, "matches": 2, "errors": 6}
+"""Names of the columns of `frame_counts` that name detections by their rows → how many they are together."""
 _CORNERS: Final = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]) / 2
-
-
-@dataclass(slots=True)
-class FrameCounts:
-    """The columns that one sample adds; `as_dict` has them by these names.
-
-    A *group* is a class within a range (class · ranges + range); a *cell* is a group at a threshold (group · thresholds
-    + threshold). Detections are rows of `scores`.
-
-    Attributes:
-        truths: how many true boxes of each group count.
-        scores: of each detection.
-        detections: (groups, detections) that count.
-        tp: (cells, detections) that find one more true box when they are added by falling score.
-        spent: (cells, detections) with which one more detection goes to a true box that does not count.
-        excused: (cells, detections, changes): true boxes neither found nor missed; see `matching.Steps`.
-        matches: (cells, detections) whose scores decide the curve's points; empty when matched by score (then `tp`).
-        errors: (classes, detections, ATE, ASE, AOE, AVE) of the matches at the protocol's error threshold; None where
-            unknown.
-    """
-
-    truths: list[int]
-    scores: list[float]
-    detections: tuple[list[int], list[int]]
-    tp: tuple[list[int], list[int]] = field(default_factory=lambda: ([], []))
-    spent: tuple[list[int], list[int]] = field(default_factory=lambda: ([], []))
-    excused: tuple[list[int], list[int], list[int]] = field(default_factory=lambda: ([], [], []))
-    matches: tuple[list[int], list[int]] = field(default_factory=lambda: ([], []))
-    errors: list[list[Any]] = field(default_factory=lambda: [[], [], [], [], [], []])
-
-    def as_dict(self) -> dict[str, Any]:
-        """Names → lists, the same after writing and reading JSON."""
-        return {
-            "truths": self.truths,
-            "scores": self.scores,
-            **{
-                name: [list(column) for column in getattr(self, name)]
-                for name in ("detections", "tp", "spent", "excused", "matches", "errors")
-            },
-        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,8 +64,25 @@ class Ring:
         return result
 
 
-def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol) -> FrameCounts:
-    """Match one sample's detections with its true boxes, both in the protocol's frame, and count."""
+def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol) -> dict[str, Any]:
+    """Match one sample's detections with its true boxes, both in the protocol's frame, and count.
+
+    A *group* is a class within a range (class · ranges + range); a *cell* is a group at a threshold (group · thresholds
+    + threshold). Detections are rows of `scores`.
+
+    Returns:
+        Lists by name, the same after writing and reading JSON:
+
+        - `truths`: how many true boxes of each group count;
+        - `scores`: of each detection;
+        - `detections`: (groups, detections) that count;
+        - `tp`: (cells, detections) that find one more true box when they are added by falling score;
+        - `spent`: (cells, detections) with which one more detection goes to a true box that does not count;
+        - `excused`: (cells, detections, changes): true boxes neither found nor missed; see `matching.Steps`;
+        - `matches`: (cells, detections) whose scores decide the curve's points; empty when matched by score (as `tp`);
+        - `errors`: (classes, detections, ATE, ASE, AOE, AVE) of the matches at the protocol's error threshold; None
+          where unknown.
+    """
     if protocol.single_precision:
         detections, truth = detections.rounded(), truth.rounded()
     truth = truth.select(rows_taken(truth, truth_taken(truth, protocol), protocol))
@@ -108,15 +92,17 @@ def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionP
     codes, true_codes = class_codes(detections, protocol), class_codes(truth, protocol)
     cost = costs(detections, truth, protocol)
     ring_count, level_count = len(protocol.ranges), len(protocol.thresholds)
-    result = FrameCounts(
-        truths=[0] * (len(protocol.classes) * ring_count), scores=detections.score.tolist(), detections=([], [])
-    )
+    result: dict[str, Any] = {
+        "truths": [0] * (len(protocol.classes) * ring_count),
+        "scores": detections.score.tolist(),
+        **{name: [[] for _ in range(width)] for name, width in COLUMNS.items()},
+    }
     for position in range(ring_count):
         ring = ring_of(detections, truth, protocol, position, cost)
         group = codes * ring_count + position
         for one in (true_codes[ring.truth_counts] * ring_count + position).tolist():
-            result.truths[one] += 1
-        _extend(result.detections, group[ring.counts].tolist(), np.flatnonzero(ring.counts).tolist())
+            result["truths"][one] += 1
+        _extend(result["detections"], group[ring.counts].tolist(), np.flatnonzero(ring.counts).tolist())
         for level in range(level_count):
             _count_level(result, ring, (position, level), detections, truth, protocol)
     return result
@@ -160,12 +146,11 @@ def ring_of(
 
 def class_codes(boxes: BoxColumns, protocol: DetectionProtocol) -> IntArray:
     """(N,) position in `protocol.classes` of each box's class; −1 for none."""
-    result: IntArray = _class_table(protocol)[boxes.category]
-    return result
+    return np.asarray(_class_table(protocol)[boxes.category])
 
 
 def _count_level(
-    result: FrameCounts,
+    result: Mapping[str, Any],
     ring: Ring,
     place: tuple[int, int],
     detections: BoxColumns,
@@ -187,26 +172,22 @@ def _count_level(
 
     counts, truth_counts = ring.counts.tolist(), ring.truth_counts.tolist()
     if protocol.matching == "by_truth":
-        steps = nearest_by_truth(reach, _by_candidate(reach, counts, classes), truth_counts)
-        _extend(result.tp, cells(steps.tp), rows(steps.tp))
-        _extend(result.spent, cells(steps.spent), rows(steps.spent))
+        steps = nearest_by_truth(reach, {one: counts[one // classes] for one in reach}, truth_counts)
+        _extend(result["tp"], cells(steps.tp), rows(steps.tp))
+        _extend(result["spent"], cells(steps.spent), rows(steps.spent))
         changed = [candidate for candidate, _ in steps.excused]
-        _extend(result.excused, cells(changed), rows(changed), [change for _, change in steps.excused])
+        _extend(result["excused"], cells(changed), rows(changed), [change for _, change in steps.excused])
         taken = highest_score_by_truth(reach)
         matched = {one: by for one, by in taken.items() if truth_counts[one] and counts[by // classes]}
-        _extend(result.matches, cells(matched.values()), rows(matched.values()))
+        _extend(result["matches"], cells(matched.values()), rows(matched.values()))
     else:
         matched = nearest_by_score(reach)
-        _extend(result.tp, cells(matched.values()), rows(matched.values()))
+        _extend(result["tp"], cells(matched.values()), rows(matched.values()))
     if protocol.thresholds[level] == protocol.error_threshold and matched:
         by = rows(matched.values())
         values = match_errors(detections.select(np.array(by)), truth.select(np.array(list(matched))), protocol)
         columns = [[None if isnan(value) else value for value in column] for column in values.T.tolist()]
-        _extend(result.errors, [one % classes for one in matched.values()], by, *columns)
-
-
-def _by_candidate(reach: Reach, counts: Sequence[bool], classes: int) -> dict[int, bool]:
-    return {candidate: counts[candidate // classes] for candidate in reach}
+        _extend(result["errors"], [one % classes for one in matched.values()], by, *columns)
 
 
 def _extend(columns: Sequence[list[Any]], *more: Iterable[Any]) -> None:
@@ -243,16 +224,14 @@ def inside_area(boxes: BoxColumns, protocol: DetectionProtocol) -> BoolArray:
         points = points + _CORNERS[:, :1] * length * along + _CORNERS[:, 1:] * width * aside
     x_low, x_high, y_low, y_high = protocol.area
     x, y = points[..., 0], points[..., 1]
-    result: BoolArray = np.all((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high), axis=1)
-    return result
+    return np.asarray(np.all((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high), axis=1))
 
 
 def _in_range(boxes: BoxColumns, protocol: DetectionProtocol, position: int) -> BoolArray:
     x, y = as_floats(boxes.center[:, 0]), as_floats(boxes.center[:, 1])
     distance = np.sqrt(x * x + (x * x if protocol.range_from_x_alone else y * y))
     low, high = protocol.ranges[position]
-    result: BoolArray = (distance >= low) & (distance < high)
-    return result
+    return np.asarray((distance >= low) & (distance < high))
 
 
 def _standing_if_unknown(truth: BoxColumns) -> BoxColumns:
@@ -274,3 +253,83 @@ def _limits(protocol: DetectionProtocol) -> FloatArray:
     """(classes, thresholds) costs that pairs of each class must be below."""
     limits = [[limit_of(one, protocol) for one in protocol.limits(name)] for name, _ in protocol.classes]
     return readonly(np.array(limits))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DetectionMatches(FrozenArrays):
+    """The matches of one sample at one threshold, with all detections at once; rows of the boxes given.
+
+    Boxes that do not count (beyond the protocol's area and ranges, of other classes, or matched with such) are in none.
+
+    Attributes:
+        threshold: metres or a share, of the protocol's.
+        detection: (M,) int64 detections that are true positives.
+        truth: (M,) int64 the true box of each.
+        false: (F,) int64 detections without a true box.
+        missed: (G,) int64 true boxes without a detection.
+    """
+
+    threshold: float
+    detection: IntArray
+    truth: IntArray
+    false: IntArray
+    missed: IntArray
+
+
+def detection_matches(
+    prediction: DetectedBoxes,
+    truth: Boxes,
+    protocol: str | DetectionProtocol = "released",
+    threshold: float | None = None,
+) -> DetectionMatches:
+    """Match one sample's detections with its true boxes as `DetectionEvaluator` does.
+
+    Args:
+        prediction: what was detected, in the protocol's frame.
+        truth: the true boxes in that frame, as `detection_truth` gives them.
+        protocol: name, or a protocol.
+        threshold: one of the protocol's; None for that of its errors, or else the middle one.
+
+    Raises:
+        ChoiceError: no such protocol, or not one of its thresholds.
+    """
+    rules = detection_protocol(protocol)
+    middle = rules.thresholds[len(rules.thresholds) // 2]
+    chosen = threshold or rules.error_threshold or middle
+    if chosen not in rules.thresholds:
+        raise ChoiceError(f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found {threshold!r}")
+    detected, true = columns_of(prediction.boxes, prediction.scores), columns_of(truth)
+    if rules.single_precision:
+        detected, true = detected.rounded(), true.rounded()
+    rows = rows_taken(detected, inside_area(detected, rules), rules)
+    true_rows = rows_taken(true, truth_taken(true, rules), rules)
+    detected, true = detected.select(rows), true.select(true_rows)
+    pairs: list[tuple[int, int]] = []
+    unmatched: set[int] = set()
+    missed: set[int] = set()
+    for position in range(len(rules.ranges)):
+        ring = ring_of(detected, true, rules, position)
+        holder = _holders(ring, rules, rules.thresholds.index(chosen))
+        counts, true_counts = ring.counts, ring.truth_counts
+        pairs += [(rows[by], true_rows[one]) for one, by in holder.items() if counts[by] and true_counts[one]]
+        unmatched |= {*np.flatnonzero(counts).tolist()} - {*holder.values()}
+        missed |= {*np.flatnonzero(true_counts).tolist()} - {*holder}
+    matched = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+    return DetectionMatches(
+        threshold=chosen,
+        detection=matched[:, 0],
+        truth=matched[:, 1],
+        false=np.sort(rows[list(unmatched)]),
+        missed=np.sort(true_rows[list(missed)]),
+    )
+
+
+def _holders(ring: Ring, rules: DetectionProtocol, level: int) -> Mapping[int, int]:
+    """True box → detection of all that match, those that do not count among them."""
+    reach, classes = ring.reach(level), len(rules.classes)
+    if rules.matching == "by_score":
+        taken = nearest_by_score(reach)
+    else:
+        counts = {candidate: bool(ring.counts[candidate // classes]) for candidate in reach}
+        taken = nearest_by_truth(reach, counts, ring.truth_counts.tolist()).holder
+    return {truth: candidate // classes for truth, candidate in taken.items()}

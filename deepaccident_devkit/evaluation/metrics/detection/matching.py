@@ -174,15 +174,13 @@ def _distance_of_bottoms(detections: BoxColumns, truth: BoxColumns, _: Detection
     squares = _squares(truth.center[:, 0], detections.center[:, 0])
     squares += _squares(truth.center[:, 1], detections.center[:, 1])
     squares += _squares(truth.bottom, detections.bottom)
-    result: AnyArray = np.sqrt(squares)
-    return result
+    return np.asarray(np.sqrt(squares))
 
 
 def _distance_bev(detections: BoxColumns, truth: BoxColumns, _: DetectionProtocol) -> AnyArray:
     squares = _squares(truth.center[:, 0], detections.center[:, 0])
     squares += _squares(truth.center[:, 1], detections.center[:, 1])
-    result: AnyArray = np.sqrt(squares)
-    return result
+    return np.asarray(np.sqrt(squares))
 
 
 def _squares(truth: AnyArray, detections: AnyArray) -> AnyArray:

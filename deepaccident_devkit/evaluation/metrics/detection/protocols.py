@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal, get_args
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError
-from deepaccident_devkit.evaluation.metrics.choices import as_tuples
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.metrics.choices import as_tuples, protocol_of, switched
 from deepaccident_devkit.taxonomy import CATEGORIES, SMALL_CATEGORIES
-from deepaccident_devkit.text import choice, possible_text, settle_choices
+from deepaccident_devkit.text import settle_choices
 
 TruthSource = Literal["label", "visible", "cooperative"]
 Measure = Literal["distance_of_bottoms", "distance_bev", "iou_3d", "iou_bev"]
@@ -149,8 +149,7 @@ class DetectionProtocol:
 
     def as_dict(self) -> dict[str, Any]:
         """All choices, as JSON holds them."""
-        result: dict[str, Any] = json.loads(json.dumps(asdict(self)))
-        return result
+        return dict(json.loads(json.dumps(asdict(self))))
 
     def _check_errors(self, threshold: float) -> None:
         if threshold not in self.thresholds or len(self.ranges) > 1 or self.curve == "voc":
@@ -228,10 +227,4 @@ def detection_protocol(protocol: str | DetectionProtocol, **switches: Any) -> De
         ChoiceError: no such protocol or choice.
         ConfigError: choices that cannot be.
     """
-    if not isinstance(protocol, DetectionProtocol):
-        protocol = DETECTION_PROTOCOLS[choice("protocol", protocol, DETECTION_PROTOCOLS)]
-    names = [field.name for field in fields(DetectionProtocol)]
-    for name in switches:
-        if name not in names:
-            raise ChoiceError(f"detection protocols have no switch {name!r}; there are {possible_text(name, names)}")
-    return replace(protocol, **switches)
+    return switched(protocol_of(protocol, DetectionProtocol, DETECTION_PROTOCOLS), switches)

@@ -1,15 +1,27 @@
-"""`MotionEvaluator`: the motion metrics of any number of samples, and the counts of each sample."""
+"""`MotionEvaluator`: the motion metrics of any number of samples, the counts of each sample, and their protocol."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray, ShortRepr
+from deepaccident_devkit.evaluation.metrics.choices import protocol_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
-from deepaccident_devkit.evaluation.metrics.frames import (
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
+    SegmentationCounts,
+    VpqRules,
+    iou,
+    mask_counts,
+    panoptic_quality,
+    vpq_counts,
+)
+from deepaccident_devkit.evaluation.metrics.numbers import TaskResult
+from deepaccident_devkit.evaluation.metrics.predictions import (
+    MotionOutput,
     cells_within,
     check_output,
     check_protocol,
@@ -18,17 +30,9 @@ from deepaccident_devkit.evaluation.metrics.frames import (
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
-    SegmentationCounts,
-    iou,
-    mask_counts,
-    panoptic_quality,
-    vpq_counts,
-)
-from deepaccident_devkit.evaluation.metrics.motion.protocol import RANGES, MotionProtocol, motion_protocol
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.evaluation.metrics.trajectories import (
+    GATE,
+    TrajectoryRules,
     instance_paths,
     longest,
     match_trajectories,
@@ -36,7 +40,64 @@ from deepaccident_devkit.evaluation.metrics.trajectories import (
     trajectory_errors,
 )
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import MotionHeads, MotionLabels, PostProcessing, predict_instances, trajectories
+from deepaccident_devkit.motion import (
+    LABEL_PROTOCOLS,
+    POST_PROCESSING,
+    MotionHeads,
+    MotionLabels,
+    PostProcessing,
+    predict_instances,
+    trajectories,
+)
+from deepaccident_devkit.text import settle_choices
+
+RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
+"""Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionProtocol:
+    """The choices of the motion metrics; the defaults are the released ones.
+
+    Sources: docs/released_code.md, Post-processing, IoU and VPQ, and Paths.
+
+    Attributes:
+        labels: protocol of the labels that are the truth, by name; others are refused. None for any labels.
+        instances: how instances are read off heads for VPQ.
+        paths: how they are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has
+            these errors from the accident evaluation, which links and cuts out instances by other rules.
+        vpq: which matches count.
+        accelerating_paths: the released quirk of `trajectories.padded`.
+        gate: metres, as of `match_trajectories`.
+        trajectories: what is a miss, and a quirk.
+        nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
+    """
+
+    labels: str | None = "released"
+    instances: PostProcessing = POST_PROCESSING["motion"]
+    paths: PostProcessing = field(default_factory=lambda: replace(POST_PROCESSING["accident"], redraw=False))
+    vpq: VpqRules = field(default_factory=VpqRules)
+    accelerating_paths: bool = True
+    gate: float = GATE
+    trajectories: TrajectoryRules = field(default_factory=TrajectoryRules)
+    nothing_is_zero: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError."""
+        settle_choices(self, {"labels": (None, *LABEL_PROTOCOLS)})
+
+
+MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
+    {"released": MotionProtocol(), "paper": MotionProtocol(nothing_is_zero=False)}
+)
+"""What the released code computes. The paper's text says no more of these metrics than their names, FIERY's and the
+ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not 0."""
+
+
+def motion_protocol(protocol: str | MotionProtocol) -> MotionProtocol:
+    """A protocol by its name, or as it is given; raises ChoiceError."""
+    return protocol_of(protocol, MotionProtocol, MOTION_PROTOCOLS)
+
 
 _PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
 _PATHS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
@@ -163,7 +224,9 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
         """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
 
-        See `overlaps.separate_selected_as_released` for the mistake; `compute(selected)` is the correct result.
+        A mistake that is kept for comparison: it has one entry a *frame*, of all samples one after the other, and takes
+        those whose number is a *sample's*, so that most of what it sums up belongs to others. `compute(selected)` is
+        the correct result.
 
         Args:
             order: all samples in the order evaluated.

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, checked
 from deepaccident_devkit.errors import GeometryError
 
 
@@ -189,22 +189,6 @@ def panoptic_quality(iou: float, true_positive: float, false_positive: float, fa
     )
 
 
-def separate_selected_as_released(
-    counts: Sequence[VpqCounts], selected: Sequence[int]
-) -> tuple[PanopticQuality, PanopticQuality]:
-    """The released VPQ "of some samples", by scenario attribute: a mistake that is kept for comparison.
-
-    The released code has one entry a *frame*, of all samples one after the other, and takes those whose number is a
-    *sample's*: so most of what it sums up belongs to others. `vpq` of the selected samples is what it means to be.
-
-    Args:
-        counts: of all samples in the order evaluated.
-        selected: numbers of samples.
-    """
-    frames = [_frame(each, frame) for each in counts for frame in range(len(each.iou))]
-    return vpq([frames[number] for number in selected])
-
-
 def _checked_maps(prediction: AnyArray, label: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Two sets of instance maps (T, H, W); raises GeometryError."""
     predicted, true = as_numbers("prediction", prediction, dtype=None), as_numbers("label", label, dtype=None)
@@ -217,16 +201,6 @@ def _quality_of(counts: Sequence[VpqCounts], index: int) -> PanopticQuality:
     names = ("iou", "true_positive", "false_positive", "false_negative")
     return panoptic_quality(
         *(math.fsum(value for each in counts for value in getattr(each, name)[:, index].tolist()) for name in names)
-    )
-
-
-def _frame(counts: VpqCounts, index: int) -> VpqCounts:
-    one = slice(index, index + 1)
-    return VpqCounts(
-        iou=counts.iou[one],
-        true_positive=counts.true_positive[one],
-        false_positive=counts.false_positive[one],
-        false_negative=counts.false_negative[one],
     )
 
 
@@ -288,3 +262,81 @@ def _background_overlap(inside: IntArray, true_size: IntArray, predicted_size: I
     """(T,) intersection over union of the background where it is more than a half, else 0."""
     union = np.maximum(true_size + predicted_size - inside, 1)
     return np.where(2 * inside > union, inside / union, 0.0)
+
+
+Reason = Literal["missing", "merged", "cut", "renamed"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LostInstance:
+    """An instance that does not come back as itself in a frame.
+
+    Attributes:
+        frame: from 0.
+        identity: its id in the labels.
+        reason: `missing`: most of its cells have no id; `merged`: they have another instance's id, of which it is the
+            smaller part; `cut`: they have its own id, but IoU ≤ 0.5; `renamed`: IoU > 0.5, but under another id than
+            when it was last found.
+        other: the id in the labels with which it was merged, or None.
+    """
+
+    frame: int
+    identity: int
+    reason: Reason
+    other: int | None = None
+
+
+def lost_instances(label: AnyArray, found: AnyArray) -> list[LostInstance]:
+    """What VPQ and the accident metrics miss of labels that went through grouping and linking, and why.
+
+    Every instance that has no partner of IoU > 0.5, or has it under a new id, is in the list with one reason: exactly
+    VPQ's false negatives.
+
+    Args:
+        label: (T, H, W) ids from 1 that stay the same over the frames, 0 elsewhere; lying as `found`.
+        found: (T, H, W) ids of the same cells as they were read off heads.
+
+    Returns:
+        By frame and id.
+
+    Raises:
+        GeometryError: the two have other shapes.
+    """
+    label = checked("label", label, (None, None, None), np.int64)
+    found = checked("found", found, label.shape, np.int64)
+    result: list[LostInstance] = []
+    names: dict[int, int] = {}
+    for frame, (here, read) in enumerate(zip(label, found, strict=True)):
+        overlap, ids, read_ids = _common_cells(here, read)
+        for row, identity in enumerate(ids.tolist()):
+            if identity == 0:
+                continue
+            column = int(np.argmax(overlap[row]))
+            name = int(read_ids[column])
+            lost = _reason(overlap, row, column, name, names.get(identity, name))
+            if lost:
+                other = int(ids[np.argmax(overlap[:, column])]) if lost == "merged" else None
+                result.append(LostInstance(frame=frame, identity=identity, reason=lost, other=other))
+            if lost in (None, "renamed"):
+                names[identity] = name
+    return result
+
+
+def _reason(overlap: IntArray, row: int, column: int, name: int, before: int) -> Reason | None:
+    if name == 0:
+        return "missing"
+    shared = overlap[row, column]
+    if overlap[:, column].max() > shared:
+        return "merged"
+    if 2 * shared <= overlap[row].sum() + overlap[:, column].sum() - shared:
+        return "cut"
+    return "renamed" if name != before else None
+
+
+def _common_cells(label: IntArray, found: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """(I, J) cells in common of I labels' ids (I,) and J found ones (J,), 0 among both if it is there."""
+    ids, row = np.unique(label.reshape(-1), return_inverse=True)
+    read_ids, column = np.unique(found.reshape(-1), return_inverse=True)
+    size = len(ids) * len(read_ids)
+    overlap = np.bincount(row * len(read_ids) + column, minlength=size).reshape(len(ids), len(read_ids))
+    return overlap, ids, read_ids

@@ -6,8 +6,11 @@ from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
     CleanWarnings,
 )
 from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
-from deepaccident_devkit.evaluation.metrics.warning.cost import AlarmCost, false_alarm_cost
-from deepaccident_devkit.evaluation.metrics.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
+from deepaccident_devkit.evaluation.metrics.warning.evaluator import (
+    WARNING_PROTOCOLS,
+    PreventedEvaluator,
+    WarningEvaluator,
+)
 from deepaccident_devkit.evaluation.metrics.warning.field import (
     FieldFigures,
     FieldResult,
@@ -15,7 +18,6 @@ from deepaccident_devkit.evaluation.metrics.warning.field import (
     field_figures,
     printed_figures,
 )
-from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
 from deepaccident_devkit.evaluation.metrics.warning.prevention import (
     AccidentOutcomes,
     OutcomeTable,
@@ -23,12 +25,11 @@ from deepaccident_devkit.evaluation.metrics.warning.prevention import (
     PreventionCurve,
     PreventionFigures,
 )
-from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
+from deepaccident_devkit.evaluation.metrics.warning.recordings import ScoreSeries
 
 __all__ = [
     "WARNING_PROTOCOLS",
     "AccidentOutcomes",
-    "AlarmCost",
     "AnticipationFigures",
     "AnticipationResult",
     "CleanScores",
@@ -44,7 +45,6 @@ __all__ = [
     "PreventionFigures",
     "ScoreSeries",
     "WarningEvaluator",
-    "false_alarm_cost",
     "field_figures",
     "printed_figures",
 ]

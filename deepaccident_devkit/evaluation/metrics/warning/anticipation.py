@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Final, get_args
 
@@ -14,7 +14,7 @@ from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
+from deepaccident_devkit.evaluation.metrics.numbers import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.metrics.warning.recordings import (
     GIVEN,
@@ -128,10 +128,6 @@ class CleanWarnings:
         settle_choices(self, {"scores_of": get_args(ScoresOf)})
         if self.threshold is not None and not math.isfinite(self.threshold):
             raise ConfigError(f"threshold: expected a number, or None, found {self.threshold!r}")
-
-    def settings(self) -> dict[str, Any]:
-        """All choices, as JSON can hold them."""
-        return asdict(self)
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> AnticipationResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""

@@ -14,8 +14,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
-from deepaccident_devkit.evaluation.metrics.warning.cost import MINUTE
-from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
+from deepaccident_devkit.evaluation.metrics.warning.recordings import MINUTE, ScoreSeries
 
 WINDOW: Final = 3.0
 """Seconds before the impact in which the headline compares scores."""
@@ -247,5 +246,4 @@ def _area(ranks: IntArray, positive: BoolArray, weight: FloatArray) -> float:
 
 
 def _shares(part: FloatArray, whole: FloatArray) -> FloatArray:
-    shares: FloatArray = np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0)
-    return shares
+    return np.asarray(np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0))

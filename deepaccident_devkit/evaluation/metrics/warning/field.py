@@ -10,23 +10,23 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import ClassVar, Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
+from deepaccident_devkit.evaluation.metrics.numbers import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.recordings import (
     GIVEN,
     PREDICTORS,
+    ScoreSeries,
     by_group,
     drives_of,
     left_out_notes,
     parts_of,
     series_of,
 )
-from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 from deepaccident_devkit.text import choice
 
 FieldCode = Literal["ustring", "dsta", "drive", "dad"]
@@ -266,8 +266,7 @@ def _time_at_r80(levels: _Points) -> float:
 
 
 def _over(part: IntArray | FloatArray, whole: IntArray) -> FloatArray:
-    shares: FloatArray = np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0)
-    return shares
+    return np.asarray(np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0))
 
 
 def _nothing(code: FieldCode, why: str) -> FieldFigures:
@@ -304,10 +303,6 @@ class FieldWarnings:
 
     A recording's score is as of `CleanWarnings`, of all its alarms, since dash-cam sets know recordings alone.
     """
-
-    def settings(self) -> dict[str, Any]:
-        """No choices: it is as those codes are."""
-        return {}
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""

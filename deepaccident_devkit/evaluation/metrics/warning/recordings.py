@@ -1,4 +1,7 @@
-"""What one sample adds to the metrics of warnings, and `Drive`: a recording's samples with the scores of predictors."""
+"""The recordings of warnings: what one sample adds, and a recording's samples with the scores of predictors.
+
+`ScoreSeries` are the scores of many, frame by frame; `AlarmRuns` say how long their alarms last.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.raised import (
     Pair,
@@ -29,12 +32,106 @@ from deepaccident_devkit.evaluation.metrics.alarms.truth import (
     BoxTruth,
     Involvement,
 )
-from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
+from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
-from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+_SLACK: Final = 1e-6
+"""Columns: times are decimal numbers, which binary numbers only approximate."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScoreSeries(FrozenArrays):
+    """How sure a predictor is, at each frame of N recordings, that an accident comes; arrays are read-only.
+
+    Attributes:
+        scores: (N, T) float64, higher is surer; −inf where no threshold makes an alarm of it; NaN after a recording's
+            end, and where a frame is missing.
+        positive: (N,) bool, whether the recording ends in an accident.
+        toa: (N,) float64, time of the accident: the column of the impact, which is no frame of the recording any more.
+            Of recordings without an accident the column after the last one that counts.
+        fps: columns a second.
+    """
+
+    scores: FloatArray
+    positive: BoolArray
+    toa: FloatArray
+    fps: float
+
+    @property
+    def valid(self) -> BoolArray:
+        """(N, T) whether there is a score that counts: all from the impact on do not exist."""
+        return np.asarray(~np.isnan(self.scores) & (np.arange(self.scores.shape[1]) < self.toa[:, None]))
+
+    def highest(self) -> FloatArray:
+        """(N,) the highest score of each recording; −inf without any."""
+        return np.asarray(np.max(self.scores, axis=1, initial=-np.inf, where=self.valid))
+
+    def before(self, seconds: float) -> FloatArray:
+        """(N, M) scores at the M moments of the last seconds before `toa`, the latest first; NaN without a score."""
+        moments = np.arange(1, round(seconds * self.fps) + 1)
+        column = np.ceil(self.toa[:, None] - moments - _SLACK).astype(np.int64)
+        there = (column >= 0) & (column < self.scores.shape[1])
+        rows = np.arange(len(self.toa))[:, None]
+        return np.where(there, np.where(self.valid, self.scores, np.nan)[rows, column * there], np.nan)
+
+    def first(self, thresholds: FloatArray) -> IntArray:
+        """(N, K) the first column with a score of at least each of K thresholds; T where there is none."""
+        so_far = np.maximum.accumulate(np.where(self.valid, self.scores, -np.inf), axis=1)
+        first = np.array([np.searchsorted(row, thresholds, side="left") for row in so_far], dtype=np.int64)
+        return first.reshape(len(so_far), len(thresholds))
+
+    def leads(self, thresholds: FloatArray) -> FloatArray:
+        """(N, K) seconds from the first score of at least each of K thresholds to `toa`; NaN where there is none."""
+        first = self.first(thresholds).astype(np.float64)
+        first[first >= self.scores.shape[1]] = np.nan
+        return np.asarray((self.toa[:, None] - first) / self.fps)
+
+
+MINUTE: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AlarmRuns(FrozenArrays):
+    """The R runs of alarmed frames of N recordings; arrays are read-only.
+
+    Attributes:
+        row: (R,) int64 which recording.
+        begin: (R,) int64 first column.
+        length: (R,) int64 columns.
+        shape: N recordings and T columns.
+        fps: columns a second.
+    """
+
+    row: IntArray
+    begin: IntArray
+    length: IntArray
+    shape: tuple[int, int]
+    fps: float
+
+    @classmethod
+    def of(cls, alarm: BoolArray, fps: float) -> AlarmRuns:
+        """The runs in (N, T) alarms: a row a recording, False also where a frame is missing, which ends a run."""
+        edges = np.diff(alarm.astype(np.int8), axis=1, prepend=0, append=0)
+        row, begin = np.nonzero(edges == 1)
+        _, end = np.nonzero(edges == -1)
+        count, columns = alarm.shape
+        return cls(row=row, begin=begin, length=end - begin, shape=(count, columns), fps=fps)
+
+    def braking_seconds(self, reaction: float) -> FloatArray:
+        """(N,) seconds in which a driver brakes who obeys: of each run max(0, its duration − the reaction time)."""
+        left = np.maximum(self.length / self.fps - reaction, 0.0)
+        return np.asarray(np.bincount(self.row, left, self.shape[0]).astype(np.float64))
+
+    def first_lasting(self, reaction: float) -> IntArray:
+        """(N,) first column of the first run that outlasts the reaction, so that it costs something; T for none."""
+        lasting = self.length / self.fps > reaction
+        first = np.full(self.shape[0], self.shape[1], dtype=np.int64)
+        np.minimum.at(first, self.row[lasting], self.begin[lasting])
+        return first
+
 
 Kind = Literal["accident", "twins", "others"]
 """Of a recording: somebody collides; nobody does, but in the scenario's twin; nobody does, and none there is known."""

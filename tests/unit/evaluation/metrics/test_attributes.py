@@ -3,7 +3,7 @@
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.metrics.attributes import (
+from deepaccident_devkit.evaluation.metrics.breakdowns import (
     ATTRIBUTES,
     NO_IMPACT,
     sample_attributes,

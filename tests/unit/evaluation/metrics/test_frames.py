@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.metrics.frames import cells_within, labels_at_present
+from deepaccident_devkit.evaluation.metrics.predictions import cells_within, labels_at_present
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 

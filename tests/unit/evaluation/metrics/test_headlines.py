@@ -7,9 +7,8 @@ import pytest
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
-from deepaccident_devkit.evaluation.metrics.headlines import headline_numbers, headlines, value_text
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
+from deepaccident_devkit.evaluation.metrics.numbers import headlines, numbers_of, value_text
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
 
 RUNS = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
@@ -30,8 +29,9 @@ def test_each_headline_is_a_number_of_the_result_by_its_path(task: str, protocol
 def test_names() -> None:
     result = MotionEvaluator().compute()
     names = ["iou 30x30", "iou 100x100", "vpq 30x30", "vpq 100x100", "min_ade", "min_fde", "miss_rate"]
-    assert headline_numbers("motion", result) == dict(zip(names, [0.0] * 4 + [None] * 3, strict=True))
-    assert [each.higher_is_better for each in headlines("motion", result)] == [True] * 4 + [False] * 3
+    found = headlines("motion", result)
+    assert {each.name: each.value for each in found} == dict(zip(names, [0.0] * 4 + [None] * 3, strict=True))
+    assert [each.higher_is_better for each in found] == [True] * 4 + [False] * 3
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from deepaccident_devkit.evaluation.metrics.headlines import HEADLINE_UNITS
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.numbers import has_interval, numbers_of, range_of
+from deepaccident_devkit.evaluation.metrics.numbers import HEADLINE_UNITS, has_interval, numbers_of, range_of
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
 
 NOWHERE = np.array([math.nan])

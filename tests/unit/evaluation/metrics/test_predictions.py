@@ -79,20 +79,32 @@ class TestMotionOutput:
 
     def test_what_is_no_output(self) -> None:
         segmentation, centerness, offset, flow = stacked()
-        with pytest.raises(GeometryError, match=r"offset: expected \(K, T, channels, H, W\).* offset \(2, 5"):
-            MotionOutput.from_arrays(segmentation, centerness, offset[:2], flow, grid=GRID)
-        with pytest.raises(GeometryError, match=r"segmentation: expected \(K, T, channels, H, W\)"):
-            MotionOutput.from_arrays(segmentation[0, 0], centerness, offset, flow, grid=GRID)
-        with pytest.raises(GeometryError, match="flow: expected shape"):
-            MotionOutput.from_arrays(segmentation, centerness, offset, flow[:, :4], grid=GRID)
-        with pytest.raises(GeometryError, match="at least one prediction"):
-            MotionOutput.from_arrays(segmentation[:0], centerness[:0], offset[:0], flow[:0], grid=GRID)
-        with pytest.raises(GeometryError, match=r"grid: expected a BevGrid, .*found NoneType"):
-            MotionOutput.from_arrays(segmentation, centerness, offset, flow, grid=None)  # type: ignore[arg-type]
-        with pytest.raises(GeometryError, match="and not both"):
-            MotionOutput(grid=GRID)
-        with pytest.raises(GeometryError, match="at least one prediction"):
-            instances_of(np.zeros((0, 5, *GRID.shape), dtype=int), GRID)
+        for words, refused in (
+            (
+                r"offset: expected \(K, T, channels, H, W\).* offset \(2, 5",
+                lambda: MotionOutput.from_arrays(segmentation, centerness, offset[:2], flow, grid=GRID),
+            ),
+            (
+                r"segmentation: expected \(K, T, channels, H, W\)",
+                lambda: MotionOutput.from_arrays(segmentation[0, 0], centerness, offset, flow, grid=GRID),
+            ),
+            (
+                "flow: expected shape",
+                lambda: MotionOutput.from_arrays(segmentation, centerness, offset, flow[:, :4], grid=GRID),
+            ),
+            (
+                "at least one prediction",
+                lambda: MotionOutput.from_arrays(segmentation[:0], centerness[:0], offset[:0], flow[:0], grid=GRID),
+            ),
+            (
+                r"grid: expected a BevGrid, .*found NoneType",
+                lambda: MotionOutput.from_arrays(segmentation, centerness, offset, flow, grid=None),  # type: ignore[arg-type]
+            ),
+            ("and not both", lambda: MotionOutput(grid=GRID)),
+            ("at least one prediction", lambda: instances_of(np.zeros((0, 5, *GRID.shape), dtype=int), GRID)),
+        ):
+            with pytest.raises(GeometryError, match=words):
+                refused()
 
 
 class TestAccident:

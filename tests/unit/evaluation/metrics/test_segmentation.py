@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from deepaccident_devkit.errors import EvaluationError, GeometryError
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.segmentation import BevSegmentationEvaluator
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import BEV_CLASSES, BevSegmentation
@@ -33,28 +33,11 @@ def test_cells_are_summed_over_samples() -> None:
     assert json.dumps(result.as_dict(), allow_nan=False)
 
 
-def test_perfect_and_empty_predictions() -> None:
-    truth = targets(road=slice(0, 2), vehicle=slice(3, 4))
-    for prediction, score in ((truth, 100), (targets(), 0)):
-        evaluator = BevSegmentationEvaluator()
-        evaluator.update("a", prediction, truth)
-        assert evaluator.compute().mean_iou == score
-
-
 def test_unknown_cells_do_not_count() -> None:
     evaluator = BevSegmentationEvaluator()
     evaluator.update("a", targets(road=slice(0, 4)), targets(known=False))
     assert math.isnan(evaluator.compute().mean_iou)
     assert math.isnan(BevSegmentationEvaluator().compute().mean_iou)
-
-
-def test_merging_is_adding() -> None:
-    one, other = BevSegmentationEvaluator(), BevSegmentationEvaluator()
-    one.update("a", targets(road=slice(0, 2)), targets(road=slice(1, 3)))
-    other.update("b", targets(), targets(road=slice(1, 3)))
-    assert one.merge(other).compute().cells["road"] == (4, 4, 12)
-    with pytest.raises(EvaluationError, match="evaluated twice"):
-        one.update("a", targets(), targets(road=slice(1, 3)))
 
 
 def test_predictions_that_do_not_fit() -> None:

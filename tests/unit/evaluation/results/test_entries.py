@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.results.entries import detection_entries
@@ -110,20 +109,6 @@ class TestEntries:
         header = ['"format": "DeepAccident results",', '"version": 1,', '"task": "accident",']
         assert lines[:6] == ["{", *header, '"meta": {"b": 1, "a": [null]},', '"results": {']
         assert lines[7:] == [f'"{SECOND}": []', "}", "}"]
-
-    def test_boxes_of_a_release(self, da: DeepAccident, tmp_path: Path) -> None:
-        """The labels as detections: the world's boxes lead back to the LiDAR frame's."""
-        token = da.sample[0]["token"]
-        boxes, world_from_lidar = da.boxes(token, frame="lidar"), da.world_from(token, "lidar")
-        detected = DetectedBoxes(boxes=boxes.transform(world_from_lidar, "world"), scores=np.ones(len(boxes)))
-        read = written(tmp_path / "d.json", "detection", {token: detected}).prediction(token)
-        assert isinstance(read, DetectedBoxes)
-        back = read.boxes.transform(world_from_lidar.inverse(), "lidar")
-        assert len(back) > 3
-        np.testing.assert_allclose(back.center, boxes.center, atol=1e-9)
-        np.testing.assert_allclose(np.exp(1j * back.yaw), np.exp(1j * boxes.yaw), atol=1e-9)
-        np.testing.assert_array_equal(back.size, boxes.size)
-        np.testing.assert_array_equal(back.category, boxes.category)
 
 
 def test_a_velocity_that_is_known_in_part_is_unknown() -> None:

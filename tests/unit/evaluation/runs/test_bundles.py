@@ -179,12 +179,19 @@ class TestPlaces:
     def test_another_folder_is_never_replaced(self, run: EvaluationRun, tmp_path: Path, overwrite: bool) -> None:
         (tmp_path / "work" / "deep").mkdir(parents=True)
         (tmp_path / "work" / "deep" / "thesis.tex").touch()
-        with pytest.raises(ResultsError, match=r"work: is not empty and holds no evaluation"):
-            save_run(run, tmp_path / "work", overwrite=overwrite)
-        with pytest.raises(ResultsError, match=r"thesis.tex: is a file; choose a folder that is new"):
-            save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite)
-        with pytest.raises(ResultsError, match=r"out: expected a folder, found an empty path"):
-            save_run(run, "", overwrite=overwrite)
+        for words, refused in (
+            (
+                r"work: is not empty and holds no evaluation",
+                lambda: save_run(run, tmp_path / "work", overwrite=overwrite),
+            ),
+            (
+                r"thesis.tex: is a file; choose a folder that is new",
+                lambda: save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite),
+            ),
+            (r"out: expected a folder, found an empty path", lambda: save_run(run, "", overwrite=overwrite)),
+        ):
+            with pytest.raises(ResultsError, match=words):
+                refused()
 
     def test_an_empty_folder_is_fine_and_checkpoints_go(
         self, da_b: DeepAccident, results: Results, selection: SampleSelection, run: EvaluationRun, tmp_path: Path

@@ -280,10 +280,6 @@ class TestRefused:
         with pytest.raises(EvaluationError, match=r"counts.json: was saved by AccidentEvaluator of devkit 9."):
             compare_bundles(a, b, FEW)
 
-    def test_no_bundle(self, tmp_path: Path, saved: Save) -> None:
-        with pytest.raises(ResultsError, match=r"nowhere: no such folder"):
-            compare_bundles(saved("a"), tmp_path / "nowhere")
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("clusters", "pairs"), [(8, 300), (12, 200), (24, 200)])

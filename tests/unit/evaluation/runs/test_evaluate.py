@@ -11,20 +11,19 @@ from report_page import Page
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import AccidentEvaluator, Resampling, accident_context, sample_attributes
-from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS
+from deepaccident_devkit.evaluation.metrics.breakdowns import WITHIN_RECORDINGS
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter
 from deepaccident_devkit.evaluation.runs import (
     BREAKDOWNS,
     EvaluationRun,
     Partial,
     SampleSelection,
-    evaluate,
     evaluate_results,
+    evaluation_run,
     scenario_hashes,
 )
-from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, remove_checkpoints
-from deepaccident_devkit.evaluation.runs.evaluate import _partial, check_metas
-from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of
+from deepaccident_devkit.evaluation.runs.evaluation_run import _partial, breakdowns_of, check_metas
+from deepaccident_devkit.evaluation.runs.many_samples import checkpoint_path, remove_checkpoints
 from deepaccident_devkit.evaluation.runs.selection import Coverage
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
 from deepaccident_devkit.splits import save_selection
@@ -40,7 +39,7 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_arguments: Any, **_named: Any) -> None:
         pytest.fail("was evaluated")
 
-    monkeypatch.setattr(evaluate, "evaluate_samples", refused)
+    monkeypatch.setattr(evaluation_run, "evaluate_samples", refused)
 
 
 class TestRun:
@@ -76,20 +75,6 @@ class TestRun:
                 writer.add(token, [])
         run = evaluate_results(da_motion, tmp_path / "none.json", SETUP, "train", workers=1)
         assert (len(run.evaluator), run.result.apa) == (20, 0.0)
-
-    @pytest.mark.slow
-    def test_two_workers_give_the_same_bits(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
-    ) -> None:
-        every = replace(selection, agents=None)
-        results = write_motion(tmp_path / "motion", every.tokens(da_b))
-        one, two = (
-            evaluate_results(da_b, results, EvaluationSetup(task="motion"), every, workers=workers)
-            for workers in (1, 2)
-        )
-        assert one.summary() == two.summary()
-        assert dict(one.evaluator.counts) == dict(two.evaluator.counts)
-        assert 0 < one.result.ranges["100x100"].iou < 100
 
     def test_breakdowns_on_two_workers_are_the_same(self, run: EvaluationRun) -> None:
         one, two = (run.broken_down(["all", "agent"], Resampling(resamples=20), workers=workers) for workers in (1, 2))
@@ -193,18 +178,12 @@ class TestPartial:
         assert run.evaluator.tokens == set(tokens)
         assert run.partial is None
 
-    def test_complete_results_are_not_partial(
-        self, da_b: DeepAccident, results: Results, selection: SampleSelection
-    ) -> None:
-        run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
-        assert run.partial is None
-
 
 class TestBrokenOff:
     @pytest.fixture
     def broken_after(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], list[str]]:
         """Break a run off after so many samples; gives the tokens that were loaded."""
-        original = evaluate.SampleLoader.__call__
+        original = evaluation_run.SampleLoader.__call__
 
         def start(count: int | None) -> list[str]:
             loaded: list[str] = []
@@ -215,7 +194,7 @@ class TestBrokenOff:
                 loaded.append(token)
                 return original(loader, token)
 
-            monkeypatch.setattr(evaluate.SampleLoader, "__call__", load)
+            monkeypatch.setattr(evaluation_run.SampleLoader, "__call__", load)
             return loaded
 
         return start
@@ -259,17 +238,6 @@ class TestBrokenOff:
         assert len(loaded) == 10
         self.run_of(da_b, write_accidents(tmp_path / "more.json", ten.tokens, moved=3.0), out)
         assert len(loaded) == 20
-
-    def test_a_damaged_checkpoint_begins_anew(
-        self, da_b: DeepAccident, ten: Results, tmp_path: Path, broken_after: Callable[[int | None], list[str]]
-    ) -> None:
-        out = tmp_path / "out"
-        self.run_of(da_b, ten, out)
-        (kept, _) = sorted((tmp_path / "out.unfinished").glob("counts/*/kept/*"))
-        kept.write_bytes(kept.read_bytes()[:-9])
-        loaded = broken_after(None)
-        self.run_of(da_b, ten, out)
-        assert len(loaded) in (8, 2)
 
     def test_the_name_says_all_that_counts(self, tmp_path: Path) -> None:
         prints = {"results": "a", "release": "b"}

@@ -13,13 +13,11 @@ from pathlib import Path
 
 import evaluating
 import pytest
-from evaluating import BROKEN, Sums, labels_as_maps, number, number_and_trace
+from evaluating import BROKEN, Sums, number, number_and_trace
 
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
-from deepaccident_devkit.evaluation import MotionEvaluator, evaluate_samples
+from deepaccident_devkit.evaluation import evaluate_samples
 from deepaccident_devkit.evaluation.runs import many_samples
-from deepaccident_devkit.parallel import run_unordered
 
 VALUES = {f"{index:02d}": float(10 ** (index % 17)) + index / 10 for index in range(40)}
 
@@ -30,24 +28,6 @@ def done(folder: Path) -> int:
 
 
 class TestWorkers:
-    @pytest.mark.slow
-    def test_two_workers_are_one(self, da_motion: DeepAccident) -> None:
-        tokens = {token: token for token in da_motion.samples("train", "evaluate")}
-        load = partial(labels_as_maps, da_motion)
-        alone, together = (evaluate_samples(MotionEvaluator(), tokens, load, workers=number) for number in (1, 2))
-        assert together.compute() == alone.compute()
-        assert dict(together.counts) == dict(alone.counts)
-        assert alone.tokens == tokens.keys()
-        by_hand = MotionEvaluator()
-        for token in tokens:
-            by_hand.update(token, *load(token))
-        assert alone.compute() == by_hand.compute()
-
-    def test_an_executor(self) -> None:
-        with ThreadPoolExecutor(2) as executor:
-            threads = evaluate_samples(Sums(), VALUES, lambda task: (task,), executor=executor)
-        assert threads.compute() == evaluate_samples(Sums(), VALUES, number, workers=1).compute()
-
     def test_none_or_few_samples(self) -> None:
         assert len(evaluate_samples(Sums(), {}, number)) == 0
         assert evaluate_samples(Sums(), {"a": 3.0}, number, workers=2).compute() == 3.0
@@ -116,21 +96,6 @@ class TestFaults:
 
 
 class TestCheckpoints:
-    def test_a_run_that_raises_goes_on(self, tmp_path: Path) -> None:
-        path, folder = tmp_path / "runs" / "counts", tmp_path / "trace"
-        folder.mkdir()
-        load = partial(number_and_trace, folder)
-        with pytest.raises(EvaluationError, match="30: cannot be"):
-            evaluate_samples(Sums(), {**VALUES, "30": BROKEN}, load, workers=1, checkpoint=path)
-        before = done(folder)
-        evaluator = evaluate_samples(Sums(), VALUES, load, workers=1, checkpoint=path)
-        assert evaluator.compute() == sum_of_all()
-        assert (before, done(folder)) == (40, 40 + 8)  # all other batches are kept
-        again = evaluate_samples(Sums(), VALUES, load, workers=2, checkpoint=path)
-        assert done(folder) == 40 + 8
-        assert dict(again.counts) == dict(evaluator.counts)
-        assert not again.repeated
-
     @pytest.mark.slow
     @pytest.mark.parametrize("workers", [1, 2])
     def test_a_killed_run_goes_on(self, tmp_path: Path, workers: int) -> None:
@@ -179,14 +144,6 @@ class TestCheckpoints:
         (tmp_path / "file").touch()
         with pytest.raises(EvaluationError, match="file/counts: cannot be written"):
             evaluate_samples(Sums(), {"x": BROKEN}, number, workers=1, checkpoint=tmp_path / "file" / "counts")
-
-
-def test_a_closed_run_begins_nothing_more(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(1) as executor:
-        results = run_unordered(partial(number_and_trace, tmp_path), [float(n) for n in range(50)], executor=executor)
-        assert next(results)[0] == 0
-        results.close()
-    assert done(tmp_path) < 10
 
 
 def sum_of_all() -> float:

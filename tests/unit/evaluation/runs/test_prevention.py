@@ -97,14 +97,6 @@ def test_the_first_alarm_above_the_threshold_decides(da_motion: DeepAccident, cr
             assert figures.warned == 1
 
 
-@pytest.mark.slow
-def test_any_workers_give_the_same_bits(da_motion: DeepAccident, crash: str) -> None:
-    evaluator = foreseen(da_motion, EVERYONE, (11, 21), crash)
-    one, two = (prevented_accidents(da_motion, evaluator, workers=workers).as_dict() for workers in (1, 2))
-    assert str(one) == str(two)
-    assert list(one["groups"]) == ["ego_involved", "bystander", "infrastructure"]
-
-
 def test_other_evaluators_have_no_scores_of_recordings(da_motion: DeepAccident) -> None:
     for evaluator in (WarningEvaluator("field"), MotionEvaluator()):
         with pytest.raises(EvaluationError, match="need one of warnings, protocol clean, which scores whole recording"):

@@ -260,7 +260,6 @@ def test_label_maps_against_the_boxes_of_a_release(da_motion: DeepAccident) -> N
 
 
 def test_what_cannot_be_evaluated(da_motion: DeepAccident) -> None:
-    assert json.loads(json.dumps(BOXES.settings())) == BOXES.settings()
     with pytest.raises(EvaluationError, match="accident_context"):
         BOXES.counts([alarm()], None, META)
     with pytest.raises(EvaluationError, match="list of Accidents"):

@@ -39,7 +39,7 @@ def test_a_protocol_of_ones_own_has_its_accidents_as_given() -> None:
     class Own:
         """Not one of the devkit's."""
 
-        settings = counts = result = pooled = lambda *_: {}
+        counts = result = pooled = lambda *_: {}
 
     assert AccidentEvaluator(Own()).protocol is not None
     compared = compared_accidents([], None, AccidentContext(), Own())

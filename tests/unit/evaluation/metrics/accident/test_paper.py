@@ -1,4 +1,3 @@
-import json
 import math
 from dataclasses import replace
 
@@ -304,30 +303,48 @@ def test_the_ego_s_own_box_is_the_agent_itself() -> None:
 
 
 def test_what_cannot_be_compared() -> None:
-    label = scene(HIT)
-    with pytest.raises(EvaluationError, match="expected a MotionOutput or a list of Accidents"):
-        PAPER.counts([(20.0, 10.0)], label, AccidentContext())
-    with pytest.raises(EvaluationError, match="needs the sample's motion labels"):
-        PAPER.counts([alarm()], None, AccidentContext())
-    with pytest.raises(EvaluationError, match="needs the sample's motion labels"):
-        PAPER.counts(as_maps(label), None, AccidentContext())
-    with pytest.raises(EvaluationError, match="expected those of the label protocol 'released'"):
-        PAPER.counts(as_maps(label), scene(HIT, protocol="clean"), AccidentContext())
-    with pytest.raises(EvaluationError, match="expected at least 5 frames from the present on, found 3"):
-        PAPER.counts(MotionOutput(grid=label.config.grid, instances=label.instance[None, :3]), label, AccidentContext())
-    other = BevGrid(x=(-25, 25, 0.25), y=(-25, 25, 0.25))
-    with pytest.raises(EvaluationError, match="make both with the same grid"):
-        PAPER.counts(MotionOutput(grid=other, instances=label.instance[None]), label, AccidentContext())
-    with pytest.raises(EvaluationError, match="present frame is not in the recording"):
-        PAPER.counts(as_maps(label), scene(HIT, frames=0), AccidentContext())
-    with pytest.raises(ChoiceError, match="sample_choice: expected one of best, mean_first"):
-        PaperAccidents(sample_choice="worst")
-    with pytest.raises(ChoiceError, match="outline: expected one of centers, cells"):
-        AccidentReading(outline="contour")
-    with pytest.raises(ConfigError, match="danger_distance"):
-        AccidentReading(danger_distance=0)
-    with pytest.raises(ConfigError, match="errors_at"):
-        Scoring(errors_at=7)
+    label, other = scene(HIT), BevGrid(x=(-25, 25, 0.25), y=(-25, 25, 0.25))
+    for error, words, refused in (
+        (
+            EvaluationError,
+            "expected a MotionOutput or a list of Accidents",
+            lambda: PAPER.counts([(20.0, 10.0)], label, AccidentContext()),
+        ),
+        (EvaluationError, "needs the sample's motion labels", lambda: PAPER.counts([alarm()], None, AccidentContext())),
+        (
+            EvaluationError,
+            "needs the sample's motion labels",
+            lambda: PAPER.counts(as_maps(label), None, AccidentContext()),
+        ),
+        (
+            EvaluationError,
+            "expected those of the label protocol 'released'",
+            lambda: PAPER.counts(as_maps(label), scene(HIT, protocol="clean"), AccidentContext()),
+        ),
+        (
+            EvaluationError,
+            "expected at least 5 frames from the present on, found 3",
+            lambda: PAPER.counts(
+                MotionOutput(grid=label.config.grid, instances=label.instance[None, :3]), label, AccidentContext()
+            ),
+        ),
+        (
+            EvaluationError,
+            "make both with the same grid",
+            lambda: PAPER.counts(MotionOutput(grid=other, instances=label.instance[None]), label, AccidentContext()),
+        ),
+        (
+            EvaluationError,
+            "present frame is not in the recording",
+            lambda: PAPER.counts(as_maps(label), scene(HIT, frames=0), AccidentContext()),
+        ),
+        (ChoiceError, "sample_choice: expected one of best, mean_first", lambda: PaperAccidents(sample_choice="worst")),
+        (ChoiceError, "outline: expected one of centers, cells", lambda: AccidentReading(outline="contour")),
+        (ConfigError, "danger_distance", lambda: AccidentReading(danger_distance=0)),
+        (ConfigError, "errors_at", lambda: Scoring(errors_at=7)),
+    ):
+        with pytest.raises(error, match=words):
+            refused()
 
 
 def alarm(x=0.0, score=1.0, time=1.5, ids=None) -> Accident:
@@ -393,7 +410,7 @@ def test_orientations_of_prediction_and_label_may_differ() -> None:
         assert PAPER.counts(as_maps(lying), label, AccidentContext()) == expected
 
 
-def test_counts_are_json_and_choices_change_them() -> None:
+def test_choices_change_the_result() -> None:
     label = scene(HIT)
 
     def evaluated(**choices: object) -> AccidentEvaluator:
@@ -402,10 +419,6 @@ def test_counts_are_json_and_choices_change_them() -> None:
         evaluator.update("two", as_maps(label), label)
         return evaluator
 
-    evaluator = evaluated()
-    assert json.loads(json.dumps(evaluator.counts["one"])) == evaluator.counts["one"]
-    json.dumps(evaluator.settings)
-    json.dumps(evaluator.compute().as_dict())
-    assert evaluator.compute().within[5.0].tp == 1
+    assert evaluated().compute().within[5.0].tp == 1
     assert evaluated(scoring=Scoring(far_is_missed=False)).compute().within[5.0].fn == 0
     assert evaluated(reading=AccidentReading(danger_distance=0.5)).compute().positives == 0

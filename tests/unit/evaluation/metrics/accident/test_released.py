@@ -2,7 +2,6 @@
 
 import json
 import math
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -286,38 +285,6 @@ def test_nothing_foreseen_has_the_released_errors() -> None:
     assert (result.id_error, result.position_error, result.time_error) == (1, 20, 1)
 
 
-def test_nothing_to_count() -> None:
-    result = AccidentEvaluator().compute()
-    assert math.isnan(result.apa)
-    assert result.samples == 0
-
-
-def test_order_and_parts_do_not_matter(tmp_path) -> None:
-    whole = evaluated()
-    parts = evaluated(tokens="db").merge(evaluated(tokens="ca"))
-    assert parts.compute() == whole.compute()
-    saved = evaluated(tokens="bc").save(tmp_path / "counts.json")
-    assert evaluated(AccidentEvaluator().resume(saved), tokens="da").compute() == whole.compute()
-    assert pickle.loads(pickle.dumps(whole)).compute() == whole.compute()
-    assert whole.compute(["a"]).apa == 1
-    again = evaluated(evaluated())
-    assert again.repeated == set("abcd")
-    assert again.compute() == whole.compute()
-
-
-def test_a_sample_with_two_outcomes_is_an_error() -> None:
-    evaluator = evaluated(tokens="a")
-    with pytest.raises(EvaluationError, match="evaluated twice"):
-        evaluator.update("a", as_heads(scene(CALM)), scene(HIT))
-
-
-def test_protocols_cannot_be_merged() -> None:
-    with pytest.raises(EvaluationError, match="cannot merge"):
-        AccidentEvaluator("released").merge(AccidentEvaluator("paper"))
-    with pytest.raises(EvaluationError, match="cannot merge"):
-        AccidentEvaluator().merge(AccidentEvaluator(replace(RELEASED, far_is_missed=True)))
-
-
 def test_choices_that_change_a_sum() -> None:
     missed, at_ten = (
         evaluated(AccidentEvaluator(replace(RELEASED, **change))).compute()
@@ -329,18 +296,27 @@ def test_choices_that_change_a_sum() -> None:
 
 def test_what_cannot_be_evaluated() -> None:
     label = scene(HIT)
-    with pytest.raises(EvaluationError, match="give a MotionOutput"):
-        counts([Accident(positions=np.zeros((2, 2)), time=1.0)], label)
-    with pytest.raises(EvaluationError, match="motion labels"):
-        counts(as_heads(label), None)
-    with pytest.raises(EvaluationError, match="frames"):
-        counts(MotionOutput(grid=label.config.grid, instances=label.instance[None, :3]), label)
-    with pytest.raises(EvaluationError, match="grid"):
-        counts(MotionOutput(grid=BevGrid((-51, 49, 0.5)), instances=label.instance[None]), label)
-    with pytest.raises(ConfigError, match="errors_at: expected one of"):
-        replace(RELEASED, errors_at=7.0)
-    with pytest.raises(ConfigError, match="prediction_gap"):
-        replace(RELEASED, prediction_gap=math.nan)
-    with pytest.raises(ChoiceError, match="released, paper, boxes"):
-        AccidentEvaluator("official")
+    for error, words, refused in (
+        (
+            EvaluationError,
+            "give a MotionOutput",
+            lambda: counts([Accident(positions=np.zeros((2, 2)), time=1.0)], label),
+        ),
+        (EvaluationError, "motion labels", lambda: counts(as_heads(label), None)),
+        (
+            EvaluationError,
+            "frames",
+            lambda: counts(MotionOutput(grid=label.config.grid, instances=label.instance[None, :3]), label),
+        ),
+        (
+            EvaluationError,
+            "grid",
+            lambda: counts(MotionOutput(grid=BevGrid((-51, 49, 0.5)), instances=label.instance[None]), label),
+        ),
+        (ConfigError, "errors_at: expected one of", lambda: replace(RELEASED, errors_at=7.0)),
+        (ConfigError, "prediction_gap", lambda: replace(RELEASED, prediction_gap=math.nan)),
+        (ChoiceError, "released, paper, boxes", lambda: AccidentEvaluator("official")),
+    ):
+        with pytest.raises(error, match=words):
+            refused()
     assert set(PROTOCOLS) == {"released", "paper", "boxes"}

@@ -26,12 +26,13 @@ def test_accidents_of_instance_maps(orientation) -> None:
     assert accidents_of(label.instance, grid, reading=AccidentReading(danger_distance=0.25)) == []
     (raw,) = accidents_of(label.instance, grid, labels=None)
     np.testing.assert_allclose(np.abs(raw.positions - found.positions), 0.25)
-    with pytest.raises(ChoiceError, match="labels"):
-        accidents_of(label.instance, grid, labels="none")
-    with pytest.raises(ConfigError, match="step"):
-        accidents_of(label.instance, grid, step=0)
-    with pytest.raises(GeometryError, match="instances"):
-        accidents_of(label.instance[..., :9], grid)
+    for error, words, refused in (
+        (ChoiceError, "labels", lambda: accidents_of(label.instance, grid, labels="none")),
+        (ConfigError, "step", lambda: accidents_of(label.instance, grid, step=0)),
+        (GeometryError, "instances", lambda: accidents_of(label.instance[..., :9], grid)),
+    ):
+        with pytest.raises(error, match=words):
+            refused()
 
 
 NOBODY = BoxTruth(

@@ -2,25 +2,19 @@
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
+from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.evaluation.metrics.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
     DetectionEvaluator,
-    detection_truth,
     nuscenes_summary,
-    released_dict,
-    released_text,
 )
-from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 SIZE = (4.0, 2.0, 1.5)
 PROTOCOLS = sorted(DETECTION_PROTOCOLS)
@@ -75,14 +69,6 @@ def test_the_released_code_gives_perfect_predictions_less_than_100() -> None:
     result = evaluated("released", (perfect(truth), truth)).compute()
     assert result.average_precision[0, 0].tolist() == pytest.approx([100 * 35 / 36] * 4)
     assert result.errors[0].tolist() == pytest.approx([1 / 36] * 4)
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_nothing_predicted_scores_0(protocol: str) -> None:
-    result = evaluated(protocol, (found_at(), truth_at((10, 0)))).compute()
-    assert result.class_average_precision[result.classes[0]] == 0
-    assert result.mean_average_precision == 0
-    assert result.truths[0].sum() == 1
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -249,43 +235,9 @@ def test_classes_that_are_nowhere() -> None:
     assert counted.mean_average_precision == pytest.approx(left_out.mean_average_precision / 6)
 
 
-def test_the_released_names_and_text() -> None:
-    names = list(released_dict(two_samples().compute()))
-    assert names[:2] == ["CARLA/car_3D_average_distance_mAP", "CARLA/car_mATE"]
-    assert released_text(two_samples("released_iou").compute()).count("IOU matching threshold") == 12
-    with pytest.raises(ChoiceError, match="no report of 1 ranges and 3 thresholds"):
-        released_text(two_samples("paper").compute())
+def test_a_summary_is_of_one_range() -> None:
     with pytest.raises(ChoiceError, match="of one range"):
         nuscenes_summary(two_samples("released_iou").compute())
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_saved_counts_go_on(protocol: str, tmp_path: Path) -> None:
-    whole = two_samples(protocol)
-    whole.save(tmp_path / "counts.json")
-    again = DetectionEvaluator(protocol).resume(tmp_path / "counts.json")
-    assert again.counts == whole.counts
-    assert again.merge(whole).compute().as_dict() == whole.compute().as_dict()
-    assert again.repeated == whole.tokens
-    with pytest.raises(EvaluationError, match="other settings"):
-        DetectionEvaluator(protocol, thresholds=(0.25,), error_threshold=None, small_thresholds=None).resume(
-            tmp_path / "counts.json"
-        )
-
-
-def test_what_intervals_are_drawn_of() -> None:
-    numbers = numbers_of(two_samples().compute())
-    assert set(numbers) == {
-        "mean_average_precision",
-        *(f"class_average_precision/{name}" for name in CATEGORIES),
-        *(f"mean_errors/{name}" for name in ("ATE", "ASE", "AOE", "AVE")),
-    }
-
-
-def test_a_sample_with_two_results_is_an_error() -> None:
-    evaluator = two_samples()
-    with pytest.raises(EvaluationError, match="evaluated twice"):
-        evaluator.update("s/ego_vehicle/000", found_at(), truth_at((1, 1)))
 
 
 def test_boxes_of_another_frame_are_refused() -> None:
@@ -302,12 +254,3 @@ def test_detected_boxes_are_checked_and_read_only() -> None:
     with pytest.raises(ValueError, match="read-only"):
         detected.scores[0] = 1
     assert len(detected) == 1
-
-
-@pytest.mark.parametrize("protocol", ["paper", "opencood"])
-def test_the_truth_of_a_release_scores_100(da: DeepAccident, protocol: str) -> None:
-    evaluator = DetectionEvaluator(protocol)
-    for sample in da.sample[:20]:
-        truth = detection_truth(da, sample, protocol)
-        evaluator.update(sample["token"], DetectedBoxes(boxes=truth, scores=np.ones(len(truth))), truth)
-    assert evaluator.compute().mean_average_precision == 100

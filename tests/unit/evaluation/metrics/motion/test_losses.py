@@ -7,8 +7,7 @@ from accident_scenes import scene, standing
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading, accident_of
-from deepaccident_devkit.evaluation.metrics.motion.losses import LostInstance, lost_instances
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_counts
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import LostInstance, lost_instances, vpq_counts
 from deepaccident_devkit.motion import MotionHeads, MotionLabels, predict_instances
 
 

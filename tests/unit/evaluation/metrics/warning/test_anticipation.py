@@ -15,8 +15,7 @@ from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context
 from deepaccident_devkit.evaluation.metrics.alarms import truth
 from deepaccident_devkit.evaluation.metrics.alarms.truth import constant_velocity_alarms
-from deepaccident_devkit.evaluation.metrics.headlines import headlines
-from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
+from deepaccident_devkit.evaluation.metrics.numbers import headlines, numbers_of
 from deepaccident_devkit.evaluation.metrics.warning import (
     AnticipationResult,
     CleanScores,
@@ -362,11 +361,6 @@ def test_results_are_as_json_holds_them() -> None:
     result = evaluated(skilled(1), pairs=3).compute()
     assert isinstance(result, AnticipationResult)
     assert result.as_dict()["groups"]["ego_involved"]["recordings"] == {"accident": 3, "twins": 3, "others": 0}
-
-
-def test_settings_are_the_protocols_choices() -> None:
-    assert WarningEvaluator().settings == {"scores_of": "pair", "threshold": None}
-    assert WarningEvaluator("field").settings == {}
 
 
 def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,16 +1,11 @@
 """The cost of false alarms: runs, seconds of braking, and alarms that outlast the reaction."""
 
-import math
-
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from deepaccident_devkit.errors import ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.metrics.warning import false_alarm_cost
-from deepaccident_devkit.evaluation.metrics.warning.cost import AlarmRuns
+from deepaccident_devkit.evaluation.metrics.warning.recordings import AlarmRuns
 
 ALARMS = arrays(bool, st.tuples(st.integers(0, 4), st.integers(0, 9)))
 ROWS = np.array([[1, 1, 0, 1, 1, 1], [0, 0, 0, 0, 0, 0], [1, 0, 1, 0, 1, 1]]) > 0
@@ -45,26 +40,3 @@ def test_fewer_alarms_never_cost_more(alarm: np.ndarray, other: np.ndarray, reac
     if alarm.shape == other.shape:
         fewer = AlarmRuns.of(alarm & other, 2.0).braking_seconds(reaction)
         assert (fewer <= AlarmRuns.of(alarm, 2.0).braking_seconds(reaction)).all()
-
-
-def test_frames_that_are_missing_count_for_nothing() -> None:
-    there = np.ones_like(ROWS)
-    there[1, 2:] = False
-    found = false_alarm_cost(ROWS, 0.5, fps=2.0, frames=there)
-    assert (found.episodes, found.alarm_seconds, found.time_share) == (5, 4.5, 9 / 14)
-    assert found.braking_seconds_per_minute == pytest.approx(2.0 * 60 / 7)
-    nothing = false_alarm_cost(ROWS[:0], 0.5)
-    assert (nothing.episodes, nothing.braking_seconds) == (0, 0.0)
-    assert math.isnan(nothing.time_share)
-    assert math.isnan(nothing.braking_seconds_per_minute)
-
-
-def test_what_is_no_alarm_is_refused() -> None:
-    with pytest.raises(EvaluationError, match=r"expected shape \(N, T\) each, found \(6,\) and \(6,\)"):
-        false_alarm_cost(ROWS[0], 1.0)
-    with pytest.raises(EvaluationError, match="alarms at frames that are there alone"):
-        false_alarm_cost(ROWS, 1.0, frames=~ROWS)
-    with pytest.raises(ConfigError, match="seconds from 0 and a rate above 0, found -1 and 10"):
-        false_alarm_cost(ROWS, -1)
-    with pytest.raises(ConfigError, match=r"found 1\.0 and 0"):
-        false_alarm_cost(ROWS, 1.0, fps=0)

@@ -1,7 +1,5 @@
 """Warnings: what samples add, by hand-made ones with known answers, and what a synthetic release knows of them."""
 
-import json
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context, box_truth
-from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningEvaluator
+from deepaccident_devkit.evaluation.metrics.warning import WarningEvaluator
 
 PAIR = (11, 22)
 MEETING = np.array([[20.0, 10.0], [16.0, 10.0]])
@@ -109,31 +107,6 @@ def test_maps_are_one_alarm_as_sure_as_the_share_of_them_that_see_it() -> None:
     hit, calm = scene(cars), scene({1: standing(20, 10)})
     for output in (as_maps(calm, hit), as_heads(hit, calm)):
         assert counted(output, context(41), hit)["alarms"] == [[0.5, 1]]
-
-
-@pytest.mark.parametrize("protocol", WARNING_PROTOCOLS)
-def test_results_can_be_copied_merged_written_and_resumed(protocol, tmp_path) -> None:
-    def evaluated(kinds):
-        evaluator = WarningEvaluator(protocol)
-        for kind in kinds:
-            for frame in range(1, LAST + 1, 5):
-                raised = [replace(RIGHT, score=0.5)] if frame > 40 and kind == "accident" else []
-                evaluator.update(f"t/{kind}/ego_vehicle/{frame:03d}", raised, None, context(frame, kind))
-        return evaluator
-
-    evaluator = evaluated(["accident", "others"])
-    made = evaluator.compute()
-    assert bits(pickle.loads(pickle.dumps(made))) == bits(made)
-    json.dumps(made.as_dict(), allow_nan=False)
-    assert bits(evaluated(["others"]).merge(evaluated(["accident"])).compute()) == bits(made)
-    assert bits(WarningEvaluator(protocol).resume(evaluator.save(tmp_path / "w.json")).compute()) == bits(made)
-    empty = WarningEvaluator(protocol).compute()
-    assert (empty.samples, empty.beyond) == (0, 0)
-    json.dumps(empty.as_dict(), allow_nan=False)
-
-
-def bits(made) -> str:
-    return json.dumps(made.as_dict(), sort_keys=True)
 
 
 def test_other_protocols_are_refused() -> None:
