@@ -8,8 +8,10 @@ The parts, lowest layer first: `model` (the fields), `yaml_nodes`, `choices`, `r
 from deepaccident_devkit.synth.spec.catalogue import (
     DESIGN_NUMBERS,
     DESIGNS,
+    SpecTemplate,
     design_text,
     designs_text,
+    draw,
     field_tables,
     parse_spec,
     read_spec,
@@ -22,7 +24,6 @@ from deepaccident_devkit.synth.spec.model import (
     ScenarioSpec,
     View,
 )
-from deepaccident_devkit.synth.spec.template import SpecTemplate, draw
 
 __all__ = [
     "DESIGNS",

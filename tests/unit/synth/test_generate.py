@@ -10,10 +10,10 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.release import find_release, read_calib, read_image, read_label, read_meta, read_split_file
 from deepaccident_devkit.synth import SynthConfig, generate, make_release, recording
+from deepaccident_devkit.synth.generate import Unfinished
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob, _Recorder, parts_of, record_scenario
 from deepaccident_devkit.synth.scenario import build_scenario
-from deepaccident_devkit.synth.unfinished import Unfinished
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CHANNELS, LIDAR, MINI_SPLITS, SPLITS
 from deepaccident_devkit.validation import release_completeness, validate_release
 

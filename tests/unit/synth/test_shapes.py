@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.bodies import MEDIAN_SIZES, random_body
+from deepaccident_devkit.synth.actors import MEDIAN_SIZES, random_body
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE, INSET, LAMP, MODELS, TAIL, shape_of
 from deepaccident_devkit.synth.solids import face_corners, face_planes
 from deepaccident_devkit.taxonomy import CATEGORIES

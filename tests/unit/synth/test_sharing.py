@@ -11,7 +11,7 @@ import pytest
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import temporary_path
 from deepaccident_devkit.synth import SynthConfig, generate, make_release
-from deepaccident_devkit.synth.unfinished import Unfinished
+from deepaccident_devkit.synth.generate import Unfinished
 
 CONFIG = SynthConfig(scenarios=3, frames=2, sensors=False, seed=7)
 

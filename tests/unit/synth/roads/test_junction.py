@@ -8,7 +8,7 @@ import pytest
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Hump, Junction, RoadSpec
 from deepaccident_devkit.synth.roads.junction import REACH
-from deepaccident_devkit.synth.roads.terrain import OUTWARD
+from deepaccident_devkit.synth.roads.layout import OUTWARD
 
 HALF_TRUCK = 1.45
 

@@ -5,7 +5,7 @@ import pytest
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ARMS, Hump, Terrain
-from deepaccident_devkit.synth.roads.terrain import EXTENT, OUTWARD
+from deepaccident_devkit.synth.roads.layout import EXTENT, OUTWARD
 
 SLOPED = {arm: Terrain(Hump(arm=arm, distance=55.0, height=2.0, length=60.0)) for arm in ARMS}
 

@@ -6,10 +6,10 @@ import pytest
 
 from deepaccident_devkit.synth.roads import MAP_CELLS, MAP_RESOLUTION
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING
-from deepaccident_devkit.synth.sensors.images.buffers import look, ray_directions, slopes
-from deepaccident_devkit.synth.sensors.images.facades import facades_of, on_facades
-from deepaccident_devkit.synth.sensors.images.light import light_of, make_sky
-from deepaccident_devkit.synth.sensors.images.shadows import add_shadows, wall_shadows
+from deepaccident_devkit.synth.sensors.light import light_of, make_sky
+from deepaccident_devkit.synth.sensors.paint import facades_of, on_facades
+from deepaccident_devkit.synth.sensors.render import look, ray_directions, slopes
+from deepaccident_devkit.synth.sensors.shadows import add_shadows, wall_shadows
 from deepaccident_devkit.synth.solids import FACES_A_SOLID, FRONT, REAR, Block, build
 from deepaccident_devkit.taxonomy import TIMES_OF_DAY, WEATHERS
 

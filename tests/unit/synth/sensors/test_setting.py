@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.sensors.images.buffers import ray_directions as camera_rays
-from deepaccident_devkit.synth.sensors.images.buffers import slopes
 from deepaccident_devkit.synth.sensors.lidar import AZIMUTHS, CHANNELS, turned_rays
+from deepaccident_devkit.synth.sensors.render import ray_directions as camera_rays
+from deepaccident_devkit.synth.sensors.render import slopes
 
 KINDS = ("lidar", "camera")
 

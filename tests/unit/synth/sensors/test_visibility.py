@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.synth.sensors.images.buffers import look, ray_directions, slopes
-from deepaccident_devkit.synth.sensors.visibility import CLOSE, Views, camera_visible, nearest_movers, rectangles
+from deepaccident_devkit.synth.sensors.annotate import CLOSE, Views, camera_visible, nearest_movers, rectangles
+from deepaccident_devkit.synth.sensors.render import look, ray_directions, slopes
 from deepaccident_devkit.synth.solids import Block
 
 SIZE, SLOPE = (400, 200), np.array([0.004, 0.004])

@@ -5,7 +5,7 @@ import pytest
 
 from deepaccident_devkit.synth.roads import SIDEWALK, Junction, RoadSpec
 from deepaccident_devkit.synth.solids import build
-from deepaccident_devkit.synth.stage.furniture import lanterns, signal_head, traffic_light, yield_sign
+from deepaccident_devkit.synth.stage.props import lanterns, signal_head, traffic_light, yield_sign
 
 
 def middle(prop):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.traffic.following import (
+from deepaccident_devkit.synth.traffic.driving import (
     Temper,
     can_stop,
     free_acceleration,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.traffic.kinematics import MAX_STEER, MAX_STEER_RATE, PERIOD
+from deepaccident_devkit.synth.traffic.driving import MAX_STEER, MAX_STEER_RATE, PERIOD
 from deepaccident_devkit.synth.traffic.simulate import simulate
 
 

@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.traffic.kinematics import Tracks
-from deepaccident_devkit.synth.traffic.perception import Alarm, Bodies, leaders
+from deepaccident_devkit.synth.traffic.driving import Tracks
 from deepaccident_devkit.synth.traffic.rights import find_rights
-from deepaccident_devkit.synth.traffic.simulate import simulate
+from deepaccident_devkit.synth.traffic.simulate import Alarm, Bodies, leaders, simulate
 
 SEES = ~np.eye(2, dtype=bool)
 

@@ -1,7 +1,6 @@
 import numpy as np
 
-from deepaccident_devkit.synth.traffic.rights import find_rights
-from deepaccident_devkit.synth.traffic.signals import AMBER, GREEN, RED, SignalPlan, plan_with_green
+from deepaccident_devkit.synth.traffic.rights import AMBER, GREEN, RED, SignalPlan, find_rights, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import simulate
 
 PLAN = SignalPlan(first="west-east", start=0.0, green=10.0)
