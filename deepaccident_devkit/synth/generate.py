@@ -1,4 +1,7 @@
-"""Making a synthetic release, in a folder beside its place, so that a later call can continue after an interruption."""
+"""Making a synthetic release, in a folder beside its place, so that a later call can continue after an interruption.
+
+Several processes and hosts may record parts of its scenarios at once. One that has the folder alone puts them together.
+"""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["MotionMaps", "SeparateDecoders", "SharedDecoder"]
 
 _CHANNELS: Final = {"segmentation": 2, "instance_center": 1, "instance_offset": 2, "instance_flow": 2}
 _RARE: Final = -2.19

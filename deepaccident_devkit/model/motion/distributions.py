@@ -15,7 +15,6 @@ from torch.nn import functional
 
 from deepaccident_devkit.errors import GeometryError
 
-__all__ = ["LatentDistribution", "SpatialDistribution"]
 
 
 class LatentDistribution(NamedTuple):

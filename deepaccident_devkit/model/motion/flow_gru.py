@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["HIDDEN_WARPS", "FlowGru", "HiddenWarp", "warp_with_flow"]
 
 HiddenWarp = Literal["none", "warped"]
 HIDDEN_WARPS: Final[tuple[HiddenWarp, ...]] = ("none", "warped")

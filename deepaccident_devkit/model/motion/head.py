@@ -23,7 +23,6 @@ from deepaccident_devkit.model.motion.labels import (
 )
 from deepaccident_devkit.text import settle_choices
 
-__all__ = ["MotionHead", "MotionHeadConfig", "MotionOutputs"]
 
 Decoders = Literal["separate", "shared"]
 _DECODERS: Final[tuple[Decoders, ...]] = ("separate", "shared")

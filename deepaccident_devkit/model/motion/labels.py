@@ -7,7 +7,6 @@ from typing import Final, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["IGNORE_INDEX", "LABEL_CHANNELS", "POSTERIOR_IGNORES", "MotionTargets", "PosteriorIgnore", "frame_mask"]
 
 IGNORE_INDEX: Final = 255
 """What offset and flow have outside instances (`motion.MotionLabelConfig.ignore_index`)."""

@@ -14,7 +14,6 @@ from deepaccident_devkit.model.motion.distributions import LatentDistribution
 from deepaccident_devkit.model.motion.head import MotionOutputs
 from deepaccident_devkit.model.motion.labels import IGNORE_INDEX, MotionTargets
 
-__all__ = ["MotionLossConfig", "center_loss", "latent_loss", "motion_losses", "segmentation_loss", "vector_loss"]
 
 _CLIP: Final = 1e-4
 """Probabilities of a centre stay so far from 0 and 1."""

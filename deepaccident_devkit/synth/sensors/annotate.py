@@ -1,4 +1,8 @@
-"""Labels: the label file of an agent for a scene, and which road users its cameras see."""
+"""Labels: the label file of an agent for a scene, and which road users its cameras see.
+
+The result depends neither on the size of the images nor on whether images are made. For every road user, rays through
+the pixels of a `WIDTH` × `HEIGHT` picture are cast; if it fills much of the picture, through fewer of them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,8 @@
-"""The cameras' pictures: what each pixel shows, and its colour in the light of the scenario."""
+"""The cameras' pictures: what each pixel shows, and its colour in the light of the scenario.
+
+The pixels between two that show the same flat face show this face too, and the inverse of its depth changes linearly.
+On outlines, two rays are cast for each pixel, and its colour is their mean.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,8 @@
-"""What a scenario file can say: the parts of a scenario to simulate, and their open choices."""
+"""What a scenario file can say: the parts of a scenario to simulate, and their open choices.
+
+`spec.draw` draws one value from each range and from each list of choices in a file. A field's name is its key in the
+file, except that `from_arm` is written `from`.
+"""
 
 from __future__ import annotations
 

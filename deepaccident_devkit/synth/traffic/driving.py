@@ -1,4 +1,7 @@
-"""How wheels move a body along its path, and how fast to drive: the bicycle model and the intelligent driver model."""
+"""How wheels move a body along its path, and how fast to drive: the bicycle model and the intelligent driver model.
+
+The paths of all road users are in one table, so that one look-up serves all of them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
