@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays
-from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.synth.roads.layout import EXTENT, LANE_WIDTH, OUTWARD, Arm, RoadSpec, slot_edges
 
 MAP_EXTENT = EXTENT

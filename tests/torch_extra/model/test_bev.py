@@ -43,11 +43,6 @@ def test_beyond_the_source_features_fade_to_zero_within_half_a_cell() -> None:
     assert (found[abs(beyond) < 0.1] > 0.1).all()
 
 
-def test_between_equal_grids_nothing_is_sampled() -> None:
-    features = torch.rand(2, 3, *SOURCE.shape)
-    assert crop(features, SOURCE, SOURCE) is features
-
-
 def test_half_precision_features_are_sampled_at_the_same_places() -> None:
     source, target = BevGrid((-51.2, 51.2, 0.8), (-51.2, 51.2, 0.8)), BevGrid()
     features = torch.rand(1, 2, *source.shape).bfloat16()

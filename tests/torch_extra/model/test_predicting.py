@@ -24,13 +24,17 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.metrics.motion.protocol import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
-from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.detection import TaskMaps, detection_targets
 from deepaccident_devkit.model.entry import mirrored_boxes
 from deepaccident_devkit.model.motion import MotionMaps
-from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.predicting import PredictConfig, SamplePrediction, motion_output, predictions
-from deepaccident_devkit.model.results import predict_results
+from deepaccident_devkit.model.network import ModelConfig, V2XFormer
+from deepaccident_devkit.model.results import (
+    PredictConfig,
+    SamplePrediction,
+    motion_output,
+    predict_results,
+    predictions,
+)
 from deepaccident_devkit.motion import MotionHeads, motion_labels
 from deepaccident_devkit.v2x import Link
 

@@ -374,14 +374,6 @@ def test_the_first_fault_among_many_boxes_is_named(write, line: int, ends: str) 
         read_label(write(ends.join([*lines, "bus 2"])))
 
 
-def test_200_000_boxes(write) -> None:
-    """A second; a walk over their words would take ten."""
-    lines = [HEADER, *[PARKED] * 200_000]
-    assert len(read_label(write("\r\n".join(lines)))) == 200_000
-    with pytest.raises(LabelError, match=r"label\.txt:200002: expected 13 fields, found 2"):
-        read_label(write("\n".join([*lines, "car 1"])))
-
-
 def test_words_alone_on_a_line_are_told(write) -> None:
     assert read_lone_words(write(REAL)) == []
     text = f"one\n{HEADER}\n\n{PARKED}\n two \n{OWN}\ncar"

@@ -2,7 +2,6 @@
 
 import shutil
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -133,13 +132,6 @@ def test_what_broke_off_goes_on(out, unfinished, whole, digests, recorded, stop_
 def test_a_call_that_makes_nothing_leaves_nothing(out, stop_at):
     stop_at(out, 0)
     assert list(out.parent.iterdir()) == []
-
-
-def test_another_configuration_is_refused(out, unfinished, stop_at):
-    stop_at(out, 1)
-    with pytest.raises(ConfigError, match=r"another configuration \(seed: 7 there, 8 asked for\)"):
-        make(out, replace(CONFIG, seed=8))
-    assert len(list((unfinished.folder / "kept").iterdir())) == 1
 
 
 def test_a_worker_whose_caller_was_stopped_marks_nothing_in_what_comes_later(unfinished):

@@ -14,15 +14,6 @@ def grid(n=4000, seed=0):
     return np.random.default_rng(seed).uniform(-EXTENT, EXTENT, (n, 2))
 
 
-def test_flat_ground_is_two_triangles_at_0():
-    flat = Terrain()
-    assert flat.is_flat
-    np.testing.assert_array_equal(flat.height(grid()), 0)
-    np.testing.assert_array_equal(flat.normal(grid()), np.tile([0.0, 0.0, 1.0], (4000, 1)))
-    assert flat.triangles().shape == (2, 3, 3)
-    assert Terrain(Hump(height=0.0)).is_flat
-
-
 @pytest.mark.parametrize("arm", ARMS)
 def test_the_crest_is_where_it_should_be_and_all_else_is_flat(arm):
     terrain, out = SLOPED[arm], np.array(OUTWARD[arm])

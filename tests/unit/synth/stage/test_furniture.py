@@ -5,7 +5,7 @@ import pytest
 
 from deepaccident_devkit.synth.roads import SIDEWALK, Junction, RoadSpec
 from deepaccident_devkit.synth.solids import build
-from deepaccident_devkit.synth.stage.props import lanterns, signal_head, traffic_light, yield_sign
+from deepaccident_devkit.synth.stage.props import traffic_light, yield_sign
 
 
 def middle(prop):
@@ -39,23 +39,3 @@ def test_a_sign_shows_its_face_to_who_comes():
         rim = build(yield_sign(RoadSpec(signalized=False), arm).blocks[-2:-1]).corners[0]
         outward = {"west": -1, "north": 1}[arm]
         assert (outward * face[:, axis]).max() > (outward * rim[:, axis]).max()
-
-
-def test_the_rows_of_a_head_are_its_lamps():
-    light = traffic_light(RoadSpec(), "south")
-    head = signal_head("south", light, first_row=40)
-    assert head.rows == (42, 43, 44)
-    assert head.yaw == -np.pi / 2
-    heights = [np.mean(light.blocks[row - 40].z) for row in head.rows]
-    assert heights == sorted(heights, reverse=True)
-    assert head.position[2] == pytest.approx(heights[1])
-
-
-def test_lanterns_stand_behind_the_kerb_on_both_sides():
-    spec = RoadSpec(lanes=2)
-    junction, places = Junction(spec), np.array([middle(each) for each in lanterns(spec)])
-    assert (junction.ground_map().at(places) == SIDEWALK).all()
-    assert len(places) >= 12
-    east = places[places[:, 0] > 30]
-    assert (east[:, 1] > 0).any()
-    assert (east[:, 1] < 0).any()
