@@ -8,15 +8,21 @@ from itertools import combinations
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.geometry.footprints import gaps
 from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release import Collision, Meta
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import (
     CATEGORIES,
+    DIRECTIONS,
     META_AGENTS,
+    ROAD_TYPES,
+    SPAWN_SIDES,
     UNTRACKED_ID,
     VEHICLE_AGENTS,
+    WEATHERS,
 )
+from deepaccident_devkit.v2x.accident_visibility import SHEER_CURTAINS
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.validation.subject import Subject, actors_text, frames_text, near_pairs
 
@@ -183,11 +189,6 @@ def _wrapped(angle: FloatArray) -> FloatArray:
     return np.arctan2(np.sin(angle), np.cos(angle))
 
 
-WEATHERS = ("Clear", "Cloudy", "HardRain", "MidRain", "SoftRain", "Wet", "WetCloudy")
-ROAD_TYPES = ("four-way junction", "three-way junction")
-SPAWN_SIDES = ("left", "right", "opposite")
-DIRECTIONS = ("straight", "left", "right")
-SHEER_CURTAINS = ("Town05_type001_subtype0002_scenario00035", "Town05_type001_subtype0002_scenario00004")
 COLLIDING_NORMAL = ("Town07_type001_subtype0002_scenario00028",)
 """Scenarios of the release's _normal folders whose meta names a collision."""
 
@@ -296,30 +297,18 @@ def pair_gap(subject: Subject, collision: Collision) -> float | None:
 
     Of an actor that several agents annotated, the two boxes that are nearest count; each agent's first.
     """
-    from shapely import distance, polygons
-
     last = subject.boxes.frame == subject.num_frames
     rows = [np.flatnonzero(last & (subject.boxes.actor == actor)) for actor in collision.ids]
     rows = [found[np.unique(subject.boxes.agent[found], return_index=True)[1]] for found in rows]
     if UNTRACKED_ID in collision.ids or not all(len(found) for found in rows):
         return None
-    first, second = (np.asarray(polygons(_footprints(subject, found))) for found in rows)
-    return float(np.min(distance(first[:, None], second[None])))
+    first, second = (_footprints(subject, found) for found in rows)
+    return float(gaps(first, second).min())
 
 
 def _footprints(subject: Subject, rows: IntArray) -> FloatArray:
-    """(M, 4, 2) corners in world, metres."""
-    length, width = subject.boxes.labels.size[rows, 0], subject.boxes.labels.size[rows, 1]
-    yaw = subject.yaw[rows]
-    signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) / 2
-    along = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
-    across = np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
-    corners: FloatArray = (
-        subject.centers[rows, None, :2]
-        + signs[None, :, :1] * (length[:, None] * along)[:, None]
-        + signs[None, :, 1:] * (width[:, None] * across)[:, None]
-    )
-    return corners
+    """(M, 5) boxes in world from above: x, y, length, width, yaw."""
+    return np.column_stack([subject.centers[rows, :2], subject.boxes.labels.size[rows, :2], subject.yaw[rows]])
 
 
 def _at_meta(subject: Subject, code: str, what: str) -> Finding:
