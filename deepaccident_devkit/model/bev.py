@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
@@ -201,6 +202,4 @@ def _check_sizes(config: BevEncodeConfig | BevUNetConfig, stages: int) -> None:
     if len(config.widths) != stages or min(config.widths) < 1:
         expected = f"the channels of {stages} stages, such as {(32, 64, 128)[:stages]}"
         raise ConfigError(f"widths: expected {expected}, found {config.widths!r}")
-    for name in ("in_channels", "out_channels"):
-        if getattr(config, name) < 1:
-            raise ConfigError(f"{name}: expected at least one channel, found {getattr(config, name)!r}")
+    check_least(config, in_channels=1, out_channels=1)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, check_least
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.geometry import SE3
@@ -46,12 +46,9 @@ class NmsConfig:
     def __post_init__(self) -> None:
         """Check; raises ConfigError or ChoiceError."""
         settle_choices(self, {"method": get_args(Method)})
-        if not self.threshold >= 0:
-            raise ConfigError(f"threshold: expected a number from 0, found {self.threshold!r}")
+        check_least(self, threshold=0, keep=1)
         if not self.scale or not min(self.scale) > 0:
             raise ConfigError(f"scale: expected one number above 0, or one a slot, found {self.scale!r}")
-        if self.keep < 1:
-            raise ConfigError(f"keep: expected a whole number from 1, found {self.keep!r}")
 
 
 RELEASED_NMS: tuple[NmsConfig, ...] = (
@@ -144,8 +141,7 @@ class DecodingConfig:
 
     def __post_init__(self) -> None:
         """Check; raises ConfigError."""
-        if self.candidates < 1:
-            raise ConfigError(f"candidates: expected a whole number from 1, found {self.candidates!r}")
+        check_least(self, candidates=1)
         if not all(low < high for low, high in zip(self.center_range[:3], self.center_range[3:], strict=True)):
             raise ConfigError(f"center_range: expected least x, y, z, then greatest, found {self.center_range!r}")
         if not self.nms:

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
+from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.detection.head import CODE_CHANNELS, CODE_SIZE, DetectionConfig, TaskMaps
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -83,9 +84,7 @@ class TargetConfig:
         settle_choices(self, {"unknown_velocity": get_args(UnknownVelocity)})
         if not 0 < self.min_overlap < 1:
             raise ConfigError(f"min_overlap: expected a number between 0 and 1, found {self.min_overlap!r}")
-        for name, least in (("min_radius", 0), ("max_boxes", 1)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: expected a whole number from {least}, found {getattr(self, name)!r}")
+        check_least(self, min_radius=0, max_boxes=1)
 
 
 class TaskTargets(NamedTuple):
@@ -234,9 +233,7 @@ class DetectionLossConfig:
 
     def __post_init__(self) -> None:
         """Check; raises ConfigError."""
-        for name in ("weight", "box_weight"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name}: expected a number from 0, found {getattr(self, name)!r}")
+        check_least(self, weight=0, box_weight=0)
 
 
 def detection_losses(

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.model.motion.decoders import (
     HIDDEN_WARPS,
@@ -85,7 +86,6 @@ def frame_mask(label_valid: Tensor, past_valid: Tensor) -> Tensor:
 
 Decoders = Literal["separate", "shared"]
 _DECODERS: Final[tuple[Decoders, ...]] = ("separate", "shared")
-_LEAST: Final = {"in_channels": 2, "latent": 1, "future_frames": 1, "samples": 0, "hidden": 1, "upsample": 1}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,9 +125,7 @@ class MotionHeadConfig:
         """Check the values; raises ConfigError."""
         words = {"decoders": _DECODERS, "posterior_ignore": POSTERIOR_IGNORES, "hidden_warp": HIDDEN_WARPS}
         settle_choices(self, words, error=ConfigError)
-        for name, least in _LEAST.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: expected at least {least}, found {getattr(self, name)!r}")
+        check_least(self, in_channels=2, latent=1, future_frames=1, samples=0, hidden=1, upsample=1)
         if not self.log_sigma[0] < self.log_sigma[1]:
             raise ConfigError(f"log_sigma: expected the smaller limit first, such as (-5, 5), found {self.log_sigma!r}")
         if self.decoders == "separate" and self.upsample != 1:

@@ -78,8 +78,8 @@ def test_the_small_encoder_takes_odd_sizes() -> None:
     [
         (BevEncodeConfig, {"widths": (8, 16)}, r"channels of 3 stages, such as \(32, 64, 128\), found \(8, 16\)"),
         (BevUNetConfig, {"widths": (8, 0)}, r"channels of 2 stages, such as \(32, 64\), found \(8, 0\)"),
-        (BevEncodeConfig, {"out_channels": 0}, "out_channels: expected at least one channel, found 0"),
-        (BevUNetConfig, {"in_channels": -1}, "in_channels: expected at least one channel, found -1"),
+        (BevEncodeConfig, {"out_channels": 0}, "out_channels: expected a number from 1, found 0"),
+        (BevUNetConfig, {"in_channels": -1}, "in_channels: expected a number from 1, found -1"),
     ],
 )
 def test_impossible_sizes_are_refused(config, values, message) -> None:

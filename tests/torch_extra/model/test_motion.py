@@ -264,7 +264,7 @@ def test_what_does_not_fit_is_refused() -> None:
         (MotionHeadConfig, {"hidden_warp": "moved"}, "hidden_warp: expected one of none, warped, found 'moved'"),
         (MotionHeadConfig, {"posterior_ignore": "drop"}, "posterior_ignore: expected one of keep, zero, found 'drop'"),
         (MotionHeadConfig, {"decoders": "none"}, "decoders: expected one of separate, shared, found 'none'"),
-        (MotionHeadConfig, {"latent": 0}, "latent: expected at least 1, found 0"),
+        (MotionHeadConfig, {"latent": 0}, "latent: expected a number from 1, found 0"),
         (MotionHeadConfig, {"log_sigma": (5, -5)}, r"smaller limit first, such as \(-5, 5\), found \(5, -5\)"),
         (MotionHeadConfig, {"upsample": 2}, "separate decoders keep the states' resolution, found 2; choose 1, or"),
         (MotionLossConfig, {"top_k": 0}, "top_k: expected a share above 0 and at most 1, found 0"),

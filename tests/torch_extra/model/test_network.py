@@ -16,7 +16,6 @@ from deepaccident_devkit.model.fusion import ReleasedFusionConfig
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.presets import fusion_config
 from deepaccident_devkit.taxonomy import ModelFusion
-from deepaccident_devkit.v2x import Link
 
 Seeded = Callable[..., V2XFormer]
 Predicted = Callable[..., list[torch.Tensor]]
@@ -156,27 +155,6 @@ def test_all_egos_of_a_partial_release_are_each_by_itself(
     for row, token in enumerate(item["egos"]):
         own = predicted(model, model_inputs(collate([alone(da_partial, token, config, "available")])))
         assert_same([each[row : row + 1] for each in together], own)
-
-
-def test_lost_messages_change_nothing_else(
-    da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
-) -> None:
-    model = seeded(config)
-    single = predicted(model, model_inputs(collate([alone(da, moment[0], config, "single")])))
-    every = alone(da, moment[0], config, "all", link=Link(packet_loss=1.0))
-    assert every["agent_valid"][:, -1].tolist() == [True, False, False, False, False]
-    assert_same(predicted(model, model_inputs(collate([every]))), single)
-    draws = (alone(da, moment[0], config, "all", link=Link(packet_loss=0.4, seed=seed)) for seed in range(20))
-    some = next(each for each in draws if partly_heard(each["agent_valid"]))
-    heard = [name for name, valid in zip(some["agents"], some["agent_valid"][:, -1], strict=True) if valid]
-    chosen = alone(da, moment[0], config, heard[1:])
-    assert_same(*(predicted(model, model_inputs(collate([each]))) for each in (some, chosen)))
-
-
-def partly_heard(valid: torch.Tensor) -> bool:
-    """Whether some partners arrived with their past, and others did not."""
-    present = valid[1:, -1]
-    return 0 < int(present.sum()) < len(present) and bool(valid[1:, 0][present].all())
 
 
 def test_fusions_that_ask_know_kinds_and_delays(

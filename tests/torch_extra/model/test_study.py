@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.model.checkpoint import read_weights
 from deepaccident_devkit.model.presets import tiny
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
@@ -95,29 +94,6 @@ def test_hidden_actors_are_those_that_a_partner_alone_sees(numbers: ModuleType, 
         hidden, seen = hidden + int(scene.hidden.sum()), seen + int((~scene.hidden).sum())
     assert hidden
     assert seen
-
-
-def evaluated(numbers: ModuleType, found: list[int]) -> Any:
-    """A row that finds so many of the four hidden actors of each of some pairs."""
-    evaluator = numbers.HiddenActors()
-    for at, each in enumerate(found):
-        for kind in ("accident", "normal"):
-            counts = dict.fromkeys(numbers._COUNTED, 0) | {"hidden": 2, "hidden_foreground": each / 2, "cells": 1}
-            evaluator.add(f"type1_subtype1_{kind}/x{at}/ego_vehicle/005", counts)
-    return {"hidden": evaluator}
-
-
-def test_differences_are_of_the_same_pairs(numbers: ModuleType) -> None:
-    base, other = evaluated(numbers, [0, 1, 2, 0, 1, 2, 1, 0]), evaluated(numbers, [2, 2, 3, 1, 3, 4, 2, 1])
-    found = numbers.differences([base], [other], Resampling())["hidden_foreground"]
-    assert found["value"] == pytest.approx(11 / 32)
-    assert 0 < found["low"] < found["value"] < found["high"]
-    back = numbers.differences([other], [base], Resampling())["hidden_foreground"]
-    assert (back["value"], back["low"], back["high"]) == pytest.approx((-found["value"], -found["high"], -found["low"]))
-    pooled = numbers.differences([base, base], [other, other], Resampling())["hidden_foreground"]
-    assert pooled == pytest.approx(found)  # twice the same model is no more evidence
-    few = numbers.differences([evaluated(numbers, [0, 1])], [evaluated(numbers, [1, 2])], Resampling())
-    assert few["hidden_foreground"] == {"value": pytest.approx(1 / 4), "low": None, "high": None}
 
 
 def number(value: float | None = 1.5, low: float | None = None, high: float | None = None) -> dict[str, Any]:

@@ -94,14 +94,6 @@ def test_processes_share_each_epoch_and_go_on_in_its_middle(count: int, ranks: i
         assert rest[: max(length - first, 0)] == part[first:]
 
 
-def test_epochs_have_orders_of_their_own() -> None:
-    order = [number % 50 for number in islice(positions(50, TrainConfig(), first=0), 100)]
-    assert order[:50] != order[50:]
-    assert order[:50] != list(range(50))
-    other = [number % 50 for number in islice(positions(50, TrainConfig(seed=1), first=0), 50)]
-    assert order[:50] != other
-
-
 def test_each_step_draws_its_own_numbers() -> None:
     drawn = {
         float(torch.rand(1, generator=generator_of(*numbers), dtype=torch.float64))
@@ -151,12 +143,6 @@ def test_partners_are_dropped_but_never_the_ego(inputs: ModelInputs) -> None:
     assert torch.equal(everyone.partners, inputs.partners)
     for nobody in ({"partner_dropout": 1, "alone": 0}, {"partner_dropout": 0, "alone": 1}):
         assert torch.equal(with_dropped_partners(inputs, replace(config, **nobody), generator_of(0)).partners, egos)
-
-
-def test_partners_who_are_not_there_are_not_heard(inputs: ModelInputs) -> None:
-    absent = replace(inputs, partners=inputs.partners & (torch.arange(5) != 2))
-    kept = with_dropped_partners(absent, replace(RUN, partner_dropout=0, alone=0), generator_of(0))
-    assert not kept.partners[:, 2].any()
 
 
 def test_egos_are_drawn_from_every_moment(da: DeepAccident, moment: list[str], config: ModelConfig) -> None:

@@ -490,13 +490,6 @@ def test_all_arrays_are_read_back(arrays: Calibs, protocol: int, *, fortran: boo
         np.testing.assert_array_equal(read[key], array.astype(array.dtype.newbyteorder("=")), strict=True)
 
 
-def test_only_some_layouts_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pickles, "_layouts", [])
-    for number in range(100):
-        load_arrays(pickle.dumps({f"key {number}": np.zeros(8)}, 4))
-    assert len(pickles._layouts) == 16
-
-
 def outcome_of(content: bytes) -> Calibs | str:
     try:
         return load_arrays(content)

@@ -12,7 +12,7 @@ from deepaccident_devkit.release import find_release, read_calib, read_image, re
 from deepaccident_devkit.synth import SynthConfig, generate, make_release, recording
 from deepaccident_devkit.synth.generate import Unfinished
 from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.recording import RecordingJob, _Recorder, record_scenario
+from deepaccident_devkit.synth.recording import _Recorder, record_scenario
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CHANNELS, LIDAR, MINI_SPLITS, SPLITS
 from deepaccident_devkit.validation import release_completeness, validate_release
@@ -90,15 +90,6 @@ def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, digests):
     config = SynthConfig(scenarios=1, frames=4, image_size=(32, 18), seed=7)
     one, two, three = (digests(make_release(tmp_path / str(count), config, workers=count)) for count in (1, 2, 3))
     assert one == two == three
-
-
-def test_parts_of_any_number_make_the_same_scenario(tmp_path, digests):
-    config = SynthConfig(scenarios=1, frames=5, image_size=(32, 18), seed=7)
-    plan = plan_scenarios(config)[0]
-    for name, step in (("whole", 1), ("parts", 3)):
-        for first in range(1, step + 1):
-            record_scenario(RecordingJob(tmp_path / name, config, plan, first, step))
-    assert digests(tmp_path / "parts") == digests(tmp_path / "whole")
 
 
 @pytest.fixture

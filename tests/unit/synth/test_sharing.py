@@ -1,8 +1,7 @@
 """Releases made on executors and by several processes: the very bytes of one call, whatever was interrupted."""
 
 import shutil
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from multiprocessing import get_context
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -74,19 +73,6 @@ def test_an_executor_makes_the_same_bytes(out, whole, digests):
     with ThreadPoolExecutor(2) as executor:
         assert digests(make_release(out, CONFIG, executor=executor)) == whole
     assert [path.name for path in out.parent.iterdir()] == ["out"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["threads", "processes"])
-def test_an_executor_makes_the_same_images(tmp_path, release_root, config, digests, kind):
-    """Threads of one process are at several scenarios at once, and at several parts of one."""
-    pools = {
-        "threads": lambda: ThreadPoolExecutor(3),
-        "processes": lambda: ProcessPoolExecutor(2, mp_context=get_context("spawn")),
-    }
-    with pools[kind]() as executor:
-        made = make_release(tmp_path / "out", config, executor=executor)
-    assert digests(made) == digests(release_root)
 
 
 def test_several_calls_share_the_parts(out, whole, digests, recorded):
