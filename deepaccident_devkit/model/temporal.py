@@ -142,7 +142,6 @@ class TemporalConfig:
         chain: the order in which motions are multiplied (`poses.present_from_past`).
         egomotion_input: with a BEV augmentation A, the motion that the convolutions see: `augmented` is
             A · E · A⁻¹, as the maps move; `raw` is E, the released code's.
-        with_skip: `blocks` adds the present's own map to its result, as the released code does.
     """
 
     channels: int
@@ -152,7 +151,6 @@ class TemporalConfig:
     warp: WarpRule = "exact"
     chain: Chain = "exact"
     egomotion_input: EgomotionInput = "augmented"
-    with_skip: bool = True
 
     def __post_init__(self) -> None:
         """Check the numbers and words; raises ConfigError."""
@@ -212,8 +210,7 @@ class Temporal3D(nn.Module):
         motion = _motion_input(egomotion[:, :-1], bev_transform, self.config)
         motion = torch.cat([torch.zeros_like(motion[:, :1]), motion], 1)
         frames = torch.cat([warped, _as_maps(motion, warped)], 2)
-        result = self.model(_without_invalid(frames, valid).transpose(1, 2))[:, :, -1]
-        return result + present if self.config.with_skip else result
+        return self.model(_without_invalid(frames, valid).transpose(1, 2))[:, :, -1] + present
 
 
 class TemporalConcat(nn.Module):

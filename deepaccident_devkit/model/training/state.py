@@ -138,8 +138,8 @@ class Progress:
         best: the best score so far; None before the first validation.
     """
 
-    step: int = 0
-    best: float | None = None
+    step: Annotated[int, msgspec.Meta(ge=0)]
+    best: Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)] | None
 
 
 def save_state(folder: Path, model: nn.Module, optimizer: AdamW, progress: Progress, meta: Mapping[str, Any]) -> None:
@@ -149,13 +149,6 @@ def save_state(folder: Path, model: nn.Module, optimizer: AdamW, progress: Progr
         tensors |= {f"{OPTIMIZER}{number}.{name}": torch.as_tensor(each) for name, each in state.items()}
     noted = {**meta, "step": progress.step, "best": progress.best}
     write_weights(folder / LAST, tensors, noted)
-
-
-class _Noted(msgspec.Struct):
-    """What a checkpoint notes of `Progress`."""
-
-    step: Annotated[int, msgspec.Meta(ge=0)]
-    best: Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)] | None
 
 
 def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> Progress:
@@ -172,10 +165,10 @@ def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> 
     """
     path = folder / LAST
     if not (path.is_file() or path.is_dir()):
-        return Progress()
+        return Progress(step=0, best=None)
     weights = read_weights(path)
     try:
-        noted = as_record(weights.meta, _Noted)
+        noted = as_record(weights.meta, Progress)
         if noted.step > steps:
             raise ValueError(f"it has {noted.step} steps, and the run {steps}")
         states = _states(weights.tensors, model, optimizer)
@@ -188,7 +181,7 @@ def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> 
         ) from error
     model.load_state_dict({name: weights.tensors[name] for name in model.state_dict()})
     optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
-    return Progress(step=noted.step, best=noted.best)
+    return noted
 
 
 def _states(tensors: Mapping[str, Tensor], model: nn.Module, optimizer: AdamW) -> dict[int, dict[str, Tensor]]:

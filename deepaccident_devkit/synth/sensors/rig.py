@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import ByteArray, Float32Array, FloatArray
+from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage, Calib, Labels
 from deepaccident_devkit.release.npz import TAGS
@@ -15,7 +15,7 @@ from deepaccident_devkit.synth.config import Sensors
 from deepaccident_devkit.synth.roads import MAP_EXTENT, MAP_RESOLUTION, TERRAIN, Arm, GroundMap, tag_of_code
 from deepaccident_devkit.synth.sensors.agents import Agent, make_agents, with_single_precision
 from deepaccident_devkit.synth.sensors.annotate import annotate
-from deepaccident_devkit.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, intensity, make_lidar, scan
+from deepaccident_devkit.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, make_lidar, scan
 from deepaccident_devkit.synth.sensors.render import Studio, Surroundings, render
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting, make_scene
 from deepaccident_devkit.synth.stage import World
@@ -143,10 +143,6 @@ class Rig:
         labels = annotate(scene, agent, world_from_ground, points, exact=self.exact)
         calib = agent.calib(world_from_ground @ ground_from_ego)
         return Sighting(labels, calib if self.exact else with_single_precision(calib), points)
-
-    def intensity(self, points: Scan) -> Float32Array:
-        """The intensity of each of the points (N,), 0 to 1."""
-        return intensity(points, self.air)
 
     def bev(self, scene: Scene, agent: Agent) -> BevImage:
         """The picture of an agent's BEV camera."""

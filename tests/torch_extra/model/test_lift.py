@@ -276,15 +276,6 @@ def test_a_wrong_configuration_is_named(change, message):
         replace(CONFIG, **change)
 
 
-def test_words_are_checked():
-    with pytest.raises(ValueError, match="frustum: expected one of corners, centres, found 'centers'"):
-        replace(CONFIG, frustum="centers")
-    with pytest.raises(ValueError, match="voxel_rounding: expected one of trunc, floor"):
-        replace(CONFIG, voxel_rounding="round")
-    with pytest.raises(ValueError, match="pooling: expected one of sum, mean, found 'max'"):
-        replace(CONFIG, pooling="max")
-
-
 def test_features_of_another_shape_are_named():
     lift = lift_of(CONFIG)
     with pytest.raises(GeometryError, match=r"features: expected \(…, 3, 5\)"):

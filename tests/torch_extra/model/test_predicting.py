@@ -95,14 +95,6 @@ def test_a_prediction_does_not_depend_on_others(
     assert not same(found[0], replace(found[1], token=tokens[0]))
 
 
-@pytest.mark.slow
-def test_workers_change_nothing(
-    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
-) -> None:
-    read = predict(model, da, tokens, PredictConfig(workers=1))
-    assert all(same(one, other) for one, other in zip(found, read, strict=True))
-
-
 def test_the_seed_changes_the_draws_but_not_the_mean(
     model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
 ) -> None:

@@ -71,7 +71,7 @@ def test_the_demo_shows_their_prediction(da: DeepAccident, tmp_path: Path, monke
     assert (tmp_path / name).stat().st_size > 20_000
     page = demo.demo_page([("agents",)], [], model=True)
     assert page.index("motion_labels_1s_before.png") < page.index(name)
-    assert name not in demo.demo_page([], [], model=False)
+    assert name not in demo.demo_page([("agents",)], [], model=False)
 
     def missing(*_: object) -> None:
         raise MissingExtraError("no torch")

@@ -40,15 +40,6 @@ def test_a_four_way_map_is_its_own_quarter_turn_or_half_turn_where_one_road_give
     assert (quarter_turned(codes) != codes).any()
 
 
-def test_a_three_way_map_mirrors_itself_but_for_lines_and_has_no_north_arm():
-    codes = Junction(RoadSpec(kind="three-way", signalized=False)).ground_map().codes
-    driven = np.isin(codes, ROAD_CODES)
-    np.testing.assert_array_equal(driven, driven[:, ::-1])
-    assert not driven[1500 + 60 :].any()
-    four = Junction(RoadSpec(signalized=False)).ground_map().codes
-    np.testing.assert_array_equal(codes[:1350], four[:1350])
-
-
 def test_from_the_middle_line_outward(junction):
     """Yellow line, lane, kerb, sidewalk, grass, 80 m from the middle; behind the kerb's end all is as before it."""
     spec, ground = junction.spec, junction.ground_map()

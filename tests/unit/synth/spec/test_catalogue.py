@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scripts import loaded_script
 
-from deepaccident_devkit.release import Collision, Meta
 from deepaccident_devkit.synth.roads import Hump, RoadSpec
 from deepaccident_devkit.synth.spec import (
     DESIGN_NUMBERS,
@@ -23,33 +22,6 @@ from deepaccident_devkit.synth.spec import (
     parse_spec,
     read_spec,
 )
-from deepaccident_devkit.tables.accidents import accident_type
-
-
-@pytest.mark.parametrize("number", DESIGN_NUMBERS)
-def test_each_draw_of_a_design_is_of_its_type(number):
-    for seed in range(30):
-        spec = draw(DESIGNS[number], np.random.default_rng(seed))
-        pair = Collision(
-            ids=(1, 2),
-            classes=("car", "car"),
-            impact=1.0,
-            spawn_relation="same",
-            contact_side="front_side",
-            agents=None,
-        )
-        meta = Meta(
-            weather=spec.weather,
-            time_of_day=spec.time_of_day,
-            collision=pair,
-            simulated_frames=50,
-            agent_ids=(1, 3, 2, 4),
-            road_type=f"{spec.road.kind} junction",
-            spawn_side=spec.spawn_side,
-            ego_direction=spec.actor("ego").turn,
-            other_direction=spec.actor("other").turn,
-        )
-        assert accident_type(meta, signalized=spec.road.signalized) == number == spec.design
 
 
 @pytest.mark.parametrize("number", DESIGN_NUMBERS)

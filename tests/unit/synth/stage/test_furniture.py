@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.synth.roads import SIDEWALK, Junction, RoadSpec
-from deepaccident_devkit.synth.solids import build
 from deepaccident_devkit.synth.stage.props import traffic_light, yield_sign
 
 
@@ -27,15 +26,3 @@ def test_it_stands_on_the_sidewalk_at_the_right_of_the_line(make, spec):
         along_right = (place - left_end) @ right
         assert spec.road_edge < along_right < spec.road_edge + 0.6
         assert 0 < (place - left_end) @ inward < 1.5
-
-
-def test_a_sign_shows_its_face_to_who_comes():
-    for arm, axis in (("west", 0), ("north", 1)):
-        face = build(yield_sign(RoadSpec(signalized=False), arm).blocks[-1:]).corners[0]
-        assert np.ptp(face[:, axis]) < 0.1
-        assert np.ptp(face[:, 1 - axis]) > 0.4
-        lower, upper = (face[np.argsort(face[:, 2])[rows], 1 - axis] for rows in (slice(4), slice(4, 8)))
-        assert np.ptp(lower) < 0.1 * np.ptp(upper)
-        rim = build(yield_sign(RoadSpec(signalized=False), arm).blocks[-2:-1]).corners[0]
-        outward = {"west": -1, "north": 1}[arm]
-        assert (outward * face[:, axis]).max() > (outward * rim[:, axis]).max()
