@@ -185,7 +185,7 @@ class Surroundings:
         facades: where there are windows.
         shadows: the shadows on façades.
         colors: the colours of all faces.
-        lamplight: from `lamplight.lamplight`; None by day.
+        lamplight: from `light.lamplight`; None by day.
     """
 
     light: Light
@@ -320,7 +320,7 @@ class Studio:
         self._shadows = wall_shadows(setting, self._facades, self.light)
 
     def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings:
-        """The colours of a moment, for the cameras of all agents; `signals` as in `lamplight.lit_lamps`."""
+        """The colours of a moment, for the cameras of all agents; `signals` as in `light.lit_lamps`."""
         lamps = lit_lamps(scene.setting.world, signals)
         rows = scene.setting.props
         return Surroundings(

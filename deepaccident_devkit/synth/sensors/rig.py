@@ -151,7 +151,7 @@ class Rig:
     def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings | None:
         """What the images of all agents at a moment have in common; None if no images are made.
 
-        `signals` are the states of the traffic lights, as for `images.lamplight.lit_lamps`.
+        `signals` are the states of the traffic lights, as for `light.lit_lamps`.
         """
         return self.studio.surroundings(scene, signals) if self.studio else None
 

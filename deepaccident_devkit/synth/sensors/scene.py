@@ -232,7 +232,7 @@ class Scene:
     Attributes:
         setting: what stands still.
         snapshot: where the road users are, seen from above.
-        frames: (A, 4, 4) their frames on the ground, as in `setting.placed_on`.
+        frames: (A, 4, 4) their frames on the ground, as in `placed_on`.
         movers: surfaces of those who are not parked.
         caster: casts rays against `movers`.
     """
