@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from deepaccident_devkit.errors import DeepAccidentError, GeometryError
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, GeometryError
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -161,6 +161,13 @@ def checked_whole(
         return operator.index(value)  # type: ignore[arg-type]  # everything else is refused
     except TypeError:
         raise error(f"{name}: expected {expected}, found {value!r}") from None
+
+
+def check_least(record: object, **least: float) -> None:
+    """Raise ConfigError if a field of a configuration is less than it may be, or NaN."""
+    for name, lowest in least.items():
+        if not (value := getattr(record, name)) >= lowest:
+            raise ConfigError(f"{name}: expected a number from {lowest}, found {value!r}")
 
 
 def as_floats(values: ArrayLike) -> FloatArray:

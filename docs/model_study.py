@@ -47,12 +47,12 @@ from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.model.checkpoint import FINAL, read_weights, write_weights
 from deepaccident_devkit.model.checkpoint import SHIPPED as SHIPPED_WEIGHTS
-from deepaccident_devkit.model.predicting import PredictConfig
 from deepaccident_devkit.model.presets import ModelChoice, load_model
+from deepaccident_devkit.model.results import PredictConfig
 from deepaccident_devkit.model.training.config import TrainConfig
-from deepaccident_devkit.model.training.log import read_log
+from deepaccident_devkit.model.training.data import SCORE, validated, validation_samples
+from deepaccident_devkit.model.training.state import read_log
 from deepaccident_devkit.model.training.train import train
-from deepaccident_devkit.model.training.validation import SCORE, validated, validation_samples
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.split_files import write_split_file
 from deepaccident_devkit.synth import SynthConfig, make_release

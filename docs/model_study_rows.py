@@ -24,8 +24,8 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.model.checkpoint import load_weights, read_weights
 from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.predicting import PredictConfig, prediction_of
 from deepaccident_devkit.model.presets import ModelChoice, tiny
+from deepaccident_devkit.model.results import PredictConfig, prediction_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Link
 

@@ -12,11 +12,10 @@ from deepaccident_devkit.synth.collision import separation
 from deepaccident_devkit.synth.recording import RecordingJob
 from deepaccident_devkit.synth.scenario import Scenario, build_scenario
 from deepaccident_devkit.synth.sensors.agents import Agent
-from deepaccident_devkit.synth.sensors.annotate import TRACKING_RANGE
+from deepaccident_devkit.synth.sensors.annotate import TRACKING_RANGE, camera_visible
 from deepaccident_devkit.synth.sensors.lidar import Scan
 from deepaccident_devkit.synth.sensors.rig import make_rig
 from deepaccident_devkit.synth.sensors.scene import Scene
-from deepaccident_devkit.synth.sensors.visibility import camera_visible
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.taxonomy import AGENTS, frame_timestamp
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
+from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import FOREGROUND_THRESHOLD, PostProcessing
 
 F = np.float32

@@ -14,8 +14,8 @@ from deepaccident_devkit.cli.options import (
 )
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.checking import checked_text
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE, Sensors
+from deepaccident_devkit.synth.scenario import checked_text
 from deepaccident_devkit.synth.sensors.caster import has_embree
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text, read_spec
 from deepaccident_devkit.taxonomy import Layout

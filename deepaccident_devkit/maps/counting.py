@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import MissingFileError, SensorFileError
 from deepaccident_devkit.maps.config import TownMapConfig
 from deepaccident_devkit.maps.looks import Looks, looks_of
 from deepaccident_devkit.release import read_bev
-from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 logger = logging.getLogger(__name__)

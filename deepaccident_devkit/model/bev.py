@@ -12,12 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
 from deepaccident_devkit.motion.orientations import axes_of
-
-__all__ = ["BevEncode", "BevEncodeConfig", "BevUNet", "BevUNetConfig", "crop"]
 
 
 def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:
@@ -82,8 +81,7 @@ class BevEncodeConfig:
 
     def __post_init__(self) -> None:
         """Check the sizes; raises ConfigError."""
-        _check_widths(self.widths, 3)
-        _check_positive(in_channels=self.in_channels, out_channels=self.out_channels)
+        _check_sizes(self, 3)
 
 
 class BevEncode(nn.Module):
@@ -132,8 +130,7 @@ class BevUNetConfig:
 
     def __post_init__(self) -> None:
         """Check the sizes; raises ConfigError."""
-        _check_widths(self.widths, 2)
-        _check_positive(in_channels=self.in_channels, out_channels=self.out_channels)
+        _check_sizes(self, 2)
 
 
 class BevUNet(nn.Module):
@@ -201,14 +198,8 @@ def _convolution(inputs: int, outputs: int) -> tuple[nn.Module, nn.Module, nn.Mo
     )
 
 
-def _check_widths(widths: tuple[int, ...], stages: int) -> None:
-    if len(widths) != stages or min(widths) < 1:
-        raise ConfigError(
-            f"widths: expected the channels of {stages} stages, such as {(32, 64, 128)[:stages]}, found {widths!r}"
-        )
-
-
-def _check_positive(**channels: int) -> None:
-    for name, count in channels.items():
-        if count < 1:
-            raise ConfigError(f"{name}: expected at least one channel, found {count!r}")
+def _check_sizes(config: BevEncodeConfig | BevUNetConfig, stages: int) -> None:
+    if len(config.widths) != stages or min(config.widths) < 1:
+        expected = f"the channels of {stages} stages, such as {(32, 64, 128)[:stages]}"
+        raise ConfigError(f"widths: expected {expected}, found {config.widths!r}")
+    check_least(config, in_channels=1, out_channels=1)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from deepaccident_devkit.model.lift import CameraGeometry
-from deepaccident_devkit.model.poses import six_from_matrices
+from deepaccident_devkit.model.warps import six_from_matrices
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE
 
 Handedness = Literal["left", "right"]

@@ -17,7 +17,6 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
 from deepaccident_devkit.model.checkpoint import load_weights, read_weights
-from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.detection import (
     ONE_TASK,
     RELEASED_CLASS_SLOTS,
@@ -37,9 +36,8 @@ from deepaccident_devkit.model.fusion import (
 from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
 from deepaccident_devkit.model.lift import LiftConfig
 from deepaccident_devkit.model.motion import MotionHeadConfig, MotionLossConfig
-from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.temporal import TemporalConfig
-from deepaccident_devkit.model.warps import GridBounds
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, ModelFusion, ModelPreset
 from deepaccident_devkit.text import choice as chosen_word
@@ -160,7 +158,7 @@ def released() -> ModelConfig:
     and so are an augmentation of its own for each agent and the mixed order of agents in batches, which are mistakes.
     """
     along = (-51.2, 51.2, 0.8)
-    grid = GridBounds(x=along, y=along)
+    grid = BevGrid(x=along, y=along)
     return ModelConfig(
         images=ImageConfig(resize=(432, 768), crop=(176, 32, 256, 704), dtype="uint8"),
         encoder=SwinConfig(checkpointing=True),
@@ -214,7 +212,7 @@ def tiny() -> ModelConfig:
             band=(-0.5, 2.5),
             pooling="mean",
         ),
-        temporal=TemporalConfig(channels=32, grid=GridBounds(x=along, y=along), frames=2, kind="concat"),
+        temporal=TemporalConfig(channels=32, grid=BevGrid(x=along, y=along), frames=2, kind="concat"),
         fusion=PoolFusionConfig(),
         bev=BevUNetConfig(),
         one_bev=True,

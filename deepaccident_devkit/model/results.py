@@ -1,23 +1,152 @@
-"""Results files of a model's predictions, which `deepaccident evaluate` takes."""
+"""Predictions of samples by a trained model, and results files of them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.utils.data import DataLoader
+from tqdm.auto import tqdm
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation import ResultsWriter
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, ResultsWriter, foreseen_accident
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
+from deepaccident_devkit.export.torch import V2XDataset, collate
 from deepaccident_devkit.files import writable_folder
+from deepaccident_devkit.model.detection import decode_detections, detected_boxes
+from deepaccident_devkit.model.entry import mirrored_boxes, model_inputs
+from deepaccident_devkit.model.motion import MotionMaps
 from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.predicting import PredictConfig, predictions
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.v2x import AgentConfig
+from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
+from deepaccident_devkit.v2x import AgentConfig, Agents, Link
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SamplePrediction(ShortRepr):
+    """What a model says of one sample.
+
+    Attributes:
+        token: of the sample.
+        motion: maps of all draws, the mean last.
+        accidents: none, or the one that the maps foresee together.
+        boxes: of the present, in the world.
+    """
+
+    token: str
+    motion: MotionOutput
+    accidents: list[Accident]
+    boxes: DetectedBoxes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictConfig:
+    """How samples are predicted.
+
+    Attributes:
+        agents: who cooperates (`v2x.cooperating_agents`).
+        link: what happens to the partners' data; None for nothing.
+        seed: of the latents' draws, which depend on it and on the sample alone.
+        device: where the model is.
+        workers: processes that read; 0 for this one.
+        images_cache: of `V2XConfig`.
+    """
+
+    agents: Agents = "all"
+    link: Link | None = None
+    seed: int = 0
+    device: str = "cpu"
+    workers: int = 0
+    images_cache: str | os.PathLike[str] | None = None
+
+
+def predictions(
+    model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig, *, progress: bool = False
+) -> Iterator[SamplePrediction]:
+    """Predict samples one after another; the result does not depend on the others.
+
+    Args:
+        model: in evaluation mode while this runs; on `config.device`.
+        dataset: the release.
+        tokens: of the samples.
+        config: who cooperates, and how.
+        progress: whether to show a bar.
+
+    Raises:
+        DeepAccidentError: as of `V2XDataset`.
+        NotAvailableError: the release has no images.
+    """
+    check_images(dataset, tokens[:1])
+    given = model.config.inputs(config.agents, link=config.link, images_cache=config.images_cache)
+    data = V2XDataset(dataset, tokens, given)
+    loader: DataLoader[Any] = DataLoader(data, collate_fn=collate, num_workers=config.workers)  # type: ignore[arg-type]
+    training = model.training
+    model.eval()
+    try:
+        for batch in tqdm(loader, desc="predicting", unit="sample", disable=not progress):
+            yield prediction_of(model, batch, config)
+    finally:
+        model.train(training)
+
+
+def check_images(dataset: Dataset, tokens: Sequence[str]) -> None:
+    """Raise NotAvailableError, with the remedy, if none of these samples has an image."""
+    paths = [dataset.sensor_path(f"{token}/{channel}") for token in tokens for channel in CAMERAS]
+    if paths and not any(path.exists() for path in paths):
+        raise NotAvailableError(
+            f"{paths[0]}: the model sees with cameras, and this release has no images of {tokens[0]}; unpack its "
+            "camera folders, or make a release with them: deepaccident synth OUT --sensors cameras"
+        )
+
+
+def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig) -> SamplePrediction:
+    """The prediction of a batch of one item.
+
+    Args:
+        model: in evaluation mode.
+        batch: of `export.torch.collate`, as `ModelConfig.inputs` describes it.
+        config: its seed, device and latency.
+    """
+    [token] = batch["token"]
+    delay = 0 if config.link is None else config.link.latency_frames
+    inputs = model_inputs(batch, model.config.handedness, delay=delay).to(config.device)
+    generator = torch.Generator().manual_seed(zlib.crc32(f"{config.seed} {token}".encode()))
+    with torch.inference_mode():
+        predicted = model(inputs, noise=model.noise(1, generator).to(config.device))
+    [found] = decode_detections(predicted.detection, model.config.detection, model.config.decoding)
+    motion = motion_output(MotionMaps(*(each[:, 0] for each in predicted.motion.maps)), model)
+    labels = model.config.labels
+    accident = foreseen_accident(motion, step=labels.step * FRAME_PERIOD, labels=model.config.labels_protocol)
+    return SamplePrediction(
+        token=token,
+        motion=motion,
+        accidents=[] if accident is None else [accident],
+        boxes=detected_boxes(
+            replace(found, boxes=mirrored_boxes(found.boxes, model.config.handedness)), batch["world_from_ego"][0]
+        ),
+    )
+
+
+def motion_output(maps: MotionMaps, model: V2XFormer) -> MotionOutput:
+    """The devkit's form of the maps (K, T, …) of one ego: centres as probabilities, on the labels' grid."""
+    arrays = [_numbers(each) for each in (maps.segmentation, maps.instance_center.sigmoid())]
+    vectors = [_numbers(each) for each in (maps.instance_offset, maps.instance_flow)]
+    return MotionOutput.from_arrays(*arrays, *vectors, grid=model.config.labels.grid)
+
+
+def _numbers(values: Tensor) -> Any:
+    return values.float().cpu().numpy()
 
 
 def predict_results(

@@ -1,5 +1,8 @@
 """Temporal models: one agent's BEV maps of the past and the present → one map of the present, before any fusion.
 
+The released TemporalBlock and Bottleneck3D, which it has from FIERY. The sequence is frames in the temporal model and
+agents in the released fusion's unused part. Attributes have the names of the released state dict.
+
 Both take the same arguments; `temporal_model` makes the one that a config names.
 """
 
@@ -10,18 +13,116 @@ from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.poses import (
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.model.warps import (
     Chain,
+    WarpRule,
     between_augmented,
     matrices_from_six,
     present_from_past,
     six_from_matrices,
+    warp_features,
 )
-from deepaccident_devkit.model.temporal_blocks import TemporalBlock
-from deepaccident_devkit.model.warps import GridBounds, WarpRule, warp_features
 from deepaccident_devkit.text import settle_choices
+
+
+class ConvBnRelu3d(nn.Module):
+    """A convolution without bias, batch norm and ReLU; keeps T, H and W.
+
+    Args:
+        in_channels: C of the input.
+        out_channels: C of the output.
+        kernel: steps, rows, columns; rows and columns odd.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, kernel: tuple[int, int, int] = (1, 1, 1)) -> None:
+        super().__init__()
+        padding = (0, kernel[1] // 2, kernel[2] // 2)
+        self.conv = nn.Conv3d(in_channels, out_channels, kernel, padding=padding, bias=False)
+        self.norm = nn.BatchNorm3d(out_channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T, H, W) → (B, C', T, H, W); the steps before the first are zeros."""
+        earlier = self.conv.kernel_size[0] - 1
+        if earlier:
+            x = functional.pad(x, (0, 0, 0, 0, earlier, 0))
+        return functional.relu(self.norm(self.conv(x)))
+
+
+class PooledStep(nn.Module):
+    """The mean over the map and over each step and the one before, through a 1×1×1 convolution; in every cell."""
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.conv_bn_relu = ConvBnRelu3d(in_channels, out_channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T, H, W) → (B, C', T, H, W); the first step is its own mean.
+
+        As in the released code a further step, the last one's own mean, counts in the batch statistics.
+        """
+        means = x.mean((-2, -1), keepdim=True)
+        pairs = torch.cat([means[:, :, :1], (means[:, :, 1:] + means[:, :, :-1]) / 2, means[:, :, -1:]], 2)
+        return self.conv_bn_relu(pairs)[:, :, :-1].expand(-1, -1, -1, *x.shape[-2:])
+
+
+class PyramidPooling(nn.Module):
+    """The released pyramid of one level, the whole map."""
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.features = nn.ModuleList([PooledStep(in_channels, out_channels)])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T, H, W) → (B, C', T, H, W)."""
+        return torch.cat([level(x) for level in self.features], 1)
+
+
+class TemporalBlock(nn.Module):
+    """Three convolution paths and a pooled one over a step and the one before, added to the input."""
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        half, third = in_channels // 2, in_channels // 3
+        self.convolution_paths = nn.ModuleList(
+            [
+                nn.Sequential(ConvBnRelu3d(in_channels, half), ConvBnRelu3d(half, half, (2, 3, 3))),
+                nn.Sequential(ConvBnRelu3d(in_channels, half), ConvBnRelu3d(half, half, (1, 3, 3))),
+                ConvBnRelu3d(in_channels, half),
+            ]
+        )
+        self.pyramid_pooling = PyramidPooling(in_channels, third)
+        self.aggregation = nn.Sequential(ConvBnRelu3d(3 * half + third, out_channels))
+        self.projection = (
+            nn.Identity()
+            if in_channels == out_channels
+            else nn.Sequential(nn.Conv3d(in_channels, out_channels, 1, bias=False), nn.BatchNorm3d(out_channels))
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T, H, W) → (B, C', T, H, W)."""
+        paths = [path(x) for path in self.convolution_paths]
+        return self.projection(x) + self.aggregation(torch.cat([*paths, self.pyramid_pooling(x)], 1))
+
+
+class Bottleneck3d(nn.Module):
+    """1×1×1 to half the channels, 1×3×3, 1×1×1 back, added to the input."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        half = channels // 2
+        self.layers = nn.Sequential()
+        self.layers.add_module("conv_down_project", ConvBnRelu3d(channels, half))
+        self.layers.add_module("conv", ConvBnRelu3d(half, half, (1, 3, 3)))
+        self.layers.add_module("conv_up_project", ConvBnRelu3d(half, channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T, H, W) → the same shape."""
+        return x + self.layers(x)
+
 
 EGOMOTION = 6
 """Channels that an egomotion takes: a 6-vector, the same in all cells."""
@@ -41,17 +142,15 @@ class TemporalConfig:
         chain: the order in which motions are multiplied (`poses.present_from_past`).
         egomotion_input: with a BEV augmentation A, the motion that the convolutions see: `augmented` is
             A · E · A⁻¹, as the maps move; `raw` is E, the released code's.
-        with_skip: `blocks` adds the present's own map to its result, as the released code does.
     """
 
     channels: int
-    grid: GridBounds
+    grid: BevGrid
     frames: int = 3
     kind: Literal["blocks", "concat"] = "blocks"
     warp: WarpRule = "exact"
     chain: Chain = "exact"
     egomotion_input: EgomotionInput = "augmented"
-    with_skip: bool = True
 
     def __post_init__(self) -> None:
         """Check the numbers and words; raises ConfigError."""
@@ -111,8 +210,7 @@ class Temporal3D(nn.Module):
         motion = _motion_input(egomotion[:, :-1], bev_transform, self.config)
         motion = torch.cat([torch.zeros_like(motion[:, :1]), motion], 1)
         frames = torch.cat([warped, _as_maps(motion, warped)], 2)
-        result = self.model(_without_invalid(frames, valid).transpose(1, 2))[:, :, -1]
-        return result + present if self.config.with_skip else result
+        return self.model(_without_invalid(frames, valid).transpose(1, 2))[:, :, -1] + present
 
 
 class TemporalConcat(nn.Module):

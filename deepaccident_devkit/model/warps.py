@@ -1,4 +1,8 @@
-"""BEV feature maps in another frame, with gradients: of past moments in the present, of partners in the ego's frame.
+"""Transforms between frames of moments and agents, and BEV feature maps in another frame, with gradients.
+
+The sibling of `geometry.six_vectors` and `motion.warps.chains`, for whole batches. Nothing here depends on the
+handedness, so long as all that goes in has the same. Products are written as sums, because `autocast` would
+round a matrix product to bfloat16, and metres need more digits than that.
 
 The torch sibling of `motion.warps.warping`, for whole batches. Maps lie [row = y ascending, column = x ascending], and
 transforms have the maps' handedness; nothing here depends on which it is.
@@ -6,7 +10,6 @@ transforms have the maps' handedness; nothing here depends on which it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -16,38 +19,103 @@ from torch.nn import functional
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
 
+Chain = Literal["released", "exact"]
+
+
+def matrices_from_six(six: Tensor) -> Tensor:
+    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4), as `geometry.six_vectors.to_matrices`."""
+    cx, cy, cz = torch.cos(six[..., 3:]).unbind(-1)
+    sx, sy, sz = torch.sin(six[..., 3:]).unbind(-1)
+    tx, ty, tz = six[..., :3].unbind(-1)
+    zero, one = torch.zeros_like(tx), torch.ones_like(tx)
+    rows = (
+        (cy * cz, -cy * sz, sy, tx),
+        (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, ty),
+        (sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy, tz),
+        (zero, zero, zero, one),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def six_from_matrices(matrix: Tensor) -> Tensor:
+    """Rigid matrices (…, 4, 4) → 6-vectors (…, 6), metres and radians; the inverse of `matrices_from_six`."""
+    m12, m22 = matrix[..., 1, 2], matrix[..., 2, 2]
+    rx = torch.atan2(-m12, m22)
+    ry = torch.atan2(matrix[..., 0, 2], torch.hypot(m12, m22))
+    rz = torch.atan2(-matrix[..., 0, 1], matrix[..., 0, 0])
+    return torch.cat([matrix[..., :3, 3], torch.stack([rx, ry, rz], -1)], -1)
+
+
+def between_augmented(target_from_source: Tensor, target_bev: Tensor | None, source_bev: Tensor | None) -> Tensor:
+    """A transform of frames → the one between their augmented maps: A_target · transform · A_source⁻¹.
+
+    Args:
+        target_from_source: (…, 4, 4).
+        target_bev: (…, 4, 4) the BEV augmentation of the frame that the transform leads to; None is the identity.
+        source_bev: (…, 4, 4) that of the frame it comes from.
+    """
+    if target_bev is not None:
+        target_from_source = _product(target_bev, target_from_source)
+    if source_bev is not None:
+        target_from_source = _product(target_from_source, torch.linalg.inv(source_bev))
+    return target_from_source
+
+
+def present_from_past(egomotion: Tensor, *, chain: Chain = "exact", bev_transform: Tensor | None = None) -> Tensor:
+    """Transforms of the past frames to the present.
+
+    Args:
+        egomotion: (N, P − 1, 6) rows `next_from_this` of the past frames, the oldest first.
+        chain: the order of the product. `exact`: E_{P−2} … E_t. `released`: E_t … E_{P−2}, which is wrong from the
+            second frame before the present on.
+        bev_transform: (N, 4, 4) the BEV augmentation A of all frames; the product becomes A · product · A⁻¹.
+
+    Returns:
+        (N, P − 1, 4, 4), the oldest first.
+    """
+    steps = matrices_from_six(egomotion).unbind(1)
+    products = list(steps[-1:])
+    for step in steps[-2::-1]:
+        products.append(_product(products[-1], step) if chain == "exact" else _product(step, products[-1]))
+    stacked = torch.stack(products[::-1], 1) if products else egomotion.new_zeros(len(egomotion), 0, 4, 4)
+    return _augmented(stacked, bev_transform)
+
+
+def present_from_frames(egomotion: Tensor, *, bev_transform: Tensor | None = None) -> Tensor:
+    """Transforms of the present and each future frame to the present: C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹.
+
+    Args:
+        egomotion: (N, T, 6) rows `next_from_this` from the present on; the last one is not used.
+        bev_transform: (N, 4, 4) the BEV augmentation A of all frames; C becomes A · C · A⁻¹.
+
+    Returns:
+        (N, T, 4, 4); without augmentation the first is the identity.
+    """
+    this_from_next = torch.linalg.inv(matrices_from_six(egomotion)).unbind(1)
+    products = [torch.eye(4, dtype=egomotion.dtype, device=egomotion.device).expand(len(egomotion), 4, 4)]
+    for step in this_from_next[:-1]:
+        products.append(_product(products[-1], step))
+    return _augmented(torch.stack(products, 1), bev_transform)
+
+
+def _product(first: Tensor, second: Tensor) -> Tensor:
+    return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
+
+
+def _augmented(transforms: Tensor, bev_transform: Tensor | None) -> Tensor:
+    """A · transforms · A⁻¹ of transforms (N, T, 4, 4) and A (N, 4, 4)."""
+    matrix = None if bev_transform is None else bev_transform[:, None]
+    return between_augmented(transforms, matrix, matrix)
+
+
 WarpRule = Literal["stretched", "exact"]
 WarpMode = Literal["bilinear", "nearest"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GridBounds:
-    """The cells of a BEV feature map; row = y ascending, column = x ascending.
-
-    Attributes:
-        x: start, end and cell size along x, metres.
-        y: start, end and cell size along y, metres.
-    """
-
-    x: Axis
-    y: Axis
-
-    def __post_init__(self) -> None:
-        """Check the ranges as `geometry.BevGrid` does; raises ConfigError."""
-        checked = BevGrid(x=self.x, y=self.y)
-        object.__setattr__(self, "x", checked.x)
-        object.__setattr__(self, "y", checked.y)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return BevGrid(x=self.x, y=self.y).shape
 
 
 def warp_features(
     features: Tensor,
     target_from_source: Tensor,
-    grid: GridBounds,
+    grid: BevGrid,
     *,
     warp: WarpRule = "exact",
     mode: WarpMode = "bilinear",
@@ -76,7 +144,7 @@ def warp_features(
     return sampled.to(features.dtype)
 
 
-def inside_mask(target_from_source: Tensor, grid: GridBounds, *, warp: WarpRule = "exact") -> Tensor:
+def inside_mask(target_from_source: Tensor, grid: BevGrid, *, warp: WarpRule = "exact") -> Tensor:
     """(N, H, W) bool: the target's cells that the source's grid covers, by nearest sampling.
 
     Args:
@@ -88,7 +156,7 @@ def inside_mask(target_from_source: Tensor, grid: GridBounds, *, warp: WarpRule 
     return warp_features(ones, target_from_source, grid, warp=warp, mode="nearest")[:, 0] > 0.5
 
 
-def agents_to_ego(features: Tensor, ego_from_agent: Tensor, grid: GridBounds, *, warp: WarpRule = "exact") -> Tensor:
+def agents_to_ego(features: Tensor, ego_from_agent: Tensor, grid: BevGrid, *, warp: WarpRule = "exact") -> Tensor:
     """All agents' maps of one moment in the ego's frame, bilinear; the ego's own, slot 0, stays as it is.
 
     Args:
@@ -105,7 +173,7 @@ def agents_to_ego(features: Tensor, ego_from_agent: Tensor, grid: GridBounds, *,
     return torch.cat([features[:, :1], warped.view_as(partners)], 1)
 
 
-def agents_mask(agent_valid: Tensor, ego_from_agent: Tensor, grid: GridBounds, *, warp: WarpRule = "exact") -> Tensor:
+def agents_mask(agent_valid: Tensor, ego_from_agent: Tensor, grid: BevGrid, *, warp: WarpRule = "exact") -> Tensor:
     """(B, A, H, W) bool: where each agent has something to say in the ego's frame; the ego, slot 0, everywhere.
 
     Args:
@@ -120,7 +188,7 @@ def agents_mask(agent_valid: Tensor, ego_from_agent: Tensor, grid: GridBounds, *
     return mask
 
 
-def _sample_points(target_from_source: Tensor, grid: GridBounds, warp: WarpRule) -> Tensor:
+def _sample_points(target_from_source: Tensor, grid: BevGrid, warp: WarpRule) -> Tensor:
     """(N, H, W, 2) the point x, y of the source that each cell samples; −1 and 1 are the grid's ends."""
     source_from_target = torch.linalg.inv(target_from_source)
     columns, rows = (_coordinates(axis, warp, source_from_target) for axis in (grid.x, grid.y))

@@ -34,7 +34,7 @@ from deepaccident_devkit.motion.drawing.box_polygons import OWN_BOX_ID, FrameBox
 from deepaccident_devkit.motion.drawing.from_boxes import labels_from_polygons, motion_labels_from_boxes
 from deepaccident_devkit.motion.label_files import LabelFiles, LabelsWritten, write_label_files
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
+from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import (
     POST_PROCESSING,
     InstancePath,
@@ -46,7 +46,7 @@ from deepaccident_devkit.motion.postprocessing.predict import (
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.motion.sample_lists import evaluation_samples, samples, training_samples
-from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego, past_to_present
+from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
 
 __all__ = [
     "BEV_CLASSES",

@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.release import BevImage
-from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 from deepaccident_devkit.text import choice
 

@@ -30,15 +30,16 @@ from deepaccident_devkit.motion.label_folder import (
     FORMAT_VERSION,
     MANIFEST,
     Manifest,
+    StoredLabels,
     batch_path,
     folder_path,
     label_path,
     label_store,
     remove_half_written,
+    write_array,
 )
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
-from deepaccident_devkit.motion.stored_labels import StoredLabels, write_array
 from deepaccident_devkit.parallel import Places
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.tables.tokens import parse_number
@@ -47,9 +48,10 @@ from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import cooperating_agents
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
 
     from deepaccident_devkit.dataset import Dataset, RowArgument
+    from deepaccident_devkit.parallel import Engine
 
 _OPEN_FILES: Final = 8
 
@@ -76,9 +78,7 @@ def write_label_files(
     config: MotionLabelConfig | str | None = None,
     *,
     names: BatchNames | None = None,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> LabelsWritten:
     """Write the motion labels of samples into a folder, one file for each scenario and agent.
 
@@ -93,9 +93,7 @@ def write_label_files(
         config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
         names: `fiery`, `beverse` or `deepaccident` writes `MotionLabels.as_batch(names)` of each sample into a file of
             its own, some 0.1 MB, for loops with numpy alone; None writes files for `LabelFiles`, 25 times smaller.
-        workers: processes; None chooses by the amount of work.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         ConfigError: the folder holds labels of another configuration, or with other names; it is left as it is.
@@ -105,7 +103,6 @@ def write_label_files(
         ChoiceError: no sample at all, or no such agent, configuration of agents, or code.
         NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
         SomeFailedError: labels of some samples cannot be made; the others are written, and the same call continues.
-        WorkerError: a worker was killed, or cannot do the work.
     """
     root, chosen = folder_path(folder), label_config(config)
     names = choice("names", names, (*get_args(BatchNames), None))
@@ -123,11 +120,9 @@ def write_label_files(
         made = store.run(
             _Work(dataset, root, manifest.config, names).write,
             {recording: (recording, frames) for recording, frames in files.items()},
-            workers=workers,
-            executor=executor,
             label="motion labels",
-            progress=progress,
             places=Places(reads=dataset.places, writes=(root,)),
+            **how,
         )
         if turn.alone():
             manifest = Manifest.of(root, chosen, names)

@@ -3,15 +3,20 @@
 Readers convert CARLA's left-handed values to the devkit's right-handed ones unless called with `raw=True`.
 """
 
-from deepaccident_devkit.release.bev_camera import BevImage, read_bev, write_bev
 from deepaccident_devkit.release.calib import Calib, Calibs, read_calib, read_calibs, write_calib, write_raw_calib
 from deepaccident_devkit.release.images import read_image, write_image
-from deepaccident_devkit.release.labels import Labels, read_label, read_labels, write_label
+from deepaccident_devkit.release.labels import (
+    Labels,
+    label_from_world_velocity,
+    read_label,
+    read_labels,
+    world_from_label_velocity,
+    write_label,
+)
 from deepaccident_devkit.release.layout import ReleaseLayout, ScenarioFolder, find_release
-from deepaccident_devkit.release.lidar import read_lidar, write_lidar
 from deepaccident_devkit.release.meta import Collision, Meta, read_meta, write_meta
+from deepaccident_devkit.release.npz import BevImage, read_bev, read_lidar, write_bev, write_lidar
 from deepaccident_devkit.release.split_files import read_split_file, write_split_file
-from deepaccident_devkit.release.velocities import label_from_world_velocity, world_from_label_velocity
 
 __all__ = [
     "BevImage",

@@ -18,7 +18,9 @@ from deepaccident_devkit.release.store import ReleasePath, places_of
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 _DIGEST_BYTES: Final = 16
 _ENDINGS: Final[Mapping[FileKind, str]] = {"label": "txt", "calib": "pkl"}
@@ -57,9 +59,7 @@ class Located(Protocol):
         """`v1` or `v1-mini`."""
 
 
-def scenario_hashes(
-    dataset: Located, scenarios: Collection[str], *, workers: int | None = None, executor: Executor | None = None
-) -> dict[str, ScenarioHashes]:
+def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[Engine]) -> dict[str, ScenarioHashes]:
     """The hashes of some scenarios' files, by token in order; those that are not in the release are left out.
 
     Reads the files themselves and not the index, which does not notice a file that was edited in place.
@@ -67,17 +67,15 @@ def scenario_hashes(
     Args:
         dataset: the release.
         scenarios: their tokens.
-        workers: processes to read with; None takes what the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         DatarootError: the release's folder is gone, or one of its folders cannot be listed.
         ReleaseError: a file cannot be read.
-        WorkerError: a worker was killed, or does not see the release.
     """
     folders = scenario_folders(dataset, scenarios)
     places = Places(reads=places_of(dataset.dataroot))
-    found = run_batch(folder_hashes, list(folders.values()), workers=workers, executor=executor, places=places)
+    found = run_batch(folder_hashes, list(folders.values()), places=places, **how)
     return dict(zip(folders, found, strict=True))
 
 

@@ -1,4 +1,8 @@
-"""`label/*.txt`: the boxes that one agent annotated at one frame (docs/format.md, Label).
+"""Label files, and the frames of their velocities.
+
+The release writes `(vx, vy) = Rz(yaw) · v_world`, with the row's own yaw in the agent's LiDAR frame. The rule is the
+same in CARLA's left-handed axes and in the devkit's: mirroring negates both the angle and y. The agent's own row has
+yaw 0, so it reads as the world's.
 
 Files are parsed in bulk: the bodies of many files are joined and go through Arrow's CSV reader in one call. Files that
 this call cannot read (CRLF, blanks at line ends, one-token lines, faults) are tidied, or their fault is named.
@@ -21,6 +25,29 @@ from deepaccident_devkit.reading import LIMITS_VARIABLE, limit_of, shortened
 from deepaccident_devkit.release._content import LARGEST, in_range, integer_of, number_of, read_content
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import CATEGORIES
+
+
+def label_from_world_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
+    """(N, 2) m/s as a label writes them.
+
+    Args:
+        velocity: (N, 2) m/s in world.
+        yaw: (N,) radians, each box's in the LiDAR frame of the label, of the same handedness.
+    """
+    return turned(velocity, yaw)
+
+
+def world_from_label_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
+    """(N, 2) m/s in world: the inverse of `label_from_world_velocity`; NaN stays NaN."""
+    return turned(velocity, -yaw)
+
+
+def turned(vectors: FloatArray, angle: FloatArray) -> FloatArray:
+    """Vectors (N, 2) turned by angles (N,), from the first axis to the second."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.column_stack([cos * x - sin * y, sin * x + cos * y])
+
 
 FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "num_lidar_pts", "camera_visible")
 """The 13 fields of a box line, in order."""

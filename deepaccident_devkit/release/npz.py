@@ -1,18 +1,24 @@
-"""The one array of an `.npz` file: read without unpickling, written with fixed bytes."""
+"""Arrays in npz files: point clouds, and the pictures of BEV cameras."""
 
 import io
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, overload
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_member
-from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.arrays import AnyArray, ByteArray, ShortRepr, checked, readonly
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.geometry import LidarPointCloud
+from deepaccident_devkit.geometry.handedness import flip_points
 from deepaccident_devkit.reading import MOST_TOLD, FileKind, fault_text, shortened
-from deepaccident_devkit.release._content import REMEDY, read_content
+from deepaccident_devkit.release._content import REMEDY, in_range, read_content
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 KEY = "data"
 _ENDING = ".npy"
@@ -59,3 +65,102 @@ def _array_member(path: ReleasePath, archive: zipfile.ZipFile) -> zipfile.ZipInf
         found = ", ".join(entry.filename.removesuffix(_ENDING) for entry in entries) or "no array"
         raise SensorFileError(f"{path}: expected an array named '{KEY}', found {shortened(found)}; {REMEDY}")
     return named[0]
+
+
+_LEVEL = 1
+"""Of compression: the numbers have single precision, so half of each is zeros; a higher level saves little more."""
+
+
+@overload
+def read_lidar(path: ReleasePath, *, raw: Literal[False] = False) -> LidarPointCloud: ...
+@overload
+def read_lidar(path: ReleasePath, *, raw: Literal[True]) -> AnyArray: ...
+def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | AnyArray:
+    """A point cloud in its LiDAR frame, right-handed, metres; NaN where the file has infinity or a number beyond 1e9.
+
+    Args:
+        path: the file.
+        raw: return the file's own array (N, 4) instead: x, y **right**, z, intensity, in the file's float type.
+
+    Raises:
+        MissingFileError: there is no such file.
+        SensorFileError: the archive cannot be read or its array is not (N, 4) of floats.
+    """
+    data = read_npz(path, "lidar")
+    if data.ndim != 2 or data.shape[1] != 4 or data.dtype.kind != "f":
+        raise SensorFileError(
+            f"{path}: expected points (N, 4) of floats, found shape {data.shape} of {data.dtype}; {REMEDY}"
+        )
+    if raw:
+        return data
+    data = np.where(in_range(data), data, np.nan)
+    return LidarPointCloud(flip_points(data[:, :3]), data[:, 3].astype(np.float32), "lidar")
+
+
+def write_lidar(path: Path, xyz: ArrayLike, intensity: ArrayLike) -> None:
+    """Write points (N, 3) of the right-handed LiDAR frame, metres, and their intensity (N,).
+
+    As in the release: numbers of single precision, stored as float64.
+    """
+    points = flip_points(checked("xyz", xyz, (None, 3)))
+    values = checked("intensity", intensity, (len(points),))
+    write_npz(path, np.column_stack([points, values]).astype(np.float32).astype(np.float64), level=_LEVEL)
+
+
+TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 8, "vehicle": 10}
+"""The CARLA semantic tags that the reference renderer uses."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BevImage(ShortRepr):
+    """What lies around an agent, seen from above; as stored, forward is up and left is left.
+
+    A point x forward, y left of the agent, metres, is at row 599.5 − x / resolution, column 599.5 − y / resolution.
+
+    Attributes:
+        semantic: (1200, 1200) uint8, CARLA's semantic tag (`TAGS`), read-only.
+        instance: (1200, 1200) uint16, the simulator's own object id (not the label's actor id), read-only.
+        resolution: metres a pixel.
+    """
+
+    semantic: ByteArray
+    instance: NDArray[np.uint16]
+    resolution: float = BEV_RESOLUTION
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        object.__setattr__(self, "semantic", readonly(self.semantic))
+        object.__setattr__(self, "instance", readonly(self.instance))
+
+
+@overload
+def read_bev(path: ReleasePath, *, raw: Literal[False] = False) -> BevImage: ...
+@overload
+def read_bev(path: ReleasePath, *, raw: Literal[True]) -> ByteArray: ...
+def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
+    """The BEV camera's array.
+
+    Args:
+        path: the file.
+        raw: return the file's own array (1200, 1200, 3) uint8 instead; channel 2 is the tag, 1 and 0 the id's low
+            and high byte.
+
+    Raises:
+        MissingFileError: there is no such file.
+        SensorFileError: the archive cannot be read or its array has another shape or type.
+    """
+    data = read_npz(path, "bev")
+    if data.shape != (*BEV_SHAPE, 3) or data.dtype != np.uint8:
+        raise SensorFileError(
+            f"{path}: expected shape {(*BEV_SHAPE, 3)} of uint8, found {data.shape} of {data.dtype}; {REMEDY}"
+        )
+    if raw:
+        return data
+    instance = data[..., 1] + data[..., 0].astype(np.uint16) * 256
+    return BevImage(data[..., 2].copy(), instance)
+
+
+def write_bev(path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = FAST) -> None:
+    """Write tags and object ids, both (1200, 1200), forward up; `level` is that of `npz.write_npz`."""
+    high, low = instance >> 8, instance & 255
+    write_npz(path, np.stack([high, low, semantic], axis=-1).astype(np.uint8), level=level)

@@ -13,7 +13,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.release import BevImage
-from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range
 from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
 from deepaccident_devkit.render.chips import keep_free

@@ -3,8 +3,7 @@
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
-
-_SIGNS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]], dtype=np.float64)
+from deepaccident_devkit.geometry.footprints import gaps_of_pairs
 
 
 def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:
@@ -36,10 +35,7 @@ def gap(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: Fl
 
     Two disjoint rectangles are nearest at a corner of one of them.
     """
-    from_a = _corner_distance(poses_a, size_a, poses_b, size_b)
-    from_b = _corner_distance(poses_b, size_b, poses_a, size_a)
-    overlapping = separation(poses_a, size_a, poses_b, size_b) <= 0
-    return np.where(overlapping, 0.0, np.minimum(from_a, from_b))
+    return gaps_of_pairs(_footprints(poses_a, size_a), _footprints(poses_b, size_b))
 
 
 def _relative(poses: FloatArray, points: FloatArray) -> FloatArray:
@@ -49,14 +45,7 @@ def _relative(poses: FloatArray, points: FloatArray) -> FloatArray:
     return np.stack([cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]], axis=-1)
 
 
-def _corner_distance(
-    poses: FloatArray, size: FloatArray, corner_poses: FloatArray, corner_size: FloatArray
-) -> FloatArray:
-    """The distance (…) from each rectangle at `poses` to the nearest corner of the one at `corner_poses`."""
-    offsets = corner_size[..., None, :] / 2 * _SIGNS
-    cos, sin = np.cos(corner_poses[..., None, 2]), np.sin(corner_poses[..., None, 2])
-    corners = corner_poses[..., None, :2] + np.stack(
-        [cos * offsets[..., 0] - sin * offsets[..., 1], sin * offsets[..., 0] + cos * offsets[..., 1]], axis=-1
-    )
-    outside = np.maximum(np.abs(_relative(poses[..., None, :], corners)) - size[..., None, :] / 2, 0.0)
-    return np.asarray(np.hypot(outside[..., 0], outside[..., 1]).min(axis=-1))
+def _footprints(poses: FloatArray, size: FloatArray) -> FloatArray:
+    """Rectangles (…, 5) as `geometry.footprints` has them: x, y, length, width, yaw."""
+    sizes = np.broadcast_to(size, (*poses.shape[:-1], 2))
+    return np.concatenate([poses[..., :2], sizes, poses[..., 2:]], axis=-1)

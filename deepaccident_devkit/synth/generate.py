@@ -1,24 +1,186 @@
-"""Making a synthetic release."""
+"""Making a synthetic release, in a folder beside its place, so that a later call can continue after an interruption.
+
+Several processes and hosts may record parts of its scenarios at once. One that has the folder alone puts them together.
+"""
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import dataclass
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import is_writable_folder, path_of, place_in
-from deepaccident_devkit.parallel import Places, Progress
+from deepaccident_devkit.files import is_writable_folder, path_of, place_in, remove_in, temporary_of, write_bytes
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.parallel import Places, Progress, Store
+from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.release.store.names import SPLIT_FILE_FOLDER
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios, plan_splits
 from deepaccident_devkit.synth.recording import RecordingJob, forget_scenario, parts_of, record_scenario
 from deepaccident_devkit.synth.sensors.caster import require_embree
-from deepaccident_devkit.synth.unfinished import Unfinished, check_free, unfinished_release
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
+
+_CONFIG_FILE = "config.json"
+_MADE = "made"
+
+
+@dataclass(frozen=True, slots=True)
+class Unfinished:
+    """The hidden folder of a release that is being made; cheap to pickle.
+
+    Attributes:
+        out: the place that the release will have; absolute.
+    """
+
+    out: Path
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies; raises OutputFolderError if it is a link."""
+        return place_in(self.out.parent, f".{self.out.name}.unfinished", opened=True)
+
+    @property
+    def store(self) -> Store:
+        """What says which parts are made, and keeps others from recording the same."""
+        return Store(self.folder, self.out, "makes the release", ConfigError)
+
+    @property
+    def release(self) -> Path:
+        """The release, as far as it is made."""
+        return place_in(self.folder, "release", opened=True)
+
+    def part(self, name: str) -> Path:
+        """Where a part of a scenario is recorded, as in a release of its own."""
+        return place_in(self.folder, f"parts/{name}", opened=True)
+
+    def clear(self, name: str) -> None:
+        """Remove the incomplete files of a part that was interrupted."""
+        remove_in(self.folder, f"parts/{name}")
+
+    def is_made(self, name: str) -> bool:
+        """Whether a part is complete."""
+        return self.store.kept(name, _MADE) is not None
+
+    def note(self, name: str) -> None:
+        """Remember that a part is complete; raises ConfigError if it was removed meanwhile."""
+        if not (self.folder / _CONFIG_FILE).exists():
+            raise ConfigError(f"{self.folder}: was removed while parts of the release were recorded; make it again")
+        self.store.keep(name, _MADE, b"")
+
+    def gather(self, names: Iterable[str]) -> None:
+        """Move the files of a scenario's parts into the release, if they are not there yet."""
+        for name in names:
+            if self.part(name).is_dir():
+                _merge(self.part(name), self.release)
+
+    def complete(self) -> None:
+        """Move the release into its place, and remove the folder."""
+        if self.out.is_dir():
+            self.out.rmdir()
+        self.release.replace(self.out)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+@contextmanager
+def unfinished_release(unfinished: Unfinished, config: SynthConfig) -> Iterator[Callable[[], bool]]:
+    """Work on a release in the block; if nothing of it is made at the end, nothing is left.
+
+    Args:
+        unfinished: its folder.
+        config: its settings.
+
+    Yields:
+        A function that waits until this process has the folder alone; whether no other one has completed the release.
+
+    Raises:
+        ConfigError: its place is taken, the unfinished release is of another configuration or version, or something
+            cannot be written.
+    """
+    store, settings = unfinished.store, unfinished.folder / _CONFIG_FILE
+
+    def begin() -> None:
+        check_free(unfinished.out)  # who held the lock may have completed it
+        _write_or_compare(settings, config)
+
+    with store.shared(begin) as turn:
+        _write_or_compare(settings, config)
+        try:
+            yield turn.alone
+        finally:
+            nothing = unfinished.folder.is_dir() and not any(unfinished.folder.glob("kept/*"))
+            if nothing and turn.alone(wait=False):
+                shutil.rmtree(unfinished.folder, ignore_errors=True)
+
+
+def check_free(out: Path) -> None:
+    """Raise ConfigError unless a release can be made there: nothing is, or an empty folder."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
+
+
+def _write_or_compare(path: Path, config: SynthConfig) -> None:
+    wanted = _as_json(config)
+    if not path.exists():
+        write_bytes(path, json.dumps(wanted, indent=1).encode())
+        return
+    there = _parsed(path)
+    for name, value in wanted.items():
+        found = there.get(name)
+        if found != value:
+            differs = "spec" if name == "spec" else f"{name}: {shortened(repr(found))} there, {value!r} asked for"
+            raise ConfigError(
+                f"{path.parent}: holds an unfinished release of another configuration ({differs}); ask for the same "
+                "to finish it, or remove the folder"
+            )
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    text = _text(path)
+    try:
+        there = parsed_json(text.encode())
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}; remove its folder") from error
+    return there if isinstance(there, dict) else {}
+
+
+def _text(path: Path) -> str:
+    """A text file's content; raises ConfigError."""
+    try:
+        return read_bytes(path, "spec").decode()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: {fault_text(error)}; make it readable, or remove it") from error
+
+
+def _as_json(config: SynthConfig) -> dict[str, Any]:
+    """All that the bytes of a release depend on, as JSON returns it; of the scenario file its text."""
+    text = None if config.spec is None else _text(config.spec)
+    fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
+    as_read: dict[str, Any] = json.loads(json.dumps(fields))
+    return as_read
+
+
+def _merge(part: Path, release: Path) -> None:
+    """Move a part's files to their places, and remove the part.
+
+    Temporary files go with it: only those leave some whose locks do not keep others out, and the part is complete.
+    """
+    for folder, _, names in os.walk(part):
+        place = place_in(release, Path(folder).relative_to(part), opened=True)
+        place.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            if temporary_of(name) is None:
+                Path(folder, name).replace(place / name)
+    shutil.rmtree(part)
+
 
 _USUAL_FRAMES = 70
 """About how many frames a scenario has if the configuration does not say it."""

@@ -26,7 +26,7 @@ from deepaccident_devkit.synth.plan import ScenarioPlan
 from deepaccident_devkit.synth.roads import Arm
 from deepaccident_devkit.synth.scenario import Scenario, build_scenario
 from deepaccident_devkit.synth.sensors.agents import Agent
-from deepaccident_devkit.synth.sensors.lidar import Scan
+from deepaccident_devkit.synth.sensors.lidar import Scan, intensity
 from deepaccident_devkit.synth.sensors.rig import Rig, make_rig
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, LIDAR, frame_timestamp
@@ -156,7 +156,7 @@ class _Recorder:
     def _record_arrays(self, scene: Scene, points: Scan, agent: Agent, frame: int) -> None:
         """Write the point cloud, and if there are labels also the BEV array, whose instances are labels too."""
         place = real_path(self.folder.channel_path(agent.name, LIDAR, frame))
-        write_lidar(place, points.xyz, self.rig.intensity(points))
+        write_lidar(place, points.xyz, intensity(points, self.rig.air))
         if self.labelled:
             bev = self.rig.bev(scene, agent)
             write_bev(real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)), bev.semantic, bev.instance)

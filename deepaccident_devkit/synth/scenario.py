@@ -2,21 +2,22 @@
 
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import Collision, Meta
-from deepaccident_devkit.synth.actors import Actor, Actors, Sampled, Uniform
-from deepaccident_devkit.synth.bodies import Body
+from deepaccident_devkit.synth.actors import Actor, Actors, Body, Sampled, Snapshot, Uniform
 from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.plan import ScenarioPlan
+from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios
 from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.stage import World, random_world
+from deepaccident_devkit.synth.traffic.casting import unplanned
 from deepaccident_devkit.synth.traffic.drama import (
     Performance,
     Recorded,
@@ -29,11 +30,10 @@ from deepaccident_devkit.synth.traffic.drama import (
     try_accident,
     usual_duration,
 )
-from deepaccident_devkit.synth.traffic.kinematics import PERIOD
-from deepaccident_devkit.synth.traffic.misses import Miss, by_far, misses_text
-from deepaccident_devkit.synth.traffic.signals import SignalPlan
-from deepaccident_devkit.synth.traffic.unplanned import unplanned
-from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID, VEHICLE_AGENTS, WARM_UP_FRAMES, AgentName
+from deepaccident_devkit.synth.traffic.driving import PERIOD
+from deepaccident_devkit.synth.traffic.impact import Miss, by_far, contact_side, misses_text
+from deepaccident_devkit.synth.traffic.rights import SignalPlan
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, STATIC_ACTOR_ID, VEHICLE_AGENTS, WARM_UP_FRAMES, AgentName
 
 AGENT_OF_ROLE: Mapping[Role, AgentName] = {
     "ego": "ego_vehicle",
@@ -255,3 +255,59 @@ def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
     """The agents of the two who are timed to meet; None for a road user that is no agent, or if nobody is timed."""
     first, second = (stage.users[row] for row in stage.cast.pair) if stage.cast.pair else (None, None)
     return AGENT_OF_ROLE.get(first.role) if first else None, AGENT_OF_ROLE.get(second.role) if second else None
+
+
+def checked_text(config: SynthConfig, *, progress: bool = False) -> str:
+    """What happens in the first pair of a release of a scenario file, as text of some lines.
+
+    Args:
+        config: the settings of the release; `spec` is the file.
+        progress: whether to show the number of draws if they take long.
+
+    Raises:
+        ConfigError: there is no file, it is no possible scenario, or its accident or twin cannot be made.
+    """
+    if config.spec is None:
+        raise ConfigError("spec: nothing to check; give a scenario file")
+    began = perf_counter()
+    plans = plan_scenarios(replace(config, scenarios=2, sensors="none"))
+    made = [build_scenario(config, plan, progress=progress) for plan in plans if plan.pair == 0]
+    lines = [f"{config.spec}: can be simulated; one draw of it, with seed {config.seed}:"]
+    for scenario in made:
+        lines += [f"  {_outcome(scenario)}", f"    {_extent(scenario)}"]
+    return "\n".join([*lines, f"checked in {perf_counter() - began:.1f} s; nothing is written"])
+
+
+def _outcome(scenario: Scenario) -> str:
+    """Who collides with whom, when, how fast and with which sides."""
+    collision, meet = scenario.meta.collision, scenario.spec.meet
+    if collision is None or meet is None:
+        return "normal: nobody collides"
+    time = _duration(scenario)
+    now = scenario.actors.at(time)
+    rows = [scenario.actors.row_of(actor) for actor in collision.ids]
+    speeds = np.hypot(*now.velocities[rows].T)
+    both = [
+        f"{role} ({scenario.actors.all[pair[0]].category}, {speed:.1f} m/s, {_side(scenario, pair, now)})"
+        for role, speed, pair in zip(meet.actors, speeds, (rows, rows[::-1]), strict=True)
+    ]
+    return f"accident: {' and '.join(both)} collide at {time:.1f} s; found in draw {scenario.draws}"
+
+
+def _side(scenario: Scenario, pair: list[int], now: Snapshot) -> str:
+    """The side of the first of a pair that is hit."""
+    side = contact_side(now.poses[pair], scenario.actors.size[pair, :2])
+    return f"{side} side" if side in ("left", "right") else side
+
+
+def _extent(scenario: Scenario) -> str:
+    """How long it is and how many take part."""
+    parked = sum(actor.parked for actor in scenario.actors.all)
+    moving = len(scenario.actors) - parked
+    frames = f"{scenario.frames} frames ({_duration(scenario):.1f} s)"
+    return f"{frames}, {moving} road users that move, {parked} parked; {scenario.weather}, {scenario.time_of_day}"
+
+
+def _duration(scenario: Scenario) -> float:
+    """Seconds from the first to the last frame."""
+    return (scenario.frames - 1) * FRAME_PERIOD

@@ -24,8 +24,7 @@ from deepaccident_devkit.taxonomy import (
     AgentName,
     Layout,
 )
-from deepaccident_devkit.testing.recording import Recorder
-from deepaccident_devkit.testing.scene import AGENT_IDS, PAIR, SmallScene, small_scene
+from deepaccident_devkit.testing.scene import AGENT_IDS, PAIR, Recorder, SmallScene, small_scene
 from deepaccident_devkit.text import choice, settle_choices
 
 _MOST_FRAMES = 100

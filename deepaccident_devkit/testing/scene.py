@@ -1,12 +1,70 @@
-"""Who drives where in a small release: a junction at the ground frame's origin, all with constant velocities."""
+"""The small releases of the test kit: a rig, road users, sensors, and how they are written."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, VEHICLE_AGENTS, AgentName
+from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, as_floats
+from deepaccident_devkit.geometry import SE3, Boxes, BoxVisibility, PinholeCamera
+from deepaccident_devkit.release import (
+    Calib,
+    Labels,
+    ScenarioFolder,
+    label_from_world_velocity,
+    write_bev,
+    write_calib,
+    write_image,
+    write_label,
+    write_lidar,
+)
+from deepaccident_devkit.release.npz import TAGS
+from deepaccident_devkit.release.store import real_path
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    BEV_CAMERA,
+    BEV_RESOLUTION,
+    BEV_SHAPE,
+    CAMERAS,
+    CATEGORIES,
+    FRAME_PERIOD,
+    INFRASTRUCTURE,
+    LIDAR,
+    OWN_ACTOR_ID,
+    UNTRACKED_ID,
+    VEHICLE_AGENTS,
+    AgentName,
+)
+
+_LIDAR_HEIGHT = 1.94
+_CAMERA_YAW = dict(zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True))
+_CAMERA_RADIUS, _CAMERA_DROP = 1.0, 0.3
+"""Metres from the LiDAR's axis to a camera, and from the LiDAR down to it."""
+_OPTICAL_FROM_FORWARD = SE3.from_rotation([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def cameras(image_size: tuple[int, int]) -> dict[str, PinholeCamera]:
+    """Channel → camera for images of `image_size` (width, height): the back camera has 110°, the others 70°."""
+    fields = {channel: np.deg2rad(110.0 if channel == "Camera_Back" else 70.0) for channel in CAMERAS}
+    return {channel: PinholeCamera.from_field_of_view(*image_size, field) for channel, field in fields.items()}
+
+
+def calib_of(agent: AgentName, world_from_ego: SE3, image_size: tuple[int, int]) -> Calib:
+    """An agent's calib of one frame."""
+    height = 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT
+    return Calib(
+        ego_from_lidar=SE3.from_yaw(0.0, (0.0, 0.0, height)),
+        world_from_ego=world_from_ego,
+        camera_from_lidar={channel: _camera_from_lidar(yaw) for channel, yaw in _CAMERA_YAW.items()},
+        intrinsic={channel: camera.intrinsic for channel, camera in cameras(image_size).items()},
+    )
+
+
+def _camera_from_lidar(yaw: float) -> SE3:
+    place = (_CAMERA_RADIUS * np.cos(yaw), _CAMERA_RADIUS * np.sin(yaw), -_CAMERA_DROP)
+    return _OPTICAL_FROM_FORWARD @ SE3.from_yaw(yaw, place).inverse()
+
 
 AGENT_IDS = (1223, 1236, 1212, 1237)
 """Actor ids of `taxonomy.VEHICLE_AGENTS`."""
@@ -110,3 +168,178 @@ def small_scene(rng: np.random.Generator, *, frames: int, accident: bool) -> Sma
     if not accident:
         agents[2:] = [replace(user, end=(user.end[0], user.end[1] - _DELAY)) for user in agents[2:]]
     return SmallScene(world_from_ground=SE3.from_yaw(yaw, (x, y, 0.3)), users=(*agents, *_TRAFFIC), frames=frames)
+
+
+_MOST_POINTS, _POINT_METRES = 20, 120.0
+"""The most points on a box, and the number of points on a box 1 m away; it becomes smaller with the distance."""
+_GROUND_RADII, _GROUND_POINTS = (6.0, 12.0, 24.0), 12
+_LIDAR_RANGE = 65.0
+_LEAST_DEPTH = 0.5
+_COLORS = np.array([(200, 40, 40), (40, 80, 200), (40, 160, 60), (220, 180, 40), (160, 60, 180), (240, 120, 40)])
+"""RGB of each of `taxonomy.CATEGORIES`."""
+_MIDDLE = (BEV_SHAPE[0] - 1) / 2
+
+
+def cloud_of(boxes: Boxes, lidar_height: float) -> FloatArray:
+    """Points (N, 3) in the LiDAR frame, metres, in the boxes and on the ground, rounded to the file's float32.
+
+    Args:
+        boxes: boxes in the LiDAR frame.
+        lidar_height: height of the LiDAR above the ground, metres.
+    """
+    parts = [_ground(lidar_height)]
+    distance = np.linalg.norm(boxes.center[:, :2], axis=1)
+    counts = np.clip(_POINT_METRES / np.maximum(distance, 1.0), 1, _MOST_POINTS).astype(int) * (distance < _LIDAR_RANGE)
+    for center, size, yaw, count in zip(boxes.center, boxes.size, boxes.yaw, counts.tolist(), strict=True):
+        inside = _spread(count) * size
+        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        parts.append(center + inside @ turn.T)
+    return np.concatenate(parts).astype(np.float32).astype(np.float64)
+
+
+def picture_of(
+    boxes: Boxes, camera: PinholeCamera, *, sky: tuple[int, int, int], road: tuple[int, int, int]
+) -> ByteArray:
+    """A picture (H, W, 3), RGB: sky, road, and each box's outline filled with its class's colour, far ones first.
+
+    Args:
+        boxes: boxes in the camera's optical frame.
+        camera: its optics.
+        sky: RGB; sky and road should differ between all pictures, so that no two files are equal.
+        road: RGB.
+    """
+    import cv2
+
+    picture = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
+    horizon = camera.height // 2
+    picture[:horizon], picture[horizon:] = sky, road
+    corners = boxes.corners()
+    for row in np.argsort(-boxes.center[:, 2]).tolist():
+        pixels, depth = camera.project(corners[row])
+        if (depth > _LEAST_DEPTH).all():
+            outline = cv2.convexHull(np.rint(np.clip(pixels, -1e4, 1e4)).astype(np.int32))
+            cv2.fillConvexPoly(picture, outline, _COLORS[boxes.category[row]].tolist())
+    return picture
+
+
+def top_view_of(boxes: Boxes, object_ids: NDArray[np.uint16]) -> tuple[ByteArray, NDArray[np.uint16]]:
+    """Tags (1200, 1200) uint8 and object ids (1200, 1200) uint16 around an agent: up is forward, left is left.
+
+    Args:
+        boxes: boxes in the ego or LiDAR frame.
+        object_ids: (N,) the simulator's ids of the boxes.
+    """
+    import cv2
+
+    semantic = np.full(BEV_SHAPE, TAGS["road"], dtype=np.uint8)
+    instance = np.zeros(BEV_SHAPE, dtype=np.uint16)
+    rows = zip(boxes.bottom_corners(), boxes.category.tolist(), object_ids.tolist(), strict=True)
+    for corners, code, number in rows:
+        places = corners[:, :2]
+        if np.abs(places).max() * 2 < BEV_RESOLUTION * BEV_SHAPE[0]:
+            outline = np.rint(_MIDDLE - places[:, ::-1] / BEV_RESOLUTION).astype(np.int32)  # OpenCV: column, row
+            tag = TAGS["pedestrian" if CATEGORIES[code] == "pedestrian" else "vehicle"]
+            cv2.fillConvexPoly(semantic, outline, tag)
+            cv2.fillConvexPoly(instance, outline, number)
+    return semantic, instance
+
+
+def _spread(count: int) -> FloatArray:
+    """(count, 3) places in a box with edges of 1 around 0, evenly distributed, a little away from its faces."""
+    steps = np.arange(1, count + 1)[:, None] * (0.8191725, 0.6710436, 0.5497005)  # the R3 sequence
+    return as_floats((steps % 1.0 - 0.5) * 0.9)
+
+
+def _ground(lidar_height: float) -> FloatArray:
+    angle = np.linspace(0.0, 2 * np.pi, _GROUND_POINTS, endpoint=False)
+    rings = [np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]) for radius in _GROUND_RADII]
+    places = np.concatenate(rings)
+    return np.column_stack([places, np.full(len(places), -lidar_height)])
+
+
+_BEV_COMPRESSION = 6
+"""It gives a quarter of the bytes of the writer's default, which is faster."""
+
+
+class Recorder:
+    """Writes what one agent recorded at one frame, file by file.
+
+    Args:
+        folder: the scenario's folder.
+        scene: what happens in the scenario.
+        agent: the agent that records.
+        frame: number of the frame, counted from 1.
+        image_size: width and height, pixels.
+    """
+
+    def __init__(
+        self, folder: ScenarioFolder, scene: SmallScene, agent: AgentName, frame: int, image_size: tuple[int, int]
+    ) -> None:
+        self._folder, self._agent, self._frame = folder, agent, frame
+        self._cameras = cameras(image_size)
+        self._calib = calib_of(agent, scene.world_from_ego(agent, frame), image_size)
+        world = scene.boxes(frame)
+        self._own = np.arange(len(world)) < (agent in VEHICLE_AGENTS)  # the own row, if any, comes first
+        if agent in VEHICLE_AGENTS:
+            own = VEHICLE_AGENTS.index(agent)
+            world = world.select([own, *(row for row in range(len(world)) if row != own)])
+        self._velocity = world.velocity[:, :2]
+        lidar_from_world = (self._calib.world_from_ego @ self._calib.ego_from_lidar).inverse()
+        self._boxes = world.transform(lidar_from_world, "lidar")
+        height = self._calib.ego_from_lidar.translation[2] if self._own.any() else POLE_HEIGHT
+        self._cloud = cloud_of(self._boxes.select(~self._own), float(height))
+
+    def write_calib(self) -> None:
+        """The poses and cameras."""
+        write_calib(real_path(self._folder.calib_path(self._agent, self._frame)), self._calib)
+
+    def write_label(self) -> None:
+        """The boxes: the own row is first; the pedestrian who is far away is not tracked."""
+        labels = self._labels()
+        points = labels.boxes().count_points(self._cloud)
+        write_label(real_path(self._folder.label_path(self._agent, self._frame)), replace(labels, num_lidar_pts=points))
+
+    def write_channel(self, channel: str) -> None:
+        """The file of one sensor."""
+        path = real_path(self._folder.channel_path(self._agent, channel, self._frame))
+        if channel == LIDAR:
+            write_lidar(path, self._cloud, np.linspace(0.0, 1.0, len(self._cloud)))
+        elif channel == BEV_CAMERA:
+            object_ids = np.arange(1, len(self._boxes) + 1, dtype=np.uint16)
+            write_bev(path, *top_view_of(self._boxes, object_ids), level=_BEV_COMPRESSION)
+        else:
+            write_image(path, self._picture(channel))
+
+    def _picture(self, channel: str) -> ByteArray:
+        boxes = self._boxes.select(~self._own).transform(self._calib.camera_from_lidar[channel], channel)
+        sky = (120 + 12 * AGENTS.index(self._agent), 130 + 12 * CAMERAS.index(channel), 200)
+        road = (40 + self._frame, 40 + self._frame, 45 + self._frame)
+        return picture_of(boxes, self._cameras[channel], sky=sky, road=road)
+
+    def _labels(self) -> Labels:
+        """The contents of the label, without the numbers of points."""
+        boxes = self._boxes
+        yaw = np.where(self._own, 0.0, boxes.yaw)
+        return Labels(
+            raw=False,
+            num_boxes=np.array([len(boxes)]),
+            agent_velocity=self._velocity[self._own] if self._own.any() else np.zeros((1, 2)),
+            category=boxes.category,
+            center=boxes.center,
+            size=boxes.size,
+            yaw=yaw,
+            velocity=label_from_world_velocity(self._velocity, yaw),
+            actor_id=np.select(
+                [self._own, boxes.actor_id == FAR_ACTOR_ID], [OWN_ACTOR_ID, UNTRACKED_ID], boxes.actor_id
+            ),
+            num_lidar_pts=np.zeros(len(boxes), dtype=np.int64),
+            camera_visible=self._visible(),
+        )
+
+    def _visible(self) -> BoolArray:
+        """(N,) whether a corner of the box is in any of the pictures; no actor hides another."""
+        seen = np.zeros(len(self._boxes), dtype=bool)
+        for channel, camera in self._cameras.items():
+            boxes = self._boxes.transform(self._calib.camera_from_lidar[channel], channel)
+            seen |= camera.boxes_in_image(boxes, BoxVisibility.ANY)
+        return seen & ~self._own

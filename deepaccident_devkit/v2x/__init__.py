@@ -23,11 +23,10 @@ from deepaccident_devkit.v2x.cooperation import (
     visible_instances,
 )
 from deepaccident_devkit.v2x.link import Link, PoseNoise
-from deepaccident_devkit.v2x.message_sizes import MessageSize, message_sizes
-from deepaccident_devkit.v2x.poses import future_egomotion, relative_pose_to_ego
+from deepaccident_devkit.v2x.messages import MessageSize, message_sizes
+from deepaccident_devkit.v2x.poses import future_egomotion, relative_pose_to_ego, transform
 from deepaccident_devkit.v2x.projection import ImagePoints, map_pointcloud_to_image, project_to_image
 from deepaccident_devkit.v2x.tracks import Trajectory, trajectory
-from deepaccident_devkit.v2x.transforms import transform
 
 __all__ = [
     "AGENT_CONFIGS",

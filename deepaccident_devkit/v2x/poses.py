@@ -1,4 +1,4 @@
-"""Poses of agents relative to each other and to their own next moment, as functions of arrays.
+"""Poses of agents, and transforms between them.
 
 See docs/released_code.md, Poses. Every function works for both kinds of handedness: right-handed poses (the devkit's)
 give right-handed 6-vectors, CARLA's raw poses give those of the released code; `geometry.handedness.flip_six_vector`
@@ -12,9 +12,41 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, checked
-from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, six_vectors
 from deepaccident_devkit.geometry.se3 import inverses
+
+
+def transform(
+    dataset: Dataset,
+    target_sample: RowArgument,
+    source_sample: RowArgument,
+    target: str = "ego",
+    source: str = "ego",
+) -> SE3:
+    """The transform `target_from_source` between frames of any two agents and moments of one scenario.
+
+    Args:
+        dataset: the release.
+        target_sample: token or record of the sample to which the target frame belongs.
+        source_sample: token or record of the sample to which the source frame belongs.
+        target: `world`, `ego`, `lidar` or a channel (cameras: the optical frame).
+        source: the same choice as for `target`.
+
+    Raises:
+        TokenError: no such sample.
+        ChoiceError: no such frame, or the samples are of two scenarios, whose worlds have nothing in common.
+    """
+    scenarios = [dataset.get("sample", sample)["scenario_token"] for sample in (target_sample, source_sample)]
+    if scenarios[0] != scenarios[1]:
+        raise ChoiceError(
+            f"transform: expected two samples of one scenario, found {scenarios[0]} and {scenarios[1]}; "
+            "scenarios take place in different worlds"
+        )
+    world_from_target = dataset.world_from(target_sample, target)
+    return world_from_target.inverse() @ dataset.world_from(source_sample, source)
+
 
 Poses = Sequence[SE3] | ArrayLike
 """Poses of several agents or moments: SE3 objects, or an array (K, 4, 4)."""

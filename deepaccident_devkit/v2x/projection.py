@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import LidarPointCloud, PinholeCamera
-from deepaccident_devkit.v2x.transforms import transform
+from deepaccident_devkit.v2x.poses import transform
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,8 +6,7 @@ from deepaccident_devkit.validation.checks import ScenarioCheck
 from deepaccident_devkit.validation.codes import CODES
 from deepaccident_devkit.validation.completeness import release_completeness
 from deepaccident_devkit.validation.completeness_report import Completeness, FileCount, LackingScenario, SplitFiles
-from deepaccident_devkit.validation.report import ValidationReport
-from deepaccident_devkit.validation.validate import findings, validate_release
+from deepaccident_devkit.validation.validate import ValidationReport, findings, validate_release
 
 __all__ = [
     "CODES",

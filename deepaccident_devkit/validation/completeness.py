@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import ReleaseError, TokenError
 from deepaccident_devkit.parallel import Places, run_batch
@@ -33,7 +33,9 @@ from deepaccident_devkit.validation.completeness_report import (
 )
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 _META = "meta"
 _KINDS = ("calib", "label", *CHANNELS)
@@ -72,9 +74,7 @@ def release_completeness(
     version: str = "v1",
     *,
     scenarios: Collection[str] | None = None,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> Completeness:
     """Count which files are here and which are missing, by split, agent and channel.
 
@@ -85,23 +85,25 @@ def release_completeness(
         root: the release, as of `DeepAccident`: a folder, archives, or a URL.
         version: `v1` or `v1-mini`.
         scenarios: tokens of the scenarios to look at; None for all.
-        workers: processes to use; see `parallel.run_batch`.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a progress bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         DatarootError: the folder is missing, holds no release, or a part of it cannot be listed.
         VersionError: the version is unknown or not under this folder.
         SplitFileError: a split file cannot be read.
         TokenError: one of `scenarios` is not there.
-        WorkerError: a worker was killed, or cannot do the work.
     """
     layout = find_release(open_dataroot(root), version)
-    return completeness(layout, scenarios, str(root), workers=workers, executor=executor, progress=progress)
+    return completeness(layout, scenarios, str(root), **how)
 
 
 def completeness(
-    layout: ReleaseLayout, scenarios: Collection[str] | None, dataroot: str, *, lenient: bool = False, **how: Any
+    layout: ReleaseLayout,
+    scenarios: Collection[str] | None,
+    dataroot: str,
+    *,
+    lenient: bool = False,
+    **how: Unpack[Engine],
 ) -> Completeness:
     """What `release_completeness` gives of a release that was found; what cannot be listed may count as missing.
 
@@ -110,7 +112,7 @@ def completeness(
         scenarios: tokens of the scenarios to look at; None for all.
         dataroot: its name.
         lenient: whether a folder that cannot be listed counts as empty.
-        **how: `workers`, `executor` and `progress`.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
     """
     folders = chosen_scenarios(layout, scenarios)
     listing = partial(_files_here, lenient=lenient)

@@ -8,7 +8,7 @@ from itertools import groupby
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
-from deepaccident_devkit.text import columns_text, size_text
+from deepaccident_devkit.text import columns_text, counted, size_text
 
 _LISTED = 10
 """Scenarios that the text lists at most."""
@@ -149,7 +149,7 @@ class Completeness(Report):
         total = self.total
         missing = f"{total.missing:,} are missing{f' (size: {_estimate(total)})' if total.missing else ''}"
         lines = [
-            f"{_counted(self.scenarios)} here, {self.whole:,} of them whole",
+            f"{counted(self.scenarios, 'scenario')} here, {self.whole:,} of them whole",
             f"{total.here:,} of their {total.expected:,} files are here ({size_text(total.bytes_here)}), {missing}",
         ]
         return "\n".join(lines)
@@ -172,7 +172,7 @@ def summed(counts: Iterable[FileCount], channel: str, agent: str | None = None) 
 
 def _split_text(name: str, split: SplitFiles) -> str:
     of_release = "" if split.expected is None else f" of the release's {split.expected}"
-    lines = [f"split {name}: {_counted(split.scenarios)}{of_release} here, {split.whole:,} of them whole"]
+    lines = [f"split {name}: {counted(split.scenarios, 'scenario')}{of_release} here, {split.whole:,} of them whole"]
     if split.absent_agents:
         absent = ", ".join(f"{agent} ({count:,})" for agent, count in split.absent_agents.items())
         lines.append(textwrap.fill(f"agents that are absent, and from how many scenarios: {absent}", _WIDTH))
@@ -239,7 +239,3 @@ def _estimate(count: FileCount) -> str:
     if count.bytes_missing is None:
         return "unknown"
     return f"~{size_text(count.bytes_missing)}" if count.missing else "-"
-
-
-def _counted(scenarios: int) -> str:
-    return f"{scenarios:,} scenario{'' if scenarios == 1 else 's'}"

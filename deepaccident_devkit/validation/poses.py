@@ -1,14 +1,23 @@
-"""Whether agents are where vehicles can be, and their sensors where the format says (docs/format.md, Calib)."""
+"""Checks over the frames of a scenario: poses, velocities, and boxes without a track."""
 
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.sensor_rows import ROTATION_TOLERANCE, TRANSLATION_TOLERANCE
-from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
-from deepaccident_devkit.validation.subject import Subject, frames_text
+from deepaccident_devkit.tables.velocities import LEAST_BOXES, VelocityFit, velocities_that_fit
+from deepaccident_devkit.taxonomy import (
+    CAMERAS,
+    CATEGORIES,
+    FRAME_PERIOD,
+    RELEASED_VELOCITY_FRAME,
+    UNTRACKED_ID,
+    VELOCITY_FRAMES,
+)
+from deepaccident_devkit.validation.agreement import SAME_PLACE
+from deepaccident_devkit.validation.subject import Subject, frames_text, near_pairs
 
 CAMERA_YAW = dict(zip(CAMERAS, (0.0, 55.0, -55.0, 180.0, 110.0, -110.0), strict=True))
 """Degrees to the left of the agent's front."""
@@ -153,3 +162,77 @@ def _central(position: FloatArray) -> FloatArray:
 
 
 _CHECKS: tuple[Callable[[Subject, int], Iterator[Finding]], ...] = (_intrinsics, _cameras, _mounts, _path, _speed)
+
+
+_ACTOR_OFF = (3, 0.8)
+"""How many boxes of an actor, and which share of them, must not fit for a finding."""
+
+
+def check_velocities(subject: Subject, fit: VelocityFit) -> Iterator[Finding]:
+    """Say that another frame than the release's fits, that none does, or which actors' velocities do not fit."""
+    if fit.boxes < LEAST_BOXES:
+        return
+    if fit.best is not None:
+        yield from _actors_off(subject, fit.best)
+    if fit.best == RELEASED_VELOCITY_FRAME:
+        return
+    shares = ", ".join(f"{name} {count / fit.boxes:.0%}" for name, count in fit.fits.items())
+    code = "velocity-frame" if fit.best else "velocity-unexplained"
+    found = f"they are in {VELOCITY_FRAMES[fit.best]}; " if fit.best else ""
+    yield subject.finding(code, subject.token, f"{found}of {fit.boxes} moving boxes fit: {shares}")
+
+
+def _actors_off(subject: Subject, frame: str) -> Iterator[Finding]:
+    """The tracks most of whose velocities do not fit the frame that fits the rest."""
+    rows, fits = velocities_that_fit(subject.boxes, subject.velocity)
+    tracks, track = np.unique(
+        np.column_stack([subject.boxes.agent[rows], subject.label_id[rows]]), axis=0, return_inverse=True
+    )
+    track = track.reshape(-1)
+    count = np.bincount(track, minlength=len(tracks))
+    wrong = np.bincount(track[~fits[frame]], minlength=len(tracks))
+    least, share = _ACTOR_OFF
+    off = (wrong >= least) & (wrong >= share * count)
+    wrong_rows = subject.mask(rows[off[track] & ~fits[frame]])
+    yield from subject.label_findings("velocity-off", wrong_rows, "velocities do not fit the displacement")
+
+
+NEAR = 15.0
+"""Metres within which a vehicle that the agent saw is not too far away to be tracked."""
+_LEAST_BOXES = 2
+"""The number of boxes that must show it: the tracking of a single one comes and goes."""
+_VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
+
+
+def check_untracked(subject: Subject) -> Iterator[Finding]:
+    """Say which labels, or all labels of which agents, lost their ids."""
+    agents, frames = len(subject.agents), subject.num_frames
+    untracked = subject.label_id == UNTRACKED_ID
+    tracked = np.bincount(subject.boxes.sample[subject.seen], minlength=agents * frames).reshape(agents, frames)
+    rows = np.flatnonzero(untracked & (tracked == 0)[subject.boxes.agent, subject.boxes.frame - 1])
+    rows = rows[_trackable(subject, rows)]
+    shown = np.bincount(subject.boxes.sample[rows], minlength=agents * frames).reshape(agents, frames)
+    for agent in range(agents):
+        lost = np.flatnonzero(shown[agent] >= _LEAST_BOXES) + 1
+        if not tracked[agent].any() and shown[agent].sum() >= _LEAST_BOXES:
+            what = f"every id of its labels is {UNTRACKED_ID}, also of {shown[agent].sum()} boxes that can be tracked"
+            yield subject.finding("ids-untracked", subject.label_where(agent), what)
+        elif len(lost):
+            what = f"every id is {UNTRACKED_ID}, also of actors that can be tracked, {frames_text(lost)}"
+            yield subject.finding("ids-untracked", subject.label_where(agent), what)
+
+
+def _trackable(subject: Subject, rows: IntArray) -> BoolArray:
+    """Which untracked boxes (M,) of what their agent saw are near vehicles, or tracked by an agent no nearer."""
+    labels, boxes = subject.boxes.labels, subject.boxes
+    distance = np.linalg.norm(labels.center[:, :2], axis=1)
+    found: BoolArray = np.isin(labels.category[rows], _VEHICLES) & (distance[rows] < NEAR)
+    others = np.flatnonzero(subject.seen)
+    if len(rows) and len(others):
+        both = np.concatenate([rows, others])
+        pairs, _ = near_pairs(subject.centers[both], boxes.frame[both], SAME_PLACE)
+        pairs = np.sort(pairs, axis=1)
+        pairs = pairs[(pairs[:, 0] < len(rows)) & (pairs[:, 1] >= len(rows))]
+        no_nearer = distance[both[pairs[:, 1]]] >= distance[both[pairs[:, 0]]]
+        found[pairs[no_nearer, 0]] = True
+    return found & ((labels.num_lidar_pts[rows] > 0) | labels.camera_visible[rows])

@@ -113,7 +113,7 @@ class Subject:
         rows = np.flatnonzero((self.label_id == UNTRACKED_ID) & (self.boxes.agent == agent))
         if not len(rows) or not len(frames):
             return np.zeros(len(frames), dtype=bool)
-        tree = place_tree(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE)
+        tree = cKDTree(np.unique(tree_points(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE), axis=0))
         points = tree_points(places, frames, _UNTRACKED_PLACE)
         distance, _ = tree.query(points, distance_upper_bound=_UNTRACKED_PLACE)
         found: BoolArray = np.isfinite(distance)
@@ -175,13 +175,6 @@ def subject_of(files: ScenarioFiles) -> Subject:
     """What the checks start from."""
     boxes = scenario_boxes(files)
     return Subject(files=files, boxes=boxes, centers=box_rules.world_centers(boxes))
-
-
-def place_tree(places: FloatArray, moments: AnyArray, radius: float) -> cKDTree:
-    """A tree over places (M, 3), each once; those of different moments (M,) are further apart than `radius`."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(np.unique(tree_points(places, moments, radius), axis=0))
 
 
 def near_pairs(places: FloatArray, moments: AnyArray, radius: float) -> tuple[IntArray, BoolArray]:

@@ -1,7 +1,9 @@
-"""Looking at a whole release, or at one scenario: the checks in their order."""
+"""`validate`: all checks of a release, and their report."""
 
 from __future__ import annotations
 
+import sys
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,26 +18,152 @@ from deepaccident_devkit.parallel import Places, Store, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import left_aside, names_without_calib
 from deepaccident_devkit.release.store import Dataroot, checksums_compared, open_dataroot, places_of
-from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.reports import Report
+from deepaccident_devkit.tables import SEVERITIES, Finding
 from deepaccident_devkit.tables.build import read_scenario
 from deepaccident_devkit.tables.scan import scan_scenario
-from deepaccident_devkit.tables.velocities import fit_velocities, total_fit
-from deepaccident_devkit.validation.agreement import check_agreement
+from deepaccident_devkit.tables.velocities import VelocityFit, fit_velocities, total_fit
+from deepaccident_devkit.taxonomy import VELOCITY_FRAMES
+from deepaccident_devkit.text import counted
+from deepaccident_devkit.validation.agreement import check_agreement, check_story
 from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, check_key
 from deepaccident_devkit.validation.completeness import chosen_scenarios, completeness
-from deepaccident_devkit.validation.inventory import absences, take_inventory
+from deepaccident_devkit.validation.completeness_report import Completeness
+from deepaccident_devkit.validation.inventory import absences, check_splits, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
-from deepaccident_devkit.validation.poses import check_poses
-from deepaccident_devkit.validation.report import ValidationReport, worst_first
+from deepaccident_devkit.validation.poses import check_poses, check_untracked, check_velocities
 from deepaccident_devkit.validation.sensors import check_sensors
-from deepaccident_devkit.validation.split_files import check_splits
-from deepaccident_devkit.validation.story import check_story
 from deepaccident_devkit.validation.subject import make_finding, subject_of
-from deepaccident_devkit.validation.untracked import check_untracked
-from deepaccident_devkit.validation.velocities import check_velocities
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
+
+_LINES_A_SCENARIO = 8
+_ALL_LISTED = "(--all lists all)"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ValidationReport(Report):
+    """What was found in a release.
+
+    Attributes:
+        dataroot: its folder.
+        version: `v1` or `v1-mini`.
+        deep: whether sensor files were decoded.
+        scenarios: how many were looked at.
+        samples: agents times frames of those.
+        findings: worst scenario first, within it worst first.
+        files: which are here, and which are missing.
+        velocity: in which frame the labels' velocities fit the displacements.
+        velocity_frames: scenario → what its labels' velocities are in; None where it cannot be told.
+    """
+
+    dataroot: str
+    version: str
+    deep: bool
+    scenarios: int
+    samples: int
+    findings: Sequence[Finding]
+    files: Completeness
+    velocity: VelocityFit
+    velocity_frames: Mapping[str, str | None]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Severity → findings."""
+        counts = Counter(finding.severity for finding in self.findings)
+        return {severity: counts[severity] for severity in SEVERITIES}
+
+    @property
+    def is_good(self) -> bool:
+        """Whether all findings are notes, or known of the real release."""
+        return all(finding.severity == "note" or finding.known for finding in self.findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        content = Report.to_dict(self)  # no `super()`: a dataclass with slots is another class
+        content["counts"] = self.counts
+        content["velocity"]["best"] = self.velocity.best
+        return content
+
+    def to_text(self, *, notes: bool = False, whole: bool = False) -> str:
+        """A table for a terminal, worst scenario first.
+
+        Args:
+            notes: whether to list what is only worth knowing, too.
+            whole: whether to list all that was found of a scenario.
+        """
+        most = sys.maxsize if whole else _LINES_A_SCENARIO
+        blocks = [self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)]
+        return "\n\n".join(blocks)
+
+    def _head(self) -> str:
+        depth = "every file decoded" if self.deep else "labels, calib, meta and file names (--deep decodes the rest)"
+        return (
+            f"DeepAccident {self.version} at {self.dataroot}\n"
+            f"{self.scenarios} scenarios, {self.samples:,} samples: {depth}"
+        )
+
+    def _scenario_blocks(self, most: int, *, notes: bool) -> Iterator[str]:
+        by_scenario: dict[str | None, list[Finding]] = {}
+        for finding in self.findings:
+            if notes or finding.severity != "note":
+                by_scenario.setdefault(finding.scenario, []).append(finding)
+        for scenario, findings in by_scenario.items():
+            counts = Counter(finding.severity for finding in findings)
+            head = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES if counts[severity])
+            lines = [f"{scenario or 'the release'}  ({head})"]
+            lines += [_line(finding) for finding in findings[:most]]
+            if len(findings) > most:
+                lines.append(f"  … and {len(findings) - most} more {_ALL_LISTED}")
+            yield "\n".join(lines)
+
+    def _closing(self, *, notes: bool) -> Iterator[str]:
+        by_code = Counter((finding.severity, finding.code, finding.known) for finding in self.findings)
+        if by_code:
+            rank = {severity: place for place, severity in enumerate(SEVERITIES)}
+            rows = sorted(by_code.items(), key=lambda item: (rank[item[0][0]], -item[1], item[0][1]))
+            lines = [f"{'kind':<24} {'how bad':<8} {'findings':>8}"]
+            for (severity, code, known), count in rows:
+                lines.append(f"{code:<24} {severity:<8} {count:>8}{'  known of the release' if known else ''}")
+            yield "\n".join(lines)
+        if self.velocity.boxes:
+            shares = ", ".join(
+                f"{name} {count / self.velocity.boxes:.0%}" for name, count in self.velocity.fits.items()
+            )
+            best = VELOCITY_FRAMES[self.velocity.best] if self.velocity.best else "in none of the known frames"
+            found = Counter(self.velocity_frames.values())
+            scenarios = ", ".join(f"{name or 'unknown'} in {count}" for name, count in found.most_common())
+            yield (
+                f"label velocities: {best}\n"
+                f"  scenarios: {scenarios}; of {self.velocity.boxes:,} moving boxes fit: {shares}"
+            )
+        yield f"files: {self.files.section()}"
+        hidden = self.counts["note"] and not notes
+        verdict = ", ".join(counted(self.counts[severity], severity) for severity in SEVERITIES)
+        yield verdict + (" (--notes lists the notes)" if hidden else "")
+
+
+def worst_first(findings: Sequence[Finding]) -> list[Finding]:
+    """Findings grouped by scenario: the one with the most errors first, then warnings; worst first within."""
+    rank = {severity: place for place, severity in enumerate(SEVERITIES)}
+    counts: dict[str | None, Counter[str]] = {}
+    for finding in findings:
+        counts.setdefault(finding.scenario, Counter())[finding.severity] += 1
+
+    def place(finding: Finding) -> tuple[object, ...]:
+        of_scenario = counts[finding.scenario]
+        badness = [-of_scenario[severity] for severity in SEVERITIES]
+        return (finding.scenario is not None, *badness, finding.scenario or "", rank[finding.severity])
+
+    return sorted(findings, key=place)
+
+
+def _line(finding: Finding) -> str:
+    known = " (known of the release)" if finding.known else ""
+    return f"  {finding.severity:<7} {finding.code}: {finding}{known}"
 
 
 def validate_release(
@@ -43,11 +171,9 @@ def validate_release(
     version: str = "v1",
     *,
     deep: bool = False,
-    workers: int | None = None,
-    executor: Executor | None = None,
     scenarios: Collection[str] | None = None,
     parts: Path | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> ValidationReport:
     """Look for everything that is wrong, odd or missing in a release; needs no index.
 
@@ -55,25 +181,21 @@ def validate_release(
         root: the release, as of `DeepAccident`: a folder, archives, or a URL.
         version: `v1` or `v1-mini`.
         deep: also decode every image, point cloud and BEV array and hold them against the labels.
-        workers: processes to use; see `parallel.run_batch`.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         scenarios: tokens of the scenarios to look at; None for all.
         parts: folder to keep what was found in each scenario, so that the same call does only what is left, and several
             processes that are given it share the scenarios; one whose files have changed since is looked at again.
             None writes nothing.
-        progress: whether to show a progress bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         DatarootError: the folder is missing, holds no release, or a part of it cannot be listed.
         VersionError: the version is unknown or not under this folder.
         TokenError: one of `scenarios` is not there.
         ConfigError: `parts` cannot be written to.
-        WorkerError: a worker was killed, or cannot do the work.
     """
     layout = find_release(open_dataroot(root), version)
     folder = None if parts is None else writable_folder(parts)
     store = None if folder is None else Store(folder, folder, "validates scenarios", ConfigError)
-    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
     checks = _Work(deep=deep, store=store).run(chosen_scenarios(layout, scenarios), **how)
     return _report(layout, checks, scenarios, root=root, deep=deep, **how)
 
@@ -102,15 +224,15 @@ class _Work:
         self.store.keep(_name(scenario), key, check.to_json().encode())
         return check
 
-    def run(self, scenarios: Sequence[ScenarioFolder], **how: Any) -> list[ScenarioCheck]:
+    def run(self, scenarios: Sequence[ScenarioFolder], **how: Unpack[Engine]) -> list[ScenarioCheck]:
         """Look at all of them."""
         reads = tuple({place for scenario in scenarios for place in places_of(scenario.root)})
-        how |= {"label": "validating scenarios"}
+        label = "validating scenarios"
         if self.store is None:
-            return run_batch(self, scenarios, places=Places(reads=reads), **how)
+            return run_batch(self, scenarios, label=label, places=Places(reads=reads), **how)
         with self.store.shared():
-            places = Places(reads=reads, writes=(self.store.folder,))
-            return list(self.store.run(self, {_name(each): each for each in scenarios}, places=places, **how).values())
+            places, items = Places(reads=reads, writes=(self.store.folder,)), {_name(each): each for each in scenarios}
+            return list(self.store.run(self, items, label=label, places=places, **how).values())
 
 
 def _name(scenario: ScenarioFolder) -> str:
@@ -124,7 +246,7 @@ def _report(
     *,
     root: Dataroot,
     deep: bool,
-    **how: Any,
+    **how: Unpack[Engine],
 ) -> ValidationReport:
     """What was found in scenarios, and in the release as a whole."""
     readable, of_release = check_splits(layout)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
+from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import predict_instances
 
 pytestmark = pytest.mark.golden_cases("h_fiery", "cases")

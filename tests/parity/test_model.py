@@ -19,10 +19,9 @@ from golden_model import GoldenModel, check_close
 
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.handedness import flip_pose
-from deepaccident_devkit.model import poses, warps
+from deepaccident_devkit.model import warps
 from deepaccident_devkit.model.bev import BevEncode, BevEncodeConfig, crop
 from deepaccident_devkit.model.checkpoint import Weights, load_weights
-from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.detection import (
     RELEASED_CLASS_SLOTS,
     RELEASED_NMS,
@@ -38,7 +37,7 @@ from deepaccident_devkit.model.detection import (
     detection_targets,
     suppress,
 )
-from deepaccident_devkit.model.detection.peaks import peak_radius
+from deepaccident_devkit.model.detection.targets import peak_radius
 from deepaccident_devkit.model.entry import ModelInputs
 from deepaccident_devkit.model.fusion import (
     Agent3D,
@@ -61,15 +60,13 @@ from deepaccident_devkit.model.motion import (
     frame_mask,
     motion_losses,
 )
-from deepaccident_devkit.model.motion.distributions import SpatialDistribution
-from deepaccident_devkit.model.motion.flow_gru import FlowGru, warp_with_flow
+from deepaccident_devkit.model.motion.decoders import FlowGru, SpatialDistribution, warp_with_flow
 from deepaccident_devkit.model.motion.losses import center_loss, latent_loss, segmentation_loss, vector_loss
-from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.poses import matrices_from_six
+from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.presets import released
 from deepaccident_devkit.model.temporal import TemporalConfig, temporal_model
 from deepaccident_devkit.model.training.step import Targets, TrainingStep
-from deepaccident_devkit.model.warps import GridBounds
+from deepaccident_devkit.model.warps import matrices_from_six
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, MotionLabels
 
 
@@ -181,9 +178,9 @@ CELLS_AT_TIES = 0.005
 """The share of cells that may differ after a nearest warp, for points on the border between two cells."""
 
 
-def bounds(golden: GoldenModel, name: str = "grid") -> GridBounds:
+def bounds(golden: GoldenModel, name: str = "grid") -> BevGrid:
     grid = golden.config[name]
-    return GridBounds(x=tuple(grid["xbound"]), y=tuple(grid["ybound"]))
+    return BevGrid(x=tuple(grid["xbound"]), y=tuple(grid["ybound"]))
 
 
 def check_sampled(ours: torch.Tensor, golden: torch.Tensor, mode: str) -> None:
@@ -206,10 +203,10 @@ def test_chains_of_warps_equal_the_released_warper(
     matrix = given["aug"] if augmented else None
     if kind == "temporal":
         moved = slice(0, 2)
-        chain = poses.present_from_past(given["egomotion"][:, :2], chain="released", bev_transform=matrix)
+        chain = warps.present_from_past(given["egomotion"][:, :2], chain="released", bev_transform=matrix)
     else:
         moved = slice(1, 3)
-        chain = poses.present_from_frames(given["egomotion"], bev_transform=matrix)[:, 1:]
+        chain = warps.present_from_frames(given["egomotion"], bev_transform=matrix)[:, 1:]
     ours = given["x"].clone()
     ours[:, moved] = warps.warp_features(
         given["x"][:, moved].flatten(0, 1), chain.flatten(0, 1), bounds(golden), warp="stretched", mode=mode
@@ -221,13 +218,13 @@ def test_partners_are_placed_as_by_the_released_warper(golden_model: Golden) -> 
     """The maps; the poses' matrices within 1e-6; also with the released transforms of augmented maps, and the right."""
     golden = golden_model("warps")
     given, expected, grid = golden.inputs(), golden.outputs(), bounds(golden)
-    ego_from_agent = poses.matrices_from_six(given["relative_pose"])
+    ego_from_agent = warps.matrices_from_six(given["relative_pose"])
     check_close(ego_from_agent, expected["pose_mats"], 1e-6)
     check_close(warps.agents_to_ego(given["xv"], ego_from_agent, grid, warp="stretched"), expected["v2x"])
     own = given["aug_v"]
-    as_released = poses.between_augmented(ego_from_agent, own, own)
+    as_released = warps.between_augmented(ego_from_agent, own, own)
     check_close(warps.agents_to_ego(given["xv"], as_released, grid, warp="stretched"), expected["v2x_aug_released"])
-    right = poses.between_augmented(ego_from_agent, own[:, :1], own)
+    right = warps.between_augmented(ego_from_agent, own[:, :1], own)
     check_close(warps.agents_to_ego(given["xv"], right, grid, warp="stretched"), expected["v2x_aug_right"])
 
 
@@ -235,7 +232,7 @@ def test_partners_are_placed_as_by_the_released_warper(golden_model: Golden) -> 
 def test_a_full_map_is_warped_as_by_the_released_warper(golden_model: Golden, name: str, pose: list[float]) -> None:
     """128 × 128 cells of 0.8 m."""
     golden = golden_model("warps")
-    target_from_source = poses.matrices_from_six(torch.tensor([pose]))
+    target_from_source = warps.matrices_from_six(torch.tensor([pose]))
     features = golden.inputs()["xf"][:, 0]
     ours = warps.warp_features(features[:, None], target_from_source, bounds(golden, "full"), warp="stretched")
     check_close(ours, golden.outputs()[name])
@@ -267,7 +264,7 @@ def test_released_fusion_equals_the_released_one(golden_model: Golden) -> None:
     golden = golden_model("fusion_released")
     given, expected = golden.inputs(), golden.outputs()
     x = given["x"].requires_grad_()
-    ego_from_agent = poses.matrices_from_six(given["relative_pose"])
+    ego_from_agent = warps.matrices_from_six(given["relative_pose"])
     placed = warps.agents_to_ego(x, ego_from_agent, bounds(golden), warp="stretched")
     check_close(placed, expected["warped"])
     config = ReleasedFusionConfig(
@@ -757,7 +754,7 @@ def config(golden: GoldenModel) -> ModelConfig:
             image_size=tuple(lift["input_dim"]),
             **along,
         ),
-        temporal=replace(whole.temporal, grid=GridBounds(**along)),
+        temporal=replace(whole.temporal, grid=BevGrid(**along)),
         bev=BevEncodeConfig(
             in_channels=heads["in_channels"], out_channels=heads["out_channels"], widths=tuple(heads["num_channels"])
         ),

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
+from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import LinkedInstances, predict_instances
 
 pytestmark = [

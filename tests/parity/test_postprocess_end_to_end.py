@@ -15,7 +15,7 @@ from parity.test_labels import Scene, labels_of
 
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
+from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import predict_instances
 
 pytestmark = pytest.mark.golden_cases("a_labels", "scenes")

@@ -19,7 +19,7 @@ from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import to_orientation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
 from deepaccident_devkit.motion.warps.chains import present_from_frames
-from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego, past_to_present
+from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
 from deepaccident_devkit.motion.warps.warping import sample_points, sampling_matrix, warp
 
 RELEASED = BevGrid(orientation="released")

@@ -10,7 +10,7 @@ from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
 from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
-from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego
+from deepaccident_devkit.motion.warps.to_present import agents_to_ego
 from deepaccident_devkit.motion.warps.warping import nearest_indices, sample_points, sampling_matrix, warp
 
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]

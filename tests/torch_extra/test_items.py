@@ -293,12 +293,6 @@ def test_image_configurations_that_cannot_be(fields: dict[str, object], message:
         ImageConfig(**fields)
 
 
-def test_image_configurations_from_arrays_and_lists() -> None:
-    config = ImageConfig(resize=[np.int64(9), 16], crop=np.array([0, 0, 4, 4]), mean=np.zeros(3), dtype="uint8")
-    assert config == ImageConfig(resize=(9, 16), crop=(0, 0, 4, 4), dtype="uint8")
-    assert hash(config) == hash(ImageConfig(resize=(9, 16), crop=(0, 0, 4, 4), dtype="uint8"))
-
-
 def test_a_crop_beyond_the_stored_image(da: DeepAccident, sample: str) -> None:
     with pytest.raises(ConfigError, match="reach beyond an image of 36 × 64"):
         V2XDataset(da, [sample], V2XConfig(images=ImageConfig(crop=(30, 0, 10, 64))))[0]
@@ -317,12 +311,3 @@ def projected(image_from_ego: torch.Tensor, points: np.ndarray) -> tuple[np.ndar
     scaled = points @ matrix[:3, :3].T + matrix[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         return scaled[:, :2] / scaled[:, 2:], scaled[:, 2]
-
-
-def test_its_text_says_what_an_item_has(da: DeepAccident, tokens: list[str]) -> None:
-    assert repr(V2XDataset(da, tokens[:2])) == "V2XDataset(2 samples, agents 'single', points, boxes)"
-    config = V2XConfig(agents="all", points=False, labels="deepaccident", bev_segmentation=BevGrid())
-    assert (
-        repr(V2XDataset(da, tokens[:1], config))
-        == "V2XDataset(1 sample, agents 'all', boxes, labels, bev_segmentation)"
-    )

@@ -23,7 +23,7 @@ from deepaccident_devkit.reading import file_checksum
 from deepaccident_devkit.release import find_release, read_calib
 from deepaccident_devkit.render.evaluation.report import report_html
 from deepaccident_devkit.synth.spec import draw, read_spec
-from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.synth.spec.model import Items, Part
 from deepaccident_devkit.tables.manifest import MANIFEST_FILE, read_manifest
 from deepaccident_devkit.validation import validate_release
 

@@ -1,12 +1,16 @@
 """Detection: boxes as peaks on the ground (CenterPoint), with the released quirks as settings."""
 
 from deepaccident_devkit.model.detection.decoding import (
+    RELEASED_NMS,
     Candidates,
     DecodingConfig,
     Detections,
+    NmsConfig,
     decode_candidates,
     decode_detections,
     detected_boxes,
+    rotated_iou,
+    suppress,
 )
 from deepaccident_devkit.model.detection.head import (
     CLASS_SLOTS,
@@ -16,9 +20,13 @@ from deepaccident_devkit.model.detection.head import (
     DetectionConfig,
     TaskMaps,
 )
-from deepaccident_devkit.model.detection.losses import DetectionLossConfig, detection_losses
-from deepaccident_devkit.model.detection.nms import RELEASED_NMS, NmsConfig, rotated_iou, suppress
-from deepaccident_devkit.model.detection.targets import TargetConfig, TaskTargets, detection_targets
+from deepaccident_devkit.model.detection.targets import (
+    DetectionLossConfig,
+    TargetConfig,
+    TaskTargets,
+    detection_losses,
+    detection_targets,
+)
 
 __all__ = [
     "CLASS_SLOTS",

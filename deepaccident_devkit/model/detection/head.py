@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -63,9 +64,7 @@ class DetectionConfig:
         """Check; raises ConfigError or ChoiceError."""
         settle_choices(self, {"branches": get_args(Branches)})
         BevGrid(x=self.x, y=self.y)  # checks both axes
-        for name in ("in_channels", "shared_channels", "upsample"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}: expected a whole number from 1, found {getattr(self, name)!r}")
+        check_least(self, in_channels=1, shared_channels=1, upsample=1)
         _check_slots(self.class_slots)
 
     @property

@@ -1,4 +1,4 @@
-"""What the detection head should say: heatmaps, box codes and where they count, from boxes in the ego frame."""
+"""What the detection head should say, from boxes in the ego frame, and the losses where it says something else."""
 
 from __future__ import annotations
 
@@ -9,11 +9,56 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
+from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.detection.head import CODE_SIZE, DetectionConfig
-from deepaccident_devkit.model.detection.peaks import draw_peaks, peak_radius
+from deepaccident_devkit.model.detection.head import CODE_CHANNELS, CODE_SIZE, DetectionConfig, TaskMaps
 from deepaccident_devkit.taxonomy import CATEGORIES
 from deepaccident_devkit.text import settle_choices
+
+
+def peak_radius(length: Tensor, width: Tensor, min_overlap: float) -> Tensor:
+    """Radius of a box's peak in the heatmap, cells, before rounding and the least radius; the released formula.
+
+    It is the smallest of three roots, in each of which the release divides by 2 where 2a would be right.
+
+    Args:
+        length: (N,) cells.
+        width: (N,) cells.
+        min_overlap: between 0 and 1.
+    """
+    total, area = length + width, length * width
+    quadratics = (
+        (1.0, total, area * (1 - min_overlap) / (1 + min_overlap)),
+        (4.0, 2 * total, (1 - min_overlap) * area),
+        (4 * min_overlap, -2 * min_overlap * total, (min_overlap - 1) * area),
+    )
+    roots = [(b + (b**2 - 4 * a * c).clamp(min=0).sqrt()) / 2 for a, b, c in quadratics]
+    return torch.stack(roots).amin(dim=0)
+
+
+def draw_peaks(heatmap: Tensor, layer: Tensor, cell: Tensor, radius: Tensor) -> None:
+    """Draw Gaussians with σ = (2r + 1)/6 in squares of 2r + 1 cells; where they meet, the larger value stays.
+
+    Args:
+        heatmap: (L, H, W), changed in place.
+        layer: (N,) int64, where each is drawn.
+        cell: (N, 2) int64, column and row of each peak, inside the map.
+        radius: (N,) int64, r in cells.
+    """
+    if not len(layer):
+        return
+    rows, columns = heatmap.shape[1:]
+    reach = int(radius.max())
+    offset = torch.arange(-reach, reach + 1, device=heatmap.device)
+    column, row = cell[:, :1] + offset, cell[:, 1:] + offset  # (N, side)
+    sigma = (2 * radius[:, None].to(heatmap.dtype) + 1) / 6
+    bell = torch.exp(-(offset.to(heatmap.dtype) ** 2) / (2 * sigma**2)) * (offset.abs() <= radius[:, None])
+    # what lies beyond an edge is moved onto it, where the Gaussian itself is larger
+    place = row.clamp(0, rows - 1)[:, :, None] * columns + column.clamp(0, columns - 1)[:, None]
+    place = place + layer[:, None, None] * (rows * columns)
+    peaks = bell[:, :, None] * bell[:, None]
+    heatmap.view(-1).scatter_reduce_(0, place.flatten(), peaks.flatten(), "amax")
+
 
 UnknownVelocity = Literal["ignore", "zero"]
 
@@ -39,9 +84,7 @@ class TargetConfig:
         settle_choices(self, {"unknown_velocity": get_args(UnknownVelocity)})
         if not 0 < self.min_overlap < 1:
             raise ConfigError(f"min_overlap: expected a number between 0 and 1, found {self.min_overlap!r}")
-        for name, least in (("min_radius", 0), ("max_boxes", 1)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: expected a whole number from {least}, found {getattr(self, name)!r}")
+        check_least(self, min_radius=0, max_boxes=1)
 
 
 class TaskTargets(NamedTuple):
@@ -170,3 +213,84 @@ def _task_targets(placed: _Placed, task: int, samples: int, head: DetectionConfi
     heatmap = box.new_zeros((samples * slots, rows, columns))
     draw_peaks(heatmap, sample * slots + placed.slot[mine], cell, placed.radius[mine])
     return TaskTargets(heatmap.view(samples, slots, rows, columns), box, place, mask, known)
+
+
+_CLIP = 1e-4
+"""Probabilities stay this far from 0 and 1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectionLossConfig:
+    """Weights of the losses, the released ones.
+
+    Attributes:
+        weight: of all of them, beside the other tasks of the network.
+        box_weight: of the box codes' loss beside the heatmap's.
+    """
+
+    weight: float = 0.5
+    box_weight: float = 0.25
+
+    def __post_init__(self) -> None:
+        """Check; raises ConfigError."""
+        check_least(self, weight=0, box_weight=0)
+
+
+def detection_losses(
+    maps: Sequence[TaskMaps], targets: Sequence[TaskTargets], config: DetectionLossConfig | None = None
+) -> dict[str, Tensor]:
+    """`task0.loss_heatmap`, `task0.loss_bbox`, … as the released CenterHeadv1 has them, times the weights.
+
+    Args:
+        maps: of each task, from the head.
+        targets: of each task.
+        config: None for the released weights.
+
+    Returns:
+        Scalars, in single precision or better.
+    """
+    weights = config or DetectionLossConfig()
+    losses: dict[str, Tensor] = {}
+    for number, (map_, target) in enumerate(zip(maps, targets, strict=True)):
+        losses[f"task{number}.loss_heatmap"] = weights.weight * heatmap_loss(map_.heatmap, target.heatmap)
+        losses[f"task{number}.loss_bbox"] = weights.weight * weights.box_weight * box_loss(map_.code, target)
+    return losses
+
+
+def heatmap_loss(logits: Tensor, heatmap: Tensor) -> Tensor:
+    """Gaussian focal loss (CornerNet, α = 2, γ = 4), summed, over the number of peaks or 1.
+
+    Args:
+        logits: (B, slots, H, W).
+        heatmap: the same shape, in [0, 1].
+    """
+    found = precise(logits).sigmoid().clamp(_CLIP, 1 - _CLIP)
+    peak = heatmap == 1
+    missed = -((1 - found) ** 2) * found.log()
+    invented = -(found**2) * (1 - found).log() * (1 - heatmap) ** 4
+    return torch.where(peak, missed, invented).sum() / peak.sum().clamp(min=1)
+
+
+def box_loss(code: Tensor, target: TaskTargets) -> Tensor:
+    """L1 distances of the box codes, summed, over the number of boxes.
+
+    Args:
+        code: (B, 10, H, W) predicted.
+        target: its boxes; velocities that are not known do not count.
+    """
+    found = gather_cells(precise(code), target.place)
+    counts = target.mask[:, :, None].repeat(1, 1, found.shape[-1])
+    counts[:, :, -CODE_CHANNELS["vel"] :] &= target.velocity_known[:, :, None]
+    distance = (found - target.box).abs() * counts
+    return distance.sum() / (target.mask.sum() + 1e-4)
+
+
+def gather_cells(maps: Tensor, place: Tensor) -> Tensor:
+    """Values (B, C, H, W) at cells (B, K), given as row · W + column: (B, K, C)."""
+    channels = maps.shape[1]
+    return maps.flatten(2).gather(2, place[:, None].expand(-1, channels, -1)).transpose(1, 2)
+
+
+def precise(values: Tensor) -> Tensor:
+    """In single precision, if mixed precision made them coarser."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))

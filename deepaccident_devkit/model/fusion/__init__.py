@@ -4,19 +4,41 @@
 `V2XViTFusion` are written after their own papers, since the released code has none of them.
 """
 
-from deepaccident_devkit.model.fusion.agent3d import Agent3D, Agent3DConfig
-from deepaccident_devkit.model.fusion.build import FusionConfig, fusion
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeAlias
+
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.fusion.cobevt import CobevtConfig, CobevtFusion
-from deepaccident_devkit.model.fusion.disconet import DiscoNetConfig, DiscoNetFusion
-from deepaccident_devkit.model.fusion.interface import Fusion
 from deepaccident_devkit.model.fusion.simple import (
     RELEASED_EGO_CHANNELS,
+    Agent3D,
+    Agent3DConfig,
+    DiscoNetConfig,
+    DiscoNetFusion,
+    Fusion,
     PoolFusion,
     PoolFusionConfig,
     ReleasedFusion,
     ReleasedFusionConfig,
 )
 from deepaccident_devkit.model.fusion.v2xvit import V2XViTConfig, V2XViTFusion
+
+FusionConfig: TypeAlias = PoolFusionConfig | ReleasedFusionConfig | DiscoNetConfig | CobevtConfig | V2XViTConfig
+_MODULES: Final[Mapping[type, Callable[[Any], Fusion]]] = {
+    PoolFusionConfig: PoolFusion,
+    ReleasedFusionConfig: ReleasedFusion,
+    DiscoNetConfig: DiscoNetFusion,
+    CobevtConfig: CobevtFusion,
+    V2XViTConfig: V2XViTFusion,
+}
+
+
+def fusion(config: FusionConfig) -> Fusion:
+    """The fusion module that a config describes, with fresh weights. Raises ConfigError: another object."""
+    if type(config) not in _MODULES:
+        raise ConfigError(f"fusion: expected the config of a fusion module, found {config!r}")
+    return _MODULES[type(config)](config)
+
 
 __all__ = [
     "RELEASED_EGO_CHANNELS",

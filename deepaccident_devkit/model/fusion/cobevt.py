@@ -13,9 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.fusion.interface import Fusion, masked_mean, visible
-from deepaccident_devkit.model.fusion.transformer import FeedForward, PreNorm, attention
-from deepaccident_devkit.model.fusion.windows import Windows, relative_positions
+from deepaccident_devkit.model.fusion.attention import FeedForward, PreNorm, Windows, attention
+from deepaccident_devkit.model.fusion.simple import Fusion, masked_mean, visible
+from deepaccident_devkit.model.images.swin import relative_positions
 from deepaccident_devkit.text import settle_choices
 
 _RELATIONS = 3

@@ -15,10 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.fusion.agent_attention import AgentAttention
-from deepaccident_devkit.model.fusion.interface import Fusion, visible
-from deepaccident_devkit.model.fusion.multi_window import MultiWindowAttention
-from deepaccident_devkit.model.fusion.transformer import FeedForward, PreNorm
+from deepaccident_devkit.model.fusion.attention import AgentAttention, FeedForward, MultiWindowAttention, PreNorm
+from deepaccident_devkit.model.fusion.simple import Fusion, visible
 from deepaccident_devkit.text import settle_choices
 
 

@@ -4,12 +4,16 @@ backbone, neck = image_encoder(SwinConfig())
 features = neck(backbone(normalised(images)))  # (N, 3, h, w) uint8 → (N, 512, h / 16, w / 16)
 """
 
-from deepaccident_devkit.model.images.encoder import EncoderConfig, image_encoder, normalised
-from deepaccident_devkit.model.images.necks import FpnNeck
+from deepaccident_devkit.model.images.encoder import (
+    EncoderConfig,
+    FpnNeck,
+    SmallConv,
+    SmallConvConfig,
+    image_encoder,
+    normalised,
+)
 from deepaccident_devkit.model.images.resnet import ResNet, ResNetConfig
-from deepaccident_devkit.model.images.small_conv import SmallConv, SmallConvConfig
-from deepaccident_devkit.model.images.swin import Swin, SwinConfig
-from deepaccident_devkit.model.images.swin_weights import from_official
+from deepaccident_devkit.model.images.swin import Swin, SwinConfig, from_official
 
 __all__ = [
     "EncoderConfig",

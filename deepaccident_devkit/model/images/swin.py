@@ -1,15 +1,116 @@
-"""`Swin`: the image backbone of the release, a Swin Transformer (Liu et al., ICCV 2021)."""
+"""`Swin`: the image backbone of the release, a Swin Transformer (Liu et al., ICCV 2021), and its official weights."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Final
 
+import torch
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.images.swin_attention import ShiftedWindowAttention, WindowAttention
+from deepaccident_devkit.reading import shortened
+
+
+class WindowAttention(nn.Module):
+    """Multi-head self-attention of the tokens of one window, with a learned bias for each relative position."""
+
+    relative_position_index: Tensor
+
+    def __init__(self, channels: int, heads: int, window: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.relative_position_bias_table = nn.Parameter(torch.zeros((2 * window - 1) ** 2, heads))
+        self.register_buffer("relative_position_index", relative_positions(window))
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.proj = nn.Linear(channels, channels)
+
+    def forward(self, tokens: Tensor, together: Tensor | None = None) -> Tensor:
+        """Attend.
+
+        Args:
+            tokens: (N, K, L, C): K windows of each image, L tokens each.
+            together: (K, L, L) bool, which tokens may see each other; None for all.
+
+        Returns:
+            (N, K, L, C).
+        """
+        channels = tokens.shape[-1]
+        # (N, K, L, 3C) → query, key and value, each (N, K, heads, L, C / heads)
+        parts = self.qkv(tokens).unflatten(-1, (3, self.heads, channels // self.heads))
+        query, key, value = parts.permute(3, 0, 1, 4, 2, 5).unbind(0)
+        scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
+        scores = scores + self.relative_position_bias_table[self.relative_position_index].permute(2, 0, 1)
+        if together is not None:
+            scores = scores.masked_fill(~together[:, None], -torch.inf)
+        return self.proj((scores.softmax(-1) @ value).transpose(2, 3).flatten(3))
+
+
+class ShiftedWindowAttention(nn.Module):
+    """A map cut into windows of which each attends to itself; `shift` moves the windows, and the map is a torus.
+
+    A map that is not a whole number of windows is filled with zeros on the right and at the bottom. As in the release,
+    tokens see the filling as they see others.
+    """
+
+    def __init__(self, channels: int, heads: int, window: int, shift: int) -> None:
+        super().__init__()
+        self.window, self.shift = window, shift
+        self.w_msa = WindowAttention(channels, heads, window)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Features (N, h, w, C) → the same shape."""
+        height, width = features.shape[1:3]
+        padded = functional.pad(features, (0, 0, 0, -width % self.window, 0, -height % self.window))
+        rows, columns = padded.shape[1:3]
+        together = None
+        if self.shift:
+            padded = padded.roll((-self.shift, -self.shift), (1, 2))
+            together = neighbours(rows, columns, self.window, self.shift, padded.device)
+        attended = self.w_msa(windows_of(padded, self.window), together)
+        result = map_of(attended, rows, columns)
+        if self.shift:
+            result = result.roll((self.shift, self.shift), (1, 2))
+        return result[:, :height, :width]
+
+
+def relative_positions(window: int) -> Tensor:
+    """(L, L) int64 for L = window² tokens: the row of the bias table for a query (first axis) and a key."""
+    cells = torch.cartesian_prod(torch.arange(window), torch.arange(window))
+    down, along = (cells[:, None] - cells + window - 1).unbind(-1)
+    return down * (2 * window - 1) + along
+
+
+def windows_of(features: Tensor, window: int) -> Tensor:
+    """A map (N, h, w, C) of whole windows as (N, K, L, C): K windows in reading order of L = window² tokens."""
+    count, rows, columns, channels = features.shape
+    cut = features.view(count, rows // window, window, columns // window, window, channels)
+    return cut.transpose(2, 3).reshape(count, -1, window * window, channels)
+
+
+def map_of(windows: Tensor, rows: int, columns: int) -> Tensor:
+    """The map (N, rows, columns, C) that `windows_of` cut."""
+    count, _, tokens, channels = windows.shape
+    window = round(tokens**0.5)
+    cut = windows.view(count, rows // window, columns // window, window, window, channels)
+    return cut.transpose(2, 3).reshape(count, rows, columns, channels)
+
+
+def neighbours(rows: int, columns: int, window: int, shift: int, device: torch.device | str | None = None) -> Tensor:
+    """Which tokens of the windows of a shifted map may see each other, (K, L, L) bool.
+
+    Those that lay beside each other before the shift: not the two sides of the map that it brought together.
+    """
+    # in the last row and column of windows the last `shift` steps come from the other side
+    down, along = ((torch.arange(size, device=device) >= size - shift).long() for size in (rows, columns))
+    sides = windows_of((2 * down[:, None] + along)[None, :, :, None], window)[0, :, :, 0]
+    return sides[:, :, None] == sides[:, None, :]
+
 
 _PATCH = 4
 """Pixels along the side of a patch."""
@@ -64,7 +165,7 @@ class SwinConfig:
 class Swin(nn.Module):
     """Swin Transformer with a LayerNorm for each map of its result, without stochastic depth, as in the release.
 
-    Parameters have the released names; `swin_weights` converts those of the official weights.
+    Parameters have the released names; `from_official` converts those of the official weights.
 
     Attributes:
         out_channels: of the two maps.
@@ -152,7 +253,7 @@ class Block(nn.Module):
 class PatchMerging(nn.Module):
     """Four neighbouring tokens → one with twice the channels; a channel's four values stand together, row by row.
 
-    (The official order is by token, and down before along: `swin_weights`.)
+    (The official order is by token, and down before along: `from_official`.)
     """
 
     def __init__(self, channels: int) -> None:
@@ -175,3 +276,58 @@ def _initialise(module: nn.Module) -> None:
             nn.init.zeros_(module.bias)
     elif isinstance(module, WindowAttention):
         nn.init.trunc_normal_(module.relative_position_bias_table, std=0.02)
+
+
+_RENAMED: Final = (
+    (r"patch_embed\.proj\.(.+)", r"patch_embed.projection.\1"),
+    (r"(patch_embed\.norm\..+)", r"\1"),
+    (r"layers\.(\d+\.blocks\.\d+\.norm[12]\..+)", r"stages.\1"),
+    (r"layers\.(\d+\.blocks\.\d+\.attn)\.(.+)", r"stages.\1.w_msa.\2"),
+    (r"layers\.(\d+\.blocks\.\d+)\.mlp\.fc1\.(.+)", r"stages.\1.ffn.layers.0.0.\2"),
+    (r"layers\.(\d+\.blocks\.\d+)\.mlp\.fc2\.(.+)", r"stages.\1.ffn.layers.1.\2"),
+    (r"layers\.(\d+\.downsample\..+)", r"stages.\1"),
+    (r"(norm\..+)", r"\1"),
+)
+_DROPPED: Final = re.compile(r"head\..+|layers\.\d+\.blocks\.\d+\.attn_mask")
+"""The classifier, and masks that depend on the size of the image alone."""
+_MERGING: Final = re.compile(r"layers\.\d+\.downsample\.(norm\.weight|norm\.bias|reduction\.weight)")
+
+
+def from_official(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A state dict with the names and the layout of `Swin`, without the classifier.
+
+    Args:
+        weights: with the names of microsoft/Swin-Transformer (in its files they are under `model`).
+
+    Returns:
+        `norm.*`, the classifier's norm, is among them, and is not used by `Swin`; `norm2.*` and `norm3.*` are not, and
+        are to be learned. So `load_state_dict` needs `strict=False`.
+
+    Raises:
+        ConfigError: a name is not one of Swin's.
+    """
+    converted = {}
+    for name, tensor in weights.items():
+        if not _DROPPED.fullmatch(name):
+            converted[_renamed(name)] = _channel_major(tensor) if _MERGING.fullmatch(name) else tensor
+    return converted
+
+
+def _renamed(name: str) -> str:
+    for pattern, template in _RENAMED:
+        match = re.fullmatch(pattern, name)
+        if match:
+            return match.expand(template)
+    raise ConfigError(
+        "expected names of Swin's official weights, such as 'layers.0.blocks.0.norm1.weight', found "
+        f"{shortened(name)!r}; if it is a file's content, give its entry 'model'"
+    )
+
+
+def _channel_major(tensor: Tensor) -> Tensor:
+    """Values (…, 4C) of the four tokens that are merged, from token-major to channel-major.
+
+    Official tokens come down, then along: (0, 0), (1, 0), (0, 1), (1, 1). Ours come in reading order.
+    """
+    by_token = tensor.unflatten(-1, (4, -1))[..., [0, 2, 1, 3], :]
+    return by_token.transpose(-1, -2).flatten(-2)

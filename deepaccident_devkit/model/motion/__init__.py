@@ -1,9 +1,7 @@
 """The motion head: distributions of the latent, future states by flow and GRU, decoders, labels and losses."""
 
-from deepaccident_devkit.model.motion.decoders import MotionMaps
-from deepaccident_devkit.model.motion.distributions import LatentDistribution
-from deepaccident_devkit.model.motion.head import MotionHead, MotionHeadConfig, MotionOutputs
-from deepaccident_devkit.model.motion.labels import MotionTargets, frame_mask
+from deepaccident_devkit.model.motion.decoders import LatentDistribution, MotionMaps
+from deepaccident_devkit.model.motion.head import MotionHead, MotionHeadConfig, MotionOutputs, MotionTargets, frame_mask
 from deepaccident_devkit.model.motion.losses import MotionLossConfig, motion_losses
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""The motion head: a latent, the future states of the BEV features, and the maps that are read off each of them."""
+"""The motion head: a latent, the future states of the BEV features, and the maps that are read off each; its labels."""
 
 from __future__ import annotations
 
@@ -10,24 +10,82 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.model.motion.decoders import MotionMaps, SeparateDecoders, SharedDecoder
-from deepaccident_devkit.model.motion.distributions import LatentDistribution, SpatialDistribution
-from deepaccident_devkit.model.motion.flow_gru import HIDDEN_WARPS, FlowGru, HiddenWarp
-from deepaccident_devkit.model.motion.labels import (
-    IGNORE_INDEX,
-    LABEL_CHANNELS,
-    POSTERIOR_IGNORES,
-    MotionTargets,
-    PosteriorIgnore,
+from deepaccident_devkit.model.motion.decoders import (
+    HIDDEN_WARPS,
+    FlowGru,
+    HiddenWarp,
+    LatentDistribution,
+    MotionMaps,
+    SeparateDecoders,
+    SharedDecoder,
+    SpatialDistribution,
 )
 from deepaccident_devkit.text import settle_choices
 
-__all__ = ["MotionHead", "MotionHeadConfig", "MotionOutputs"]
+IGNORE_INDEX: Final = 255
+"""What offset and flow have outside instances (`motion.MotionLabelConfig.ignore_index`)."""
+LABEL_CHANNELS: Final = 6
+"""Of a frame's maps as the posterior sees them: segmentation, centerness, offset and flow."""
+PosteriorIgnore = Literal["keep", "zero"]
+POSTERIOR_IGNORES: Final[tuple[PosteriorIgnore, ...]] = ("keep", "zero")
+
+
+class MotionTargets(NamedTuple):
+    """A batch's motion labels, all frames warped to the present (`TorchConfig(to_present="nearest")`).
+
+    Attributes:
+        segmentation: (N, T, H, W) int64, 1 on instances.
+        centerness: (N, T, 1, H, W) 1 at the instances' centres, less around them.
+        offset: (N, T, 2, H, W) cells to the centre, down the rows and along the columns; 255 = ignored.
+        flow: (N, T, 2, H, W) cells to the centre in the next frame, likewise.
+        frame_mask: (N, T) bool, the frames that losses count (`frame_mask`).
+    """
+
+    segmentation: Tensor
+    centerness: Tensor
+    offset: Tensor
+    flow: Tensor
+    frame_mask: Tensor
+
+    def posterior_input(self, *, stride: int, ignore: PosteriorIgnore, ignore_index: int) -> Tensor:
+        """The maps of the future frames as channels beside the features.
+
+        Args:
+            stride: take every such row and column, the first included.
+            ignore: what ignored cells of offset and flow show: `keep` the mark (as released), or `zero`.
+            ignore_index: the mark.
+
+        Returns:
+            (N, (T − 1) · 6, H / stride, W / stride): frame after frame segmentation, centerness, offset, flow.
+        """
+        centerness, offset, flow = (
+            maps[:, 1:, :, ::stride, ::stride] for maps in (self.centerness, self.offset, self.flow)
+        )
+        segmentation = self.segmentation[:, 1:, None, ::stride, ::stride].to(centerness.dtype)
+        if ignore == "zero":
+            offset, flow = (maps.masked_fill(maps == ignore_index, 0) for maps in (offset, flow))
+        return torch.cat([segmentation, centerness, offset, flow], dim=2).flatten(1, 2)
+
+
+def frame_mask(label_valid: Tensor, past_valid: Tensor) -> Tensor:
+    """Which label frames losses count: those in the recording, of samples whose past frames all are in it.
+
+    The released rule (`sample_ignore_mode = "past_valid"`).
+
+    Args:
+        label_valid: (N, T) bool, the label frames in the recording, from the present on.
+        past_valid: (N, P − 1) bool, the frames before the present.
+
+    Returns:
+        (N, T) bool.
+    """
+    return label_valid & past_valid.all(dim=1, keepdim=True)
+
 
 Decoders = Literal["separate", "shared"]
 _DECODERS: Final[tuple[Decoders, ...]] = ("separate", "shared")
-_LEAST: Final = {"in_channels": 2, "latent": 1, "future_frames": 1, "samples": 0, "hidden": 1, "upsample": 1}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,9 +125,7 @@ class MotionHeadConfig:
         """Check the values; raises ConfigError."""
         words = {"decoders": _DECODERS, "posterior_ignore": POSTERIOR_IGNORES, "hidden_warp": HIDDEN_WARPS}
         settle_choices(self, words, error=ConfigError)
-        for name, least in _LEAST.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: expected at least {least}, found {getattr(self, name)!r}")
+        check_least(self, in_channels=2, latent=1, future_frames=1, samples=0, hidden=1, upsample=1)
         if not self.log_sigma[0] < self.log_sigma[1]:
             raise ConfigError(f"log_sigma: expected the smaller limit first, such as (-5, 5), found {self.log_sigma!r}")
         if self.decoders == "separate" and self.upsample != 1:

@@ -10,11 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
-from deepaccident_devkit.model.motion.distributions import LatentDistribution
-from deepaccident_devkit.model.motion.head import MotionOutputs
-from deepaccident_devkit.model.motion.labels import IGNORE_INDEX, MotionTargets
-
-__all__ = ["MotionLossConfig", "center_loss", "latent_loss", "motion_losses", "segmentation_loss", "vector_loss"]
+from deepaccident_devkit.model.motion.decoders import LatentDistribution
+from deepaccident_devkit.model.motion.head import IGNORE_INDEX, MotionOutputs, MotionTargets
 
 _CLIP: Final = 1e-4
 """Probabilities of a centre stay so far from 0 and 1."""

@@ -25,16 +25,30 @@ from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
 from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.predicting import PredictConfig, check_images
 from deepaccident_devkit.model.presets import ModelChoice
+from deepaccident_devkit.model.results import PredictConfig, check_images
 from deepaccident_devkit.model.training.config import TrainConfig
-from deepaccident_devkit.model.training.data import Moments, batches
-from deepaccident_devkit.model.training.log import add_to_log, cut_log, read_log
-from deepaccident_devkit.model.training.place import Place, processes
-from deepaccident_devkit.model.training.schedule import freeze, generator_of, learning_rate, optimizer_of, positions
-from deepaccident_devkit.model.training.state import Progress, load_state, save_state
-from deepaccident_devkit.model.training.step import TrainingStep, training_batch, with_dropped_partners
-from deepaccident_devkit.model.training.validation import SCORE, validated, validation_samples
+from deepaccident_devkit.model.training.data import SCORE, Moments, batches, validated, validation_samples
+from deepaccident_devkit.model.training.state import (
+    Place,
+    Progress,
+    add_to_log,
+    cut_log,
+    load_state,
+    processes,
+    read_log,
+    save_state,
+)
+from deepaccident_devkit.model.training.step import (
+    TrainingStep,
+    freeze,
+    generator_of,
+    learning_rate,
+    optimizer_of,
+    positions,
+    training_batch,
+    with_dropped_partners,
+)
 from deepaccident_devkit.reading import fault_text, read_bytes
 from deepaccident_devkit.render.training import save_training
 

@@ -1,1 +1,1 @@
-"""From a model's maps to instances: `heads`, `grouping` (centres, pixels), `linking` (ids over time), `redrawing`."""
+"""From a model's maps to instances: `grouping` (heads, centres, pixels, ids over time), `contours` (redrawing)."""

@@ -15,10 +15,16 @@ from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.grouping import FrameGroups, find_peaks, group_cells, sums_by
-from deepaccident_devkit.motion.postprocessing.heads import LABEL_LOGIT, MotionHeads
-from deepaccident_devkit.motion.postprocessing.linking import link_frames
-from deepaccident_devkit.motion.postprocessing.redrawing import first_hulls, redrawn_cells
+from deepaccident_devkit.motion.postprocessing.contours import first_hulls, redrawn_cells
+from deepaccident_devkit.motion.postprocessing.grouping import (
+    LABEL_LOGIT,
+    FrameGroups,
+    MotionHeads,
+    find_peaks,
+    group_cells,
+    link_frames,
+    sums_by,
+)
 from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol
 from deepaccident_devkit.motion.settings import count, flag, number
 from deepaccident_devkit.text import choice

@@ -34,7 +34,9 @@ from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.release.store.zips import list_zip
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 _States: TypeAlias = Mapping[str, tuple[int, str]]
 """File → its bytes, and a text that changes with it."""
@@ -52,9 +54,7 @@ def open_dataroot(
     *,
     refresh: bool = False,
     outside: bool = False,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> ReleasePath:
     """Where the files of a release are read.
 
@@ -66,9 +66,7 @@ def open_dataroot(
         index_dir: where lists and indexes are kept; by default in the dataroot, or in the user's cache.
         refresh: list the files of a URL again.
         outside: keep a new list in the user's cache, not beside the archives.
-        workers: processes to list archives with; None chooses by their number.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a progress bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says; for the lists of archives.
 
     Returns:
         The folder's absolute path, which need not be there; or the release's folder in a store.
@@ -91,7 +89,6 @@ def open_dataroot(
     archives = _archives(located)
     if not archives:
         return located
-    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
     return _opened_archives(located, archives, places, **how)
 
 
@@ -157,7 +154,7 @@ def _has_scenarios(folder: Path) -> bool:
     return False
 
 
-def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path], **how: Any) -> StorePath:
+def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path], **how: Unpack[Engine]) -> StorePath:
     base = path.parent if archives == [path] else path
     files = [*archives, *(each for each in _split_paths(path) if each.is_file())]
     states = {file.relative_to(base).as_posix(): state_of(file) for file in files}
@@ -166,8 +163,7 @@ def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path
         with suppress(IndexStoreError):  # a damaged list is made again
             return StorePath(opened_store(str(path), str(base), known))
     jobs = [(str(archive), archive.relative_to(base).as_posix()) for archive in archives]
-    how = {"label": "listing archives", **how}
-    listings = run_batch(_listed_archive, jobs, places=Places(reads=(base,)), **how)
+    listings = run_batch(_listed_archive, jobs, label="listing archives", places=Places(reads=(base,)), **how)
     beside = {file: state for file, state in states.items() if _is_split(file)}
     known = _written(places, name, _with_loose(listings, beside))
     return StorePath(opened_store(str(path), str(base), known))

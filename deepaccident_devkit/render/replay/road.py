@@ -13,7 +13,7 @@ from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps import GROUND_CLASSES, TownMap
 from deepaccident_devkit.release import BevImage
-from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.colors import BEV_COLORS
 from deepaccident_devkit.render.missing import is_there
 from deepaccident_devkit.render.replay.recording import Recording

@@ -18,9 +18,8 @@ from deepaccident_devkit.synth.roads.ground import (
     tag_of_code,
 )
 from deepaccident_devkit.synth.roads.junction import TURNS, Junction, Route, Turn
-from deepaccident_devkit.synth.roads.layout import LANE_WIDTH, RoadKind, RoadSpec
+from deepaccident_devkit.synth.roads.layout import ARMS, LANE_WIDTH, Arm, Hump, RoadKind, RoadSpec, Terrain
 from deepaccident_devkit.synth.roads.paths import Meeting, Path, crossing, lane_change, straight
-from deepaccident_devkit.synth.roads.terrain import ARMS, Arm, Hump, Terrain
 
 __all__ = [
     "ARMS",

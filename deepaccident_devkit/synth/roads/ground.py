@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays
-from deepaccident_devkit.release.bev_camera import TAGS
-from deepaccident_devkit.synth.roads.layout import LANE_WIDTH, RoadSpec, slot_edges
-from deepaccident_devkit.synth.roads.terrain import EXTENT, OUTWARD, Arm
+from deepaccident_devkit.release.npz import TAGS
+from deepaccident_devkit.synth.roads.layout import EXTENT, LANE_WIDTH, OUTWARD, Arm, RoadSpec, slot_edges
 
 MAP_EXTENT = EXTENT
 """The raster covers −`MAP_EXTENT` to `MAP_EXTENT` in x and y, metres."""

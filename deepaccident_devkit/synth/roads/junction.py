@@ -9,7 +9,7 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray, ShortRepr, readonly
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads.ground import GroundMap, paint_junction
-from deepaccident_devkit.synth.roads.layout import RoadSpec, parking_places
+from deepaccident_devkit.synth.roads.layout import ARMS, OUTWARD, Arm, RoadSpec, Terrain, parking_places
 from deepaccident_devkit.synth.roads.paths import (
     Meeting,
     Path,
@@ -20,7 +20,6 @@ from deepaccident_devkit.synth.roads.paths import (
     tangent_of_corner,
     tangent_of_radius,
 )
-from deepaccident_devkit.synth.roads.terrain import ARMS, OUTWARD, Arm, Terrain
 
 Turn = Literal["straight", "left", "right"]
 TURNS: tuple[Turn, ...] = get_args(Turn)

@@ -13,8 +13,7 @@ from deepaccident_devkit.arrays import AnyArray, BoolArray, Float32Array, FloatA
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.sensors.agents import Agent
 from deepaccident_devkit.synth.sensors.caster import NOTHING, make_caster
-from deepaccident_devkit.synth.sensors.scene import Scene
-from deepaccident_devkit.synth.sensors.setting import Setting
+from deepaccident_devkit.synth.sensors.scene import Scene, Setting
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.synth.solids import FACES_A_SOLID
 

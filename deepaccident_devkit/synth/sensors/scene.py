@@ -1,16 +1,228 @@
-"""One moment of a scenario, ready to be recorded: where all road users are, and a caster for rays to them."""
+"""What stands still during a scenario, and one moment of it, ready to be recorded."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.synth.actors import Actors, Snapshot
-from deepaccident_devkit.synth.sensors.caster import Caster, make_caster
-from deepaccident_devkit.synth.sensors.setting import Setting, Surfaces, moved
+from deepaccident_devkit.synth.roads import Terrain
+from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, Caster, make_caster, plane_distance
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
+from deepaccident_devkit.synth.solids import FACES_A_SOLID, Solids, concatenate, face_corners, face_planes
+from deepaccident_devkit.synth.stage import World
+from deepaccident_devkit.taxonomy import CATEGORIES
+
+_AXLES, _WHEELS = 0.3, 0.4
+"""Where bodies touch the ground: the share of the length ahead of and behind the middle, and of the width beside it."""
+
+
+def placed_on(terrain: Terrain, poses: FloatArray, size: FloatArray, upright: BoolArray) -> FloatArray:
+    """The frames of bodies on the ground, (A, 4, 4): origin on the ground below the box's centre, x forward, z up.
+
+    Args:
+        terrain: the ground.
+        poses: (A, 3) x, y (metres), yaw (radians) of the boxes' centres.
+        size: (A, 3) length, width, height, metres.
+        upright: (A,) whether a body stays upright on a slope.
+    """
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    zero = np.zeros(len(poses))
+    forward, left = np.stack([cos, sin, zero], axis=1), np.stack([-sin, cos, zero], axis=1)
+    height = zero
+    if not terrain.is_flat:
+        ahead, aside = _AXLES * size[:, :1], _WHEELS * size[:, 1:2]
+        xy = poses[:, :2]
+        at = [xy + ahead * forward[:, :2], xy - ahead * forward[:, :2]]
+        at += [xy + aside * left[:, :2], xy - aside * left[:, :2]]
+        front, rear, port, starboard = terrain.height(np.concatenate(at)).reshape(4, -1)
+        tilted = ~upright
+        forward[tilted, 2] = ((front - rear) / (2 * ahead[:, 0]))[tilted]
+        left[tilted, 2] = ((port - starboard) / (2 * aside[:, 0]))[tilted]
+        height = (front + rear + port + starboard) / 4
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    up = np.cross(forward, left)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    frames = np.zeros((len(poses), 4, 4))
+    frames[:, :3, 0], frames[:, :3, 1], frames[:, :3, 2] = forward, np.cross(up, forward), up
+    frames[:, :2, 3], frames[:, 2, 3] = poses[:, :2], height
+    frames[:, 3, 3] = 1.0
+    return frames
+
+
+def moved(corners: FloatArray, frames: FloatArray) -> FloatArray:
+    """Points (P, K, 3) in the own frames of P bodies, moved by the bodies' frames (P, 4, 4)."""
+    turned: FloatArray = corners @ np.swapaxes(frames[:, :3, :3], 1, 2)
+    return turned + frames[:, None, :3, 3]
+
+
+NOBODY = -1
+"""The owner of what belongs to no road user."""
+_UPRIGHT = CATEGORIES.index("pedestrian")
+_ENDLESS = 1e3
+_LEVEL, _CAREFUL = 1e-6, 1e-3
+"""The largest angle between two lines that count as one; the share of its length that a ray may be shorter."""
+_CASTS_KEPT = 8
+"""How many results are kept of rays from sensors that have not moved: five LiDARs, and a reserve."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Solids in the ground frame.
+
+    Attributes:
+        solids: the solids in their owners' frames; their colours are used.
+        corners: (P, 8, 3) float64, metres, ground frame.
+        owner: (P,) int64, row of the actor that each solid belongs to, or `NOBODY`.
+    """
+
+    solids: Solids
+    corners: FloatArray
+    owner: IntArray
+
+    @cached_property
+    def quads(self) -> FloatArray:
+        """The corners of all faces, (F, 4, 3), metres."""
+        return face_corners(self.corners)
+
+    @cached_property
+    def planes(self) -> tuple[FloatArray, FloatArray]:
+        """Outward unit normals (F, 3) of the faces and their offsets (F,), normal · p on the face."""
+        return face_planes(self.quads)
+
+    @cached_property
+    def colors(self) -> FloatArray:
+        """RGB of the faces in white light, (F, 3) float64, 0 to 255."""
+        return self.solids.colors.reshape(-1, 3).astype(np.float64)
+
+    @cached_property
+    def face_owner(self) -> IntArray:
+        """Row of the actor that each face belongs to, (F,), or `NOBODY`."""
+        return np.repeat(self.owner, FACES_A_SOLID)
+
+
+class Setting:
+    """All that stands still, and the road users that move.
+
+    Attributes:
+        world: the place.
+        actors: all road users.
+        terrain: the shape of the ground.
+        still: surfaces of things and of parked vehicles.
+        moving: (M,) rows of the actors that are not parked.
+        parked: (A − M,) rows of the parked actors.
+        moving_shapes: the solids of the moving actors, each in its owner's frame.
+        moving_owner: (Q,) row of the actor to which each of these solids belongs.
+        props: (W,) rows of the world's solids among those of `still`.
+        caster: casts rays against what stands still and the ground.
+    """
+
+    world: World
+    actors: Actors
+    terrain: Terrain
+    still: Surfaces
+    props: IntArray
+    moving: IntArray
+    parked: IntArray
+    moving_shapes: Solids
+    moving_owner: IntArray
+    caster: Caster
+
+    def __init__(self, world: World, actors: Actors) -> None:
+        self.world, self.actors, self.terrain = world, actors, world.terrain
+        parked = np.array([actor.parked for actor in actors.all], dtype=bool)
+        solid_parked = parked[actors.solid_actor]
+        frames = self.frames(actors.at(0.0).poses)
+        vehicles = np.flatnonzero(solid_parked)
+        placed = moved(actors.solids.corners[vehicles], frames[actors.solid_actor[vehicles]])
+        self.still = Surfaces(
+            concatenate([actors.solids.select(vehicles), world.props]),
+            np.concatenate([placed, world.props.corners]),
+            np.concatenate([actors.solid_actor[vehicles], np.full(len(world.props), NOBODY)]),
+        )
+        self.props = len(vehicles) + np.arange(len(world.props))
+        self.moving, self.parked = np.flatnonzero(~parked), np.flatnonzero(parked)
+        self.moving_shapes = actors.solids.select(np.flatnonzero(~solid_parked))
+        self.moving_owner = actors.solid_actor[~solid_parked]
+        self.caster = make_caster(self.still.corners, self.terrain)
+        self._fence: Caster = make_caster(_endless(self.still.corners))
+        self._kept: dict[bytes, tuple[AnyArray, AnyArray]] = {}
+
+    @property
+    def faces(self) -> int:
+        """How many faces stand still; the numbers of moving faces begin with this one."""
+        return len(self.still.corners) * FACES_A_SOLID
+
+    @cached_property
+    def face_owner(self) -> IntArray:
+        """Row of the actor to which each face belongs, moving faces too, (F + 2,), or `NOBODY`.
+
+        The last two are for `caster.GROUND` and `caster.NOTHING`, so that every face can be used as an index.
+        """
+        moving = np.repeat(self.moving_owner, FACES_A_SOLID)
+        return np.concatenate([self.still.face_owner, moving, [NOBODY, NOBODY]])
+
+    def frames(self, poses: FloatArray) -> FloatArray:
+        """The actors' frames on the ground, (A, 4, 4), at poses (A, 3)."""
+        return placed_on(self.terrain, poses, self.actors.size, self.actors.category == _UPRIGHT)
+
+    def cast_columns(self, origin: FloatArray, rays: AnyArray, limit: float = np.inf) -> tuple[AnyArray, AnyArray]:
+        """Does the same as `caster.cast` for columns of rays, but skips rays that meet the ground before any thing.
+
+        It knows them on flat ground, where all rays of a column go over the same line.
+
+        Args:
+            origin: (3,) metres.
+            rays: (R, C, 3) float32; if those of a column do not go over the same line, all are cast.
+            limit: up to where results must be correct, in lengths of the ray.
+
+        Returns:
+            (R · C,) distances and faces.
+        """
+        flat = rays.reshape(-1, 3)
+        if not self.terrain.is_flat or not _in_columns(rays):
+            return self.caster.cast(origin, flat)
+        distance = plane_distance(origin[2], flat[:, 2]).astype(np.float32)
+        face = np.where(np.isfinite(distance), np.int32(GROUND), np.int32(NOTHING))
+        clear = self._clear(origin, rays[0])
+        ends = np.minimum(distance, limit).reshape(rays.shape[:2]) * np.hypot(rays[..., 0], rays[..., 1])
+        open_ = np.flatnonzero((ends > clear * (1 - _CAREFUL)).ravel())
+        distance[open_], face[open_] = self.caster.cast(origin, flat[open_])
+        return distance, face
+
+    def _clear(self, origin: FloatArray, directions: AnyArray) -> AnyArray:
+        """Metres over the ground, (N,), from the origin of rays (N, 3) to the first thing above or below each of them.
+
+        No ray over the same line meets a thing before that. Infinite if there is nothing.
+        """
+        level = directions * np.array([1, 1, 0], dtype=np.float32)
+        reached, _ = self._fence.cast(np.array([*origin[:2], 0.0]), level)
+        return np.asarray(reached * np.linalg.norm(level, axis=1))
+
+    def kept(self, pose: bytes, cast: Callable[[], tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
+        """The result of `cast`; from memory if it was called for the same pose before. Do not change it."""
+        found = self._kept.pop(pose, None) or cast()
+        self._kept[pose] = found
+        if len(self._kept) > _CASTS_KEPT:
+            del self._kept[next(iter(self._kept))]
+        return found
+
+
+def _in_columns(rays: AnyArray) -> bool:
+    """Whether the rays (R, C, 3) of each column go over the same line on the ground."""
+    first, last = rays[0, :, :2], rays[-1, :, :2]
+    aside = first[:, 0] * last[:, 1] - first[:, 1] * last[:, 0]
+    return bool((np.abs(aside) <= _LEVEL * (np.abs(first) * np.abs(last)).sum(axis=1)).all())
+
+
+def _endless(corners: FloatArray) -> FloatArray:
+    """Upright boxes (P, 8, 3) around solids, from deep below the ground to high above it."""
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    low[:, 2], high[:, 2] = -_ENDLESS, _ENDLESS
+    return np.asarray(np.where(CORNER_SIGNS > 0, high[:, None], low[:, None]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +232,7 @@ class Scene:
     Attributes:
         setting: what stands still.
         snapshot: where the road users are, seen from above.
-        frames: (A, 4, 4) their frames on the ground, as in `setting.placed_on`.
+        frames: (A, 4, 4) their frames on the ground, as in `placed_on`.
         movers: surfaces of those who are not parked.
         caster: casts rays against `movers`.
     """

@@ -1,15 +1,17 @@
 """Scenario files: what they can say, how they are read, and the paper's twelve designs as such files.
 
 A file is read into a `SpecTemplate`, whose ranges and choices are still open; `draw` makes a `ScenarioSpec` from it.
-The parts, lowest layer first: `model` (the fields), `yaml_nodes`, `choices`, `reading` (types), `checks` (the rest),
-`template`, `catalogue` (files, the designs, and the fields as text).
+The parts, lowest layer first: `model` (the fields and their open choices), `reading` (YAML and types), `checks` (the
+rest), `catalogue` (templates, the designs, and the fields as text).
 """
 
 from deepaccident_devkit.synth.spec.catalogue import (
     DESIGN_NUMBERS,
     DESIGNS,
+    SpecTemplate,
     design_text,
     designs_text,
+    draw,
     field_tables,
     parse_spec,
     read_spec,
@@ -22,7 +24,6 @@ from deepaccident_devkit.synth.spec.model import (
     ScenarioSpec,
     View,
 )
-from deepaccident_devkit.synth.spec.template import SpecTemplate, draw
 
 __all__ = [
     "DESIGNS",

@@ -7,8 +7,7 @@ from typing import Final, TypeAlias, cast
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ARMS, Arm, Junction, RoadSpec, Turn
-from deepaccident_devkit.synth.spec.choices import Items, Part, default_of
-from deepaccident_devkit.synth.spec.model import Role
+from deepaccident_devkit.synth.spec.model import Items, Part, Role, default_of
 
 _Way: TypeAlias = tuple[Arm, Turn, int]
 """Arm, turn and lane."""

@@ -1,13 +1,14 @@
-"""Things that stand on the ground: blocks, with a code for the map from above."""
+"""Things that stand on the ground: street furniture, trees and houses, as blocks with a code for the map from above."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.synth.roads import GroundMap, Terrain
-from deepaccident_devkit.synth.solids import Block, Solids, build
+from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, TREE, Arm, GroundMap, RoadSpec, Terrain
+from deepaccident_devkit.synth.roads.layout import OUTWARD
+from deepaccident_devkit.synth.solids import Block, Color, Solids, build
 
 BASEMENT = 0.2
 """Metres that things reach into the ground."""
@@ -67,3 +68,234 @@ def top_map(ground: GroundMap, props: Sequence[Prop]) -> GroundMap:
 def _corners(prop: Prop) -> FloatArray:
     x0, x1, y0, y1 = prop.footprint
     return np.array([[x0, y0], [x0, y1], [x1, y0], [x1, y1]])
+
+
+LAMP_COLORS: tuple[Color, Color, Color] = ((230, 46, 38), (240, 186, 50), (52, 210, 96))
+"""The colours of lamps that are on: red, amber, green."""
+_DARK_LAMPS: tuple[Color, Color, Color] = ((72, 22, 20), (76, 58, 20), (18, 62, 32))
+_STEEL: Color = (92, 96, 100)
+_HOUSING: Color = (38, 40, 42)
+LANTERN_COLOR: Color = (226, 222, 200)
+"""The colour of a lantern's head, which shines at night."""
+_PLATE: Color = (230, 226, 220)
+_RIM: Color = (186, 34, 36)
+KERB_INSET = 0.3
+"""Metres from the kerb to the middle of a mast."""
+_BEHIND_LINE = 0.3
+"""Metres from the stop line or yield line, towards the junction, to the light or sign."""
+_LAMP_HEIGHTS = (3.35, 3.05, 2.75)
+"""Heights of the red, amber and green lamp above the ground, metres."""
+_LANTERN_SPACING = 28.0
+_LANTERN_HEIGHT = 6.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SignalHead:
+    """The lamps for the traffic that comes by one arm.
+
+    Attributes:
+        arm: by which the traffic comes.
+        position: x, y, z of the middle lamp, metres, ground frame.
+        yaw: direction in which the lamps shine, radians.
+        rows: rows of the red, amber and green lamp in `World.props`.
+    """
+
+    arm: Arm
+    position: tuple[float, float, float]
+    yaw: float
+    rows: tuple[int, int, int]
+
+
+def mast(x: float, y: float, top: float) -> Prop:
+    """A mast whose top is `top` metres high."""
+    return Prop(POLE, (_column(x, y, (-0.1, top)),))
+
+
+def traffic_light(spec: RoadSpec, arm: Arm) -> Prop:
+    """A mast, a housing and three dark lamps (the last three blocks: red, amber, green) at the right of a stop line."""
+    out_x, out_y = OUTWARD[arm]
+    x, y = _right_of_line(spec, arm)
+    lamps = (
+        _box(x + 0.12 * out_x, y + 0.12 * out_y, 0.11, (z - 0.1, z + 0.1), color)
+        for z, color in zip(_LAMP_HEIGHTS, _DARK_LAMPS, strict=True)
+    )
+    housing = _box(x, y, 0.15, (_LAMP_HEIGHTS[2] - 0.2, _LAMP_HEIGHTS[0] + 0.2), _HOUSING)
+    return Prop(POLE, (_column(x, y, (-0.1, housing.z[0])), housing, *lamps))
+
+
+def yield_sign(spec: RoadSpec, arm: Arm) -> Prop:
+    """A post with a white triangle in a red one, a corner downwards, at the right of a yield line."""
+    out_x, out_y = OUTWARD[arm]
+    x, y = _right_of_line(spec, arm)
+    rim = _triangle(x, y, arm, (2.05, 2.75), _RIM)
+    face = _triangle(x + 0.02 * out_x, y + 0.02 * out_y, arm, (2.2, 2.69), _PLATE)
+    return Prop(POLE, (_column(x, y, (-0.1, 2.3), half=0.025), rim, face))
+
+
+def signal_head(arm: Arm, light: Prop, first_row: int) -> SignalHead:
+    """Where the lamps of a traffic light are.
+
+    Args:
+        arm: whose light it is.
+        light: from `traffic_light`, at the height of its ground.
+        first_row: row of the light's first block in the world's solids.
+    """
+    amber, red_row = light.blocks[-2], first_row + len(light.blocks) - len(LAMP_COLORS)
+    out_x, out_y = OUTWARD[arm]
+    return SignalHead(
+        arm=arm,
+        position=(float(np.mean(amber.x)), float(np.mean(amber.y)), float(np.mean(amber.z))),
+        yaw=float(np.arctan2(out_y, out_x)),
+        rows=(red_row, red_row + 1, red_row + 2),
+    )
+
+
+def lanterns(spec: RoadSpec) -> Iterator[Prop]:
+    """Street lanterns along each arm, on its two sidewalks by turns."""
+    for arm in spec.arms:
+        out_x, out_y = OUTWARD[arm]
+        for number, along in enumerate(np.arange(spec.stop_line[1] + 9.0, 115.0, _LANTERN_SPACING)):
+            side = 1 if number % 2 else -1
+            beside = side * (spec.road_edge + KERB_INSET)
+            x, y = float(along * out_x - beside * out_y), float(along * out_y + beside * out_x)
+            head = _box(x, y, 0.24, (_LANTERN_HEIGHT, _LANTERN_HEIGHT + 0.25), LANTERN_COLOR)
+            yield Prop(POLE, (_column(x, y, (-0.1, _LANTERN_HEIGHT)), head))
+
+
+def _right_of_line(spec: RoadSpec, arm: Arm) -> tuple[float, float]:
+    """Where the light or sign for the traffic from an arm stands: x and y, metres."""
+    along, beside = spec.stop_line[0] - _BEHIND_LINE, spec.road_edge + KERB_INSET
+    out_x, out_y = OUTWARD[arm]
+    return along * out_x - beside * out_y, along * out_y + beside * out_x
+
+
+def _triangle(x: float, y: float, arm: Arm, z: tuple[float, float], color: Color) -> Block:
+    """A plate across an arm, nearly a point at the bottom, and at the top as wide as it is high."""
+    tip, wide, thin = 0.02, (z[1] - z[0]) * 0.5, 0.02
+    if OUTWARD[arm][0]:
+        return Block((x - thin, x + thin), (y - tip, y + tip), z, color, inset=(0.0, 0.0, tip - wide))
+    return Block((x - tip, x + tip), (y - thin, y + thin), z, color, inset=(tip - wide, tip - wide, 0.0))
+
+
+def _column(x: float, y: float, z: tuple[float, float], half: float = 0.09) -> Block:
+    return _box(x, y, half, z, _STEEL)
+
+
+def _box(x: float, y: float, half: float, z: tuple[float, float], color: Color) -> Block:
+    return Block((x - half, x + half), (y - half, y + half), z, color)
+
+
+_BARK: Color = (92, 72, 54)
+_LEAVES: tuple[Color, ...] = ((70, 116, 54), (88, 132, 62), (58, 100, 58))
+_SPACING = 13.0
+_SHARE = 0.55
+"""The share of places that have a tree."""
+_INSET = 1.25
+"""Metres from the sidewalk to a trunk, so that crowns end at the sidewalk."""
+
+
+def trees(rng: np.random.Generator, spec: RoadSpec) -> Iterator[Prop]:
+    """Trees along both sides of each arm, with gaps."""
+    for arm in spec.arms:
+        out_x, out_y = OUTWARD[arm]
+        for along in np.arange(spec.stop_line[1] + 7.0, 105.0, _SPACING):
+            for side in (1, -1):
+                place, present = float(along + rng.uniform(-2, 2)), rng.random() < _SHARE
+                beside = side * (spec.sidewalk_edge + _INSET)
+                if present:
+                    yield _tree(rng, place * out_x - beside * out_y, place * out_y + beside * out_x)
+
+
+def _tree(rng: np.random.Generator, x: float, y: float) -> Prop:
+    leaves, top = _LEAVES[rng.integers(len(_LEAVES))], float(rng.uniform(4.0, 5.6))
+    crown = ((x - 1.1, x + 1.1), (y - 1.1, y + 1.1))
+    return Prop(
+        TREE,
+        (
+            Block((x - 0.14, x + 0.14), (y - 0.14, y + 0.14), (-0.1, 2.3), _BARK),
+            Block(*crown, (2.2, 3.3), leaves, inset=(-0.1, -0.1, -0.1)),
+            Block((x - 1.15, x + 1.15), (y - 1.15, y + 1.15), (3.3, top), leaves, inset=(0.7, 0.7, 0.7)),
+        ),
+    )
+
+
+Span = tuple[float, float]
+
+STOREY = 3.2
+"""Height of a storey, metres."""
+_WALLS: tuple[Color, ...] = (
+    (176, 122, 96), (206, 190, 160), (170, 170, 166), (148, 100, 82), (220, 214, 200), (140, 150, 158), (190, 160, 128),
+)  # fmt: skip
+_SETBACK = (2.5, 4.6)
+"""Metres from the sidewalk to the fronts."""
+_LAST = 110.0
+_KERB_HOUSE_LENGTH = 20.5
+_KERB_HOUSE_STOREYS = 3
+_MAST_ROOM = 0.25
+"""Metres from the middle of a mast to the house on the kerb behind it."""
+_CODES = 240
+
+
+def houses(rng: np.random.Generator, spec: RoadSpec) -> list[Prop]:
+    """A corner building in each quadrant and a row of houses along each of its two sides."""
+    blocks = [block for sign_x in (1, -1) for sign_y in (1, -1) for block in _quadrant(rng, spec, sign_x, sign_y)]
+    if spec.kind == "three-way":
+        blocks += _closed_side(rng, spec)
+    return [_building(number, block) for number, block in enumerate(blocks)]
+
+
+def kerb_house(spec: RoadSpec, corner: tuple[int, int]) -> Prop:
+    """The house on the kerb of a corner, given by its signs of x and y: it hides the traffic behind it.
+
+    Between it and the road there is only room for a mast.
+    """
+    near = spec.road_edge + KERB_INSET + _MAST_ROOM
+    kept = spec.kerb_radius - KERB_INSET - _MAST_ROOM
+    near = max(near, spec.road_edge + spec.kerb_radius - kept / float(np.sqrt(2)))
+    x, y = (_mirrored((near, near + _KERB_HOUSE_LENGTH), sign) for sign in corner)
+    wall = _WALLS[0]
+    return Prop(FIRST_BUILDING, (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), wall, facade=True),))
+
+
+def _quadrant(rng: np.random.Generator, spec: RoadSpec, sign_x: int, sign_y: int) -> Iterator[Block]:
+    setback = spec.sidewalk_edge + rng.uniform(*_SETBACK, 2)
+    end = setback + rng.uniform(15, 22, 2)
+    yield _house(rng, (setback[0], end[0]), (setback[1], end[1]), (sign_x, sign_y), storeys=(3, 6))
+    for span, front in _row(rng, spec, end[0], end[1]):
+        yield _house(rng, span, front, (sign_x, sign_y))
+    for span, front in _row(rng, spec, end[1], end[0]):
+        yield _house(rng, front, span, (sign_x, sign_y))
+
+
+def _closed_side(rng: np.random.Generator, spec: RoadSpec) -> Iterator[Block]:
+    """A house on the side where a three-way junction has no arm, between the corner houses."""
+    front = spec.sidewalk_edge + rng.uniform(*_SETBACK)
+    half = spec.sidewalk_edge + _SETBACK[0] - 1.5
+    yield _house(rng, (-half, half), (front, front + rng.uniform(9, 14)), (1, 1), storeys=(2, 4))
+
+
+def _row(rng: np.random.Generator, spec: RoadSpec, start: float, deepest: float) -> Iterator[tuple[Span, Span]]:
+    """Houses side by side from `start`: their extents along the road and away from it."""
+    position = start + rng.uniform(1.5, 6)
+    while position < _LAST:
+        length, front = rng.uniform(10, 20), spec.sidewalk_edge + rng.uniform(*_SETBACK)
+        yield (position, position + length), (front, min(front + rng.uniform(9, 14), deepest))
+        position += length + rng.uniform(1, 7)
+
+
+def _house(
+    rng: np.random.Generator, x: Span, y: Span, signs: tuple[int, int], storeys: tuple[int, int] = (2, 5)
+) -> Block:
+    """A house of the first quadrant, mirrored into another."""
+    height = STOREY * int(rng.integers(*storeys)) + 0.8
+    wall = _WALLS[rng.integers(len(_WALLS))]
+    return Block(_mirrored(x, signs[0]), _mirrored(y, signs[1]), (-BASEMENT, height), wall, facade=True)
+
+
+def _mirrored(span: Span, sign: int) -> Span:
+    low, high = sorted((sign * float(span[0]), sign * float(span[1])))
+    return low, high
+
+
+def _building(number: int, block: Block) -> Prop:
+    return Prop(FIRST_BUILDING + number % _CODES, (block,))

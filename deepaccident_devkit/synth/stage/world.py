@@ -8,20 +8,25 @@ from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.roads import Arm, GroundMap, Junction, Terrain
-from deepaccident_devkit.synth.roads.terrain import OUTWARD
+from deepaccident_devkit.synth.roads.layout import OUTWARD
 from deepaccident_devkit.synth.solids import Solids
 from deepaccident_devkit.synth.spec import View
-from deepaccident_devkit.synth.stage.furniture import (
+from deepaccident_devkit.synth.stage.props import (
+    Prop,
     SignalHead,
+    houses,
+    kerb_house,
     lanterns,
     mast,
+    overlap,
+    settled,
     signal_head,
+    solids_of,
+    top_map,
     traffic_light,
     trees,
     yield_sign,
 )
-from deepaccident_devkit.synth.stage.houses import houses, kerb_house
-from deepaccident_devkit.synth.stage.props import Prop, overlap, settled, solids_of, top_map
 
 Corner = tuple[int, int]
 """A corner, given by its signs of x and y."""

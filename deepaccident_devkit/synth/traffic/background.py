@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.synth.bodies import Body, random_body
+from deepaccident_devkit.synth.actors import Body, random_body
 from deepaccident_devkit.synth.roads import Junction, Path, Route
-from deepaccident_devkit.synth.roads.terrain import OUTWARD
+from deepaccident_devkit.synth.roads.layout import OUTWARD
 from deepaccident_devkit.synth.spec import ActorSpec, ScenarioSpec
-from deepaccident_devkit.synth.traffic.signals import RED, SignalPlan
+from deepaccident_devkit.synth.traffic.rights import RED, SignalPlan
 from deepaccident_devkit.synth.traffic.users import MANNERS, RoadUser, lane_span, lane_way, shifted
 
 _DRIVERS = ("car", "car", "car", "car", "van", "truck")

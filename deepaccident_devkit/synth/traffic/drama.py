@@ -14,10 +14,8 @@ from deepaccident_devkit.synth.spec import ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
 from deepaccident_devkit.synth.traffic.casting import WARM_UP, Cast, cast_actors
-from deepaccident_devkit.synth.traffic.impact import Impact, impact_of, least_gap, touching_pairs
-from deepaccident_devkit.synth.traffic.misses import Miss, measured_miss
-from deepaccident_devkit.synth.traffic.rights import find_rights
-from deepaccident_devkit.synth.traffic.signals import AXIS_OF_ARM, SignalPlan, plan_with_green
+from deepaccident_devkit.synth.traffic.impact import Impact, Miss, impact_of, least_gap, measured_miss, touching_pairs
+from deepaccident_devkit.synth.traffic.rights import AXIS_OF_ARM, SignalPlan, find_rights, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import Simulation, simulate
 from deepaccident_devkit.synth.traffic.users import RoadUser, middle_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD

@@ -7,14 +7,12 @@ from functools import lru_cache
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.synth.bodies import Body
+from deepaccident_devkit.synth.actors import Body
 from deepaccident_devkit.synth.roads import Arm, Junction, Path, Route, Turn, straight
-from deepaccident_devkit.synth.roads.layout import RoadSpec
+from deepaccident_devkit.synth.roads.layout import OUTWARD, RoadSpec
 from deepaccident_devkit.synth.roads.paths import through
-from deepaccident_devkit.synth.roads.terrain import OUTWARD
 from deepaccident_devkit.synth.spec.model import Role, Rule, Side
-from deepaccident_devkit.synth.traffic.following import Temper
-from deepaccident_devkit.synth.traffic.kinematics import WHEELBASE
+from deepaccident_devkit.synth.traffic.driving import WHEELBASE, Temper
 
 _SPAN = (4.0, 10.0)
 """Metres before the stop line, and metres past the junction, between which paths can cross."""

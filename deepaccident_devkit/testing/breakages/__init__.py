@@ -7,22 +7,22 @@ from pathlib import Path
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import ScenarioFolder, find_release
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
-from deepaccident_devkit.testing.breakages import calibs, folders, labels, legal, metas, sensors
+from deepaccident_devkit.testing.breakages import files, folders, legal
 from deepaccident_devkit.testing.breakages.kinds import Breakage, BrokenRelease, Victim
 from deepaccident_devkit.testing.editing import ScenarioEditor
 from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
 from deepaccident_devkit.text import choice
 
 _GROUPS = (
-    labels.FORM,
-    labels.MEANING,
-    calibs.FORM,
-    calibs.MEANING,
-    metas.FORM,
-    metas.MEANING,
-    sensors.FORM,
-    sensors.MISSING,
-    sensors.MEANING,
+    files.LABEL_FORM,
+    files.LABEL_MEANING,
+    files.CALIB_FORM,
+    files.CALIB_MEANING,
+    files.META_FORM,
+    files.META_MEANING,
+    folders.SENSOR_FORM,
+    folders.SENSOR_MISSING,
+    folders.SENSOR_MEANING,
     folders.BROKEN,
     folders.ODD,
     folders.SPLIT_FILES,

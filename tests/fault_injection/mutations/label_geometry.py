@@ -9,9 +9,10 @@ from fault_injection.kinds import Group
 from fault_injection.place import FIELD, Place
 
 GROUP = Group("label, geometry")
+Edit = Callable[[list[str]], None]
 
 
-def _scale(*names: str, by: float = -1.0) -> Callable[[list[str]], None]:
+def _scale(*names: str, by: float = -1.0) -> Edit:
     def edit(row: list[str]) -> None:
         for name in names:
             row[FIELD[name]] = repr(float(row[FIELD[name]]) * by)
@@ -19,7 +20,7 @@ def _scale(*names: str, by: float = -1.0) -> Callable[[list[str]], None]:
     return edit
 
 
-def _add(names: Sequence[str], amounts: Sequence[float]) -> Callable[[list[str]], None]:
+def _add(names: Sequence[str], amounts: Sequence[float]) -> Edit:
     def edit(row: list[str]) -> None:
         for name, amount in zip(names, amounts, strict=True):
             row[FIELD[name]] = repr(float(row[FIELD[name]]) + float(amount))
@@ -32,12 +33,36 @@ def _way(rng: np.random.Generator, length: float) -> tuple[float, float]:
     return length * float(np.cos(angle)), length * float(np.sin(angle))
 
 
+def _of_box(place: Place, rng: np.random.Generator, edit: Edit) -> str:
+    """Edit an actor's box in one agent's label of one frame."""
+    (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
+    place.edit_rows(agent, [frame], edit, actor=actor)
+    return f"{agent} {frame}: {actor}"
+
+
+def _of_actor(place: Place, rng: np.random.Generator, edit: Edit, *, moving: bool = False) -> str:
+    """Edit an actor's boxes in all labels of one agent."""
+    agent, actor = place.shared_actor(rng, moving=moving)
+    place.edit_rows(agent, place.frames, edit, actor=actor)
+    return f"{agent}: {actor}"
+
+
+def _of_agent(place: Place, rng: np.random.Generator, edit: Edit) -> str:
+    """Edit all boxes of one agent."""
+    return _of_agent(place, rng, edit)
+
+
+def _of_all(place: Place, edit: Edit) -> str:
+    """Edit all boxes of all agents."""
+    for agent in place.agents:
+        place.edit_rows(agent, place.frames, edit)
+    return "all agents"
+
+
 @GROUP.kind()
 def x_sign(place: Place, rng: np.random.Generator) -> str:
     """A box's x has the other sign at one frame."""
-    (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
-    place.edit_rows(agent, [frame], _scale("x"), actor=actor)
-    return f"{agent} {frame}: {actor}"
+    return _of_box(place, rng, _scale("x"))
 
 
 @GROUP.kind()
@@ -60,49 +85,37 @@ def y_flipped_in_a_frame(place: Place, rng: np.random.Generator) -> str:
 @GROUP.kind()
 def y_flipped(place: Place, rng: np.random.Generator) -> str:
     """All y of an agent have the other sign."""
-    agent = place.any_agent(rng)
-    place.edit_rows(agent, place.frames, _scale("y"))
-    return agent
+    return _of_agent(place, rng, _scale("y"))
 
 
 @GROUP.kind()
 def yaw_flipped(place: Place, rng: np.random.Generator) -> str:
     """All yaws of an agent have the other sign."""
-    agent = place.any_agent(rng)
-    place.edit_rows(agent, place.frames, _scale("yaw"))
-    return agent
+    return _of_agent(place, rng, _scale("yaw"))
 
 
 @GROUP.kind()
 def labels_right_handed(place: Place, rng: np.random.Generator) -> str:
     """An agent's labels are right-handed: y, yaw and vy have the other sign."""
-    agent = place.any_agent(rng)
-    place.edit_rows(agent, place.frames, _scale("y", "yaw", "vy"))
-    return agent
+    return _of_agent(place, rng, _scale("y", "yaw", "vy"))
 
 
 @GROUP.kind()
 def all_labels_right_handed(place: Place, rng: np.random.Generator) -> str:
     """All agents' labels are right-handed, but the poses are not."""
-    for agent in place.agents:
-        place.edit_rows(agent, place.frames, _scale("y", "yaw", "vy"))
-    return "all agents"
+    return _of_all(place, _scale("y", "yaw", "vy"))
 
 
 @GROUP.kind()
 def yaw_in_degrees(place: Place, rng: np.random.Generator) -> str:
     """An agent's yaws are degrees."""
-    agent = place.any_agent(rng)
-    place.edit_rows(agent, place.frames, _scale("yaw", by=180 / np.pi))
-    return agent
+    return _of_agent(place, rng, _scale("yaw", by=180 / np.pi))
 
 
 @GROUP.kind()
 def yaw_turned(place: Place, rng: np.random.Generator) -> str:
     """A box is turned by 90° at one frame."""
-    (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
-    place.edit_rows(agent, [frame], _add(["yaw"], [np.pi / 2]), actor=actor)
-    return f"{agent} {frame}: {actor}"
+    return _of_box(place, rng, _add(["yaw"], [np.pi / 2]))
 
 
 @GROUP.kind()
@@ -124,9 +137,7 @@ def size_axes_swapped(place: Place, rng: np.random.Generator) -> str:
 @GROUP.kind()
 def all_size_axes_swapped(place: Place, rng: np.random.Generator) -> str:
     """Length and width are exchanged in all labels of all agents."""
-    for agent in place.agents:
-        place.edit_rows(agent, place.frames, _swap_axes)
-    return "all agents"
+    return _of_all(place, _swap_axes)
 
 
 def _swap_axes(row: list[str]) -> None:
@@ -145,25 +156,19 @@ def _shared_vehicle(place: Place, rng: np.random.Generator) -> tuple[str, int]:
 @GROUP.kind()
 def size_scaled(place: Place, rng: np.random.Generator) -> str:
     """An actor is a quarter larger in one agent."""
-    agent, actor = place.shared_actor(rng)
-    place.edit_rows(agent, place.frames, _scale("l", "w", "h", by=1.25), actor=actor)
-    return f"{agent}: {actor}"
+    return _of_actor(place, rng, _scale("l", "w", "h", by=1.25))
 
 
 @GROUP.kind()
 def size_halved_in_a_frame(place: Place, rng: np.random.Generator) -> str:
     """A box has half its size (as if the file had half lengths) at one frame."""
-    (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
-    place.edit_rows(agent, [frame], _scale("l", "w", "h", by=0.5), actor=actor)
-    return f"{agent} {frame}: {actor}"
+    return _of_box(place, rng, _scale("l", "w", "h", by=0.5))
 
 
 @GROUP.kind(deep=True)
 def all_sizes_halved(place: Place, rng: np.random.Generator) -> str:
     """All boxes of all agents have half their size."""
-    for agent in place.agents:
-        place.edit_rows(agent, place.frames, _scale("l", "w", "h", by=0.5))
-    return "all agents"
+    return _of_all(place, _scale("l", "w", "h", by=0.5))
 
 
 @GROUP.kind()
@@ -189,9 +194,7 @@ def heights_of_the_ground(place: Place, rng: np.random.Generator) -> str:
     def edit(row: list[str]) -> None:
         row[FIELD["z"]] = repr(float(row[FIELD["z"]]) - float(row[FIELD["h"]]) / 2)
 
-    agent = place.any_agent(rng)
-    place.edit_rows(agent, place.frames, edit)
-    return agent
+    return _of_agent(place, rng, edit)
 
 
 @GROUP.kind()
@@ -224,9 +227,7 @@ def _move_lone(place: Place, rng: np.random.Generator, frame: int) -> str:
 @GROUP.kind()
 def box_lifted(place: Place, rng: np.random.Generator) -> str:
     """A box is 1.5 m too high at one frame."""
-    (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
-    place.edit_rows(agent, [frame], _add("z", [1.5]), actor=actor)
-    return f"{agent} {frame}: {actor}"
+    return _of_box(place, rng, _add("z", [1.5]))
 
 
 @GROUP.kind()
@@ -266,9 +267,7 @@ def _change_speeds(place: Place, agent: str, frames: list[int], way: tuple[float
 @GROUP.kind()
 def velocity_reversed(place: Place, rng: np.random.Generator) -> str:
     """A moving actor's velocity has the other sign in one agent."""
-    agent, actor = place.shared_actor(rng, moving=True)
-    place.edit_rows(agent, place.frames, _scale("vx", "vy"), actor=actor)
-    return f"{agent}: {actor}"
+    return _of_actor(place, rng, _scale("vx", "vy"), moving=True)
 
 
 @GROUP.kind()
@@ -279,9 +278,7 @@ def velocities_in_another_frame(place: Place, rng: np.random.Generator) -> str:
         vx, vy = FIELD["vx"], FIELD["vy"]
         row[vx], row[vy] = repr(-float(row[vy])), row[vx]
 
-    agent = place.any_agent(rng)
-    place.edit_rows(agent, place.frames, edit)
-    return agent
+    return _of_agent(place, rng, edit)
 
 
 @GROUP.kind()

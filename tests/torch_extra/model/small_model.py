@@ -15,11 +15,10 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.model import presets
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
-from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
+from deepaccident_devkit.model.network import ModelConfig
 from deepaccident_devkit.model.training import train as training
 from deepaccident_devkit.model.training.config import TrainConfig
-from deepaccident_devkit.model.warps import GridBounds
 
 ALONG = (-50.0, 50.0, 2.5)
 """40 cells: 20 after the encoder, 5 of the latent."""
@@ -46,7 +45,7 @@ def small() -> ModelConfig:
         lift=replace(
             tiny.lift, in_channels=8, channels=8, depth=(2.0, 50.0, 4.0), x=ALONG, y=ALONG, image_size=(48, 64)
         ),
-        temporal=replace(tiny.temporal, channels=8, grid=GridBounds(x=ALONG, y=ALONG)),
+        temporal=replace(tiny.temporal, channels=8, grid=BevGrid(x=ALONG, y=ALONG)),
         bev=BevUNetConfig(in_channels=8, out_channels=16, widths=(16, 16)),
         motion=replace(tiny.motion, in_channels=16, latent=4, future_frames=2, hidden=8, samples=2),
         detection=replace(tiny.detection, in_channels=16, shared_channels=8, x=ALONG, y=ALONG),
@@ -71,7 +70,7 @@ def small_released() -> ModelConfig:
             y=along,
             image_size=(32, 64),
         ),
-        temporal=replace(released.temporal, channels=8, grid=GridBounds(x=along, y=along)),
+        temporal=replace(released.temporal, channels=8, grid=BevGrid(x=along, y=along)),
         fusion=replace(released.fusion, channels=8, ego_channels=(1, 5)),
         bev=BevEncodeConfig(in_channels=8, out_channels=16, widths=(8, 8, 16)),
         motion=replace(released.motion, in_channels=16, latent=4, future_frames=2, samples=2),

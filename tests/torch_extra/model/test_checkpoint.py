@@ -1,6 +1,5 @@
 """Weights in files: ours bit for bit, foreign ones by their names, and files that are none."""
 
-import json
 import pickle
 import re
 from collections.abc import Callable
@@ -297,11 +296,3 @@ def test_notes_that_are_no_json_object_are_refused(tmp_path: Path, noted: str) -
     path = tmp_path / "weights.safetensors"
     save_file({"img_neck.weight": torch.zeros(1)}, path, metadata={"deepaccident": noted})
     assert_refused(path, "is no file of weights")
-
-
-def test_safetensors_of_others_have_no_notes(tmp_path: Path) -> None:
-    path = tmp_path / "weights.safetensors"
-    for metadata in (None, {"format": "pt"}):
-        save_file({"img_neck.weight": torch.ones(1)}, path, metadata=metadata)
-        assert read_weights(path).meta == {}
-        assert json.loads(json.dumps(dict(read_weights(path).meta))) == {}

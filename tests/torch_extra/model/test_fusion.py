@@ -20,8 +20,7 @@ from deepaccident_devkit.model.fusion import (
     V2XViTConfig,
     fusion,
 )
-from deepaccident_devkit.model.fusion.v2xvit import sinusoid
-from deepaccident_devkit.model.fusion.windows import Windows, relative_positions
+from deepaccident_devkit.model.fusion.attention import Windows
 
 C = 8
 MEAN = PoolFusionConfig()
@@ -214,14 +213,6 @@ def test_v2xvit_s_windows_can_see_what_the_mask_hides() -> None:
     assert not torch.allclose(windowed(louder, mask, infra, delay), fused, atol=1e-4)
 
 
-def test_sinusoids_begin_with_no_sine_and_whole_cosines() -> None:
-    code = sinusoid(torch.tensor([0, 1]), 6) * 6**0.5
-    torch.testing.assert_close(code[0], torch.tensor([0.0, 1, 0, 1, 0, 1]))
-    rate = torch.tensor([1, 10000 ** (-1 / 3), 10000 ** (-2 / 3)])
-    torch.testing.assert_close(code[1, 0::2], rate.sin())
-    torch.testing.assert_close(code[1, 1::2], rate.cos())
-
-
 @settings(max_examples=30)
 @given(st.integers(1, 4), st.integers(1, 9), st.integers(1, 9), st.booleans())
 def test_windows_are_joined_as_they_were_split(size: int, height: int, width: int, strided: bool) -> None:
@@ -239,14 +230,6 @@ def test_windows_hold_neighbours_or_cells_spread_over_the_map() -> None:
     numbers = torch.arange(24).view(1, 1, 4, 6, 1)
     assert Windows(size=2).split(numbers)[1, :, 0].tolist() == [2, 3, 8, 9]
     assert Windows(size=2, strided=True).split(numbers)[1, :, 0].tolist() == [1, 4, 13, 16]
-
-
-def test_relative_positions_are_query_minus_key() -> None:
-    """Cells of a 3 × 3 window: the middle of the 5 × 5 differences is no difference at all."""
-    positions = relative_positions(3)
-    assert positions.diagonal().tolist() == [12] * 9
-    assert positions[5, 0].item() == (1 + 2) * 5 + (2 + 2)
-    assert positions[0, 5].item() == (-1 + 2) * 5 + (-2 + 2)
 
 
 def test_wrong_configs_say_so() -> None:

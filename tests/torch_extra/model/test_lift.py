@@ -185,14 +185,6 @@ def test_frames_and_samples_keep_apart_and_the_order_of_cameras_does_not_matter(
     torch.testing.assert_close(lift(features.flip(2), turned), whole)
 
 
-def test_cells_can_be_computed_once():
-    lift, features, cameras = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5), rig()
-    cells = lift.cells(cameras)
-    assert cells.dtype == torch.int64
-    assert torch.equal(lift(features, cells), lift(features, cameras))
-    assert torch.equal(lift(features[1:], cells[1:]), lift(features[1:], replace_all(cameras, lambda each: each[1:])))
-
-
 def replace_all(cameras: CameraGeometry, change) -> CameraGeometry:
     return CameraGeometry(
         **{name: change(getattr(cameras, name)) for name in ("rotation", "translation", "intrinsics")}
@@ -222,15 +214,6 @@ def test_gradients_reach_the_features_and_every_weight():
     assert not lift.frustum.requires_grad
 
 
-@pytest.mark.parametrize("pooling", ["sum", "mean"])
-def test_gradients_are_those_of_finite_differences(pooling):
-    config = replace(CONFIG, in_channels=2, channels=1, depth=(2, 8, 2), image_size=(16, 16), pooling=pooling)
-    lift, cameras = lift_of(config).double(), rig(shape=(1, 1, 2))
-    features = noise(1, 1, 2, 2, 2, 2).double().requires_grad_()
-    cells = lift.cells(cameras)
-    assert torch.autograd.gradcheck(lambda each: lift(each, cells), (features,))
-
-
 def test_half_precision_is_summed_in_single_precision():
     lift, features, cameras = lift_of(WIDE), noise(2, 2, 3, 5, 3, 5), rig()
     expected = lift(features, cameras)
@@ -239,15 +222,6 @@ def test_half_precision_is_summed_in_single_precision():
         assert torch.equal(lift.points(cameras), LiftSplat(WIDE).points(cameras))
     assert found.dtype == torch.float32
     torch.testing.assert_close(found, expected, atol=0.05, rtol=0.05)
-
-
-def test_agents_become_samples():
-    cameras = rig(shape=(6, 2, 3))
-    agents = replace_all(cameras, lambda each: each.unflatten(0, (2, 3)))
-    flat = agents.flattened()
-    assert torch.equal(flat.rotation, cameras.rotation)
-    assert torch.equal(flat.translation, cameras.translation)
-    assert flat.valid is None
 
 
 # --- what `tiny` has beside the release
@@ -300,15 +274,6 @@ def test_a_mean_does_not_grow_with_the_number_of_points():
 def test_a_wrong_configuration_is_named(change, message):
     with pytest.raises(ConfigError, match=message):
         replace(CONFIG, **change)
-
-
-def test_words_are_checked():
-    with pytest.raises(ValueError, match="frustum: expected one of corners, centres, found 'centers'"):
-        replace(CONFIG, frustum="centers")
-    with pytest.raises(ValueError, match="voxel_rounding: expected one of trunc, floor"):
-        replace(CONFIG, voxel_rounding="round")
-    with pytest.raises(ValueError, match="pooling: expected one of sum, mean, found 'max'"):
-        replace(CONFIG, pooling="max")
 
 
 def test_features_of_another_shape_are_named():

@@ -7,24 +7,19 @@ from typing import Any, get_args
 import pytest
 import torch
 from torch.testing import assert_close
-from torch_extra.model.small_model import RUN, small, small_released
+from torch_extra.model.small_model import small, small_released
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, V2XDataset, collate, collate_all_egos
-from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.entry import model_inputs
 from deepaccident_devkit.model.fusion import ReleasedFusionConfig
-from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.presets import fusion_config
-from deepaccident_devkit.model.training.step import TrainingStep, training_batch
 from deepaccident_devkit.taxonomy import ModelFusion
-from deepaccident_devkit.v2x import Link
 
 Seeded = Callable[..., V2XFormer]
 Predicted = Callable[..., list[torch.Tensor]]
 FUSIONS = get_args(ModelFusion)
-_NO_BOXES = tuple(f"pts_bbox_head.task_decoders.3dod.task_heads.{task}." for task in (2, 4, 5))
-"""Released tasks whose categories the release of the tests lacks, or that have none: no gradient but of heatmaps."""
 
 
 def assert_same(found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float = 1e-4) -> None:
@@ -162,27 +157,6 @@ def test_all_egos_of_a_partial_release_are_each_by_itself(
         assert_same([each[row : row + 1] for each in together], own)
 
 
-def test_lost_messages_change_nothing_else(
-    da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
-) -> None:
-    model = seeded(config)
-    single = predicted(model, model_inputs(collate([alone(da, moment[0], config, "single")])))
-    every = alone(da, moment[0], config, "all", link=Link(packet_loss=1.0))
-    assert every["agent_valid"][:, -1].tolist() == [True, False, False, False, False]
-    assert_same(predicted(model, model_inputs(collate([every]))), single)
-    draws = (alone(da, moment[0], config, "all", link=Link(packet_loss=0.4, seed=seed)) for seed in range(20))
-    some = next(each for each in draws if partly_heard(each["agent_valid"]))
-    heard = [name for name, valid in zip(some["agents"], some["agent_valid"][:, -1], strict=True) if valid]
-    chosen = alone(da, moment[0], config, heard[1:])
-    assert_same(*(predicted(model, model_inputs(collate([each]))) for each in (some, chosen)))
-
-
-def partly_heard(valid: torch.Tensor) -> bool:
-    """Whether some partners arrived with their past, and others did not."""
-    present = valid[1:, -1]
-    return 0 < int(present.sum()) < len(present) and bool(valid[1:, 0][present].all())
-
-
 def test_fusions_that_ask_know_kinds_and_delays(
     da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted
 ) -> None:
@@ -216,34 +190,3 @@ def test_a_left_handed_model_maps_the_mirror_image(
             fused.append(model.fused(lifted[None, :, -1], inputs))
     assert_close(fused[0], fused[1].flip(-2), atol=1e-3, rtol=1e-3)
     assert apart(fused[:1], fused[1:]) > 0.1
-
-
-@pytest.mark.parametrize("name", FUSIONS)
-def test_gradients_reach_every_parameter_of_tiny(da: DeepAccident, moment: list[str], name: str) -> None:
-    assert without_gradient(da, moment, of_fusion(name)) == []
-
-
-@pytest.mark.parametrize("name", FUSIONS)
-def test_gradients_reach_every_parameter_of_released(da: DeepAccident, moment: list[str], name: str) -> None:
-    """But those of boxes of tasks that see none: a heatmap alone learns that there is nothing."""
-    lacking = without_gradient(da, moment, of_fusion(name, small_released))
-    assert all(each.startswith(_NO_BOXES) and ".heatmap." not in each for each in lacking), lacking
-    assert len(lacking) == 3 * 5 * 5
-
-
-def without_gradient(da: DeepAccident, moment: list[str], config: ModelConfig) -> list[str]:
-    """Names of parameters whose gradient is 0, or was never made, with some egos and with the others.
-
-    The signs of a few boxes may cancel out in the gradient of a bias: hence not all at once.
-    """
-    torch.manual_seed(1)
-    model = V2XFormer(config)
-    given = config.inputs("all", boxes="sample", labels=config.labels)
-    batch = collate_all_egos([AllEgosDataset(da, moment, given)[0]])
-    lacking = {name for name, parameter in model.named_parameters() if parameter.requires_grad}
-    for seed in range(2):
-        inputs, targets = training_batch(batch, config, RUN, torch.Generator().manual_seed(seed))
-        model.zero_grad(set_to_none=True)
-        torch.stack(list(TrainingStep(model)(inputs, targets).values())).sum().backward()
-        lacking -= {name for name, each in model.named_parameters() if each.grad is not None and each.grad.any()}
-    return sorted(lacking)

@@ -24,13 +24,17 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.metrics.motion.evaluator import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
-from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.detection import TaskMaps, detection_targets
 from deepaccident_devkit.model.entry import mirrored_boxes
 from deepaccident_devkit.model.motion import MotionMaps
-from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.predicting import PredictConfig, SamplePrediction, motion_output, predictions
-from deepaccident_devkit.model.results import predict_results
+from deepaccident_devkit.model.network import ModelConfig, V2XFormer
+from deepaccident_devkit.model.results import (
+    PredictConfig,
+    SamplePrediction,
+    motion_output,
+    predict_results,
+    predictions,
+)
 from deepaccident_devkit.motion import MotionHeads, motion_labels
 from deepaccident_devkit.v2x import Link
 
@@ -89,14 +93,6 @@ def test_a_prediction_does_not_depend_on_others(
     for one, other in zip(found, predict(model, da, tokens[::-1])[::-1], strict=True):
         assert same(one, other)
     assert not same(found[0], replace(found[1], token=tokens[0]))
-
-
-@pytest.mark.slow
-def test_workers_change_nothing(
-    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
-) -> None:
-    read = predict(model, da, tokens, PredictConfig(workers=1))
-    assert all(same(one, other) for one, other in zip(found, read, strict=True))
 
 
 def test_the_seed_changes_the_draws_but_not_the_mean(

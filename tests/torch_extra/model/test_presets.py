@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ from deepaccident_devkit.model.bev import BevUNetConfig
 from deepaccident_devkit.model.checkpoint import FINAL, write_weights
 from deepaccident_devkit.model.fusion import CobevtConfig, DiscoNetConfig, PoolFusionConfig, V2XViTConfig
 from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.presets import PRESETS, ModelChoice, fusion_config, load_model, released, tiny
+from deepaccident_devkit.model.presets import PRESETS, ModelChoice, load_model, released, tiny
 from deepaccident_devkit.taxonomy import ModelFusion
 from deepaccident_devkit.v2x import Link
 
@@ -56,19 +56,6 @@ def test_a_fusion_fits_its_preset(fusion: ModelFusion, kind: type, preset: Any) 
     assert replace(config, fusion=PRESETS[preset]().fusion) == PRESETS[preset]()
     with torch.device("meta"):
         V2XFormer(config)
-
-
-def test_every_fusion_has_a_config() -> None:
-    assert {type(fusion_config(name, 64)).__name__ for name in get_args(ModelFusion)} == {
-        "PoolFusionConfig",
-        "ReleasedFusionConfig",
-        "DiscoNetConfig",
-        "CobevtConfig",
-        "V2XViTConfig",
-    }
-    assert fusion_config("max", 64) != fusion_config("mean", 64)
-    with pytest.raises(ChoiceError, match="fusion: expected one of mean, max"):
-        fusion_config("sum", 64)
 
 
 def test_the_released_fusion_has_channels_that_a_small_model_lacks() -> None:

@@ -11,10 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.model.checkpoint import read_weights
 from deepaccident_devkit.model.presets import tiny
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
@@ -80,15 +78,6 @@ def test_hidden_and_seen_actors_are_counted_apart(numbers: ModuleType, scene: An
     }
 
 
-def test_who_covers_everything_finds_all_but_has_a_false_map(numbers: ModuleType, scene: Any) -> None:
-    evaluator = numbers.HiddenActors()
-    everything = np.ones(LABELS.grid.shape, dtype=bool)
-    evaluator.add("a", numbers.found_counts(scene, everything, np.zeros((0, 2))))
-    result = evaluator.compute()
-    assert (result.hidden_foreground, result.seen_foreground, result.hidden_detected) == (1.0, 1.0, 0.0)
-    assert result.false_foreground == pytest.approx(1 - 3 / LABELS.grid.cells)
-
-
 def test_hidden_actors_are_those_that_a_partner_alone_sees(numbers: ModuleType, da: DeepAccident) -> None:
     hidden = seen = 0
     for scenario in da.scenario:
@@ -105,75 +94,6 @@ def test_hidden_actors_are_those_that_a_partner_alone_sees(numbers: ModuleType, 
         hidden, seen = hidden + int(scene.hidden.sum()), seen + int((~scene.hidden).sum())
     assert hidden
     assert seen
-
-
-def test_donors_are_of_another_pair_at_the_same_place(rows: ModuleType) -> None:
-    scenarios = [f"type1_subtype{kind}_{end}/x{kind}" for kind in (1, 2) for end in ("accident", "normal")]
-    tokens = [f"{scenario}/ego_vehicle/{frame:03d}" for scenario in scenarios for frame in (10, 15)]
-    given = rows.donors(tokens)
-    assert [each[-3:] for each in given] == [each[-3:] for each in tokens]
-    assert all(one.split("/")[1] != other.split("/")[1] for one, other in zip(given, tokens, strict=True))
-    with pytest.raises(AssertionError, match="no other pair"):
-        rows.donors(tokens[:4])
-
-
-def test_strangers_take_the_partners_places_alone(rows: ModuleType) -> None:
-    keys = rows._FOREIGN
-    item = {"agents": ("ego_vehicle", "infrastructure", "other_vehicle"), **{key: torch.zeros(3, 2) for key in keys}}
-    donor = {
-        "agents": ("ego_vehicle", "other_vehicle"),
-        **{key: torch.tensor([[1.0], [2.0]]).expand(2, 2) for key in keys},
-    }
-    changed = rows.with_strangers({**item, "token": "a"}, donor)
-    for key in keys:
-        assert changed[key].tolist() == [[0, 0], [0, 0], [2, 2]]
-        assert not item[key].any()
-    assert list(changed) == [*item, "token"]
-    images = rows.blanked({"images": torch.ones(2, dtype=torch.uint8), "token": "a"})["images"]
-    assert images.dtype == torch.uint8
-    assert not images.any()
-
-
-def evaluated(numbers: ModuleType, found: list[int]) -> Any:
-    """A row that finds so many of the four hidden actors of each of some pairs."""
-    evaluator = numbers.HiddenActors()
-    for at, each in enumerate(found):
-        for kind in ("accident", "normal"):
-            counts = dict.fromkeys(numbers._COUNTED, 0) | {"hidden": 2, "hidden_foreground": each / 2, "cells": 1}
-            evaluator.add(f"type1_subtype1_{kind}/x{at}/ego_vehicle/005", counts)
-    return {"hidden": evaluator}
-
-
-def test_differences_are_of_the_same_pairs(numbers: ModuleType) -> None:
-    base, other = evaluated(numbers, [0, 1, 2, 0, 1, 2, 1, 0]), evaluated(numbers, [2, 2, 3, 1, 3, 4, 2, 1])
-    found = numbers.differences([base], [other], Resampling())["hidden_foreground"]
-    assert found["value"] == pytest.approx(11 / 32)
-    assert 0 < found["low"] < found["value"] < found["high"]
-    back = numbers.differences([other], [base], Resampling())["hidden_foreground"]
-    assert (back["value"], back["low"], back["high"]) == pytest.approx((-found["value"], -found["high"], -found["low"]))
-    pooled = numbers.differences([base, base], [other, other], Resampling())["hidden_foreground"]
-    assert pooled == pytest.approx(found)  # twice the same model is no more evidence
-    few = numbers.differences([evaluated(numbers, [0, 1])], [evaluated(numbers, [1, 2])], Resampling())
-    assert few["hidden_foreground"] == {"value": pytest.approx(1 / 4), "low": None, "high": None}
-
-
-def test_a_row_of_some_samples(numbers: ModuleType) -> None:
-    row = evaluated(numbers, [0, 0, 0, 0, 0, 0, 0, 4])
-    assert numbers.row_numbers([row], Resampling())["hidden_foreground"]["value"] == pytest.approx(1 / 8)
-    last = [token for token in row["hidden"].tokens if "/x7/" in token]
-    assert numbers.row_numbers([row], Resampling(), last)["hidden_foreground"]["value"] == 1
-
-
-def test_the_protocol_keeps_its_releases_apart(scripts: dict[str, ModuleType]) -> None:
-    protocol = scripts["model_study_protocol"]
-    plans = [protocol.PROTOCOL.training, protocol.PROTOCOL.tuning, protocol.PROTOCOL.test]
-    assert len({plan.seed for plan in (*plans, protocol.SHIPPED)}) == 4
-    assert [protocol.HELD_OUT in plan.designs for plan in plans] == [False, False, True]
-    assert all(plan.scenarios >= 2 * len(plan.designs) for plan in plans)  # a pair of each design, at least
-    names = [row.name for row in protocol.rows_of(protocol.PROTOCOL)]
-    assert len(set(names)) == len(names)
-    assert {name for pair in protocol.COMPARED for name in pair} <= set(names)
-    assert protocol.COMPARED[0] == ("single", "all")
 
 
 def number(value: float | None = 1.5, low: float | None = None, high: float | None = None) -> dict[str, Any]:
@@ -255,19 +175,6 @@ def test_the_headline_follows_from_the_interval(
     assert told.partition(":")[0] in page.page(summary).replace("\n", " ")
 
 
-def test_the_controls_say_why(page: ModuleType, summary: dict[str, Any]) -> None:
-    undecided = page.reasons_text(summary)
-    assert "nothing shows that their data are used" in undecided
-    summary["differences"][3]["numbers"]["iou_100"] = number(2.0, 1.0, 3.0)
-    summary["differences"][4]["numbers"]["iou_100"] = number(2.0, 1.0, 3.0)
-    summary["differences"][2]["numbers"]["hidden_foreground"] = number(0.2, 0.1, 0.3)
-    summary["differences"][2]["numbers"]["false_foreground"] = number(0.1, 0.05, 0.2)
-    decided = page.reasons_text(summary)
-    assert "it is their data that help" in decided
-    assert "it does look" in decided
-    assert "find more with partners than alone (+0.20 [0.10, 0.30]); a larger share of the map is false" in decided
-
-
 def test_the_page_has_all_rows_and_no_gap(page: ModuleType, summary: dict[str, Any], tmp_path: Path) -> None:
     text = page.page(summary)
     for row in summary["rows"]:
@@ -280,24 +187,6 @@ def test_the_page_has_all_rows_and_no_gap(page: ModuleType, summary: dict[str, A
     assert "nothing was measured on one" in text
     summary["machine"]["gpu"] = "NVIDIA X"
     assert "The models ran on NVIDIA X." in page.page(summary).replace("\n", " ")
-
-
-def test_the_page_is_compared_and_refuses_a_tiny_run(
-    page: ModuleType, summary: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page, "SUMMARY", tmp_path / "model_study.json")
-    monkeypatch.setattr(page, "PAGE", tmp_path / "model.md")
-    page.SUMMARY.write_text(json.dumps(summary))
-    monkeypatch.setattr(sys, "argv", ["make_model_page.py"])
-    page.main()
-    monkeypatch.setattr(sys, "argv", ["make_model_page.py", "--check"])
-    page.main()
-    page.PAGE.write_text(page.PAGE.read_text().replace("1.5", "9.5"))
-    with pytest.raises(SystemExit, match="does not say what"):
-        page.main()
-    page.SUMMARY.write_text(json.dumps({**summary, "smoke": True}))
-    with pytest.raises(SystemExit, match="another protocol"):
-        page.main()
 
 
 def test_what_is_committed_agrees(page: ModuleType, scripts: dict[str, ModuleType]) -> None:

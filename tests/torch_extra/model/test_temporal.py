@@ -2,15 +2,18 @@
 
 import pytest
 import torch
-from torch.nn import functional
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.poses import between_augmented, matrices_from_six, six_from_matrices
-from deepaccident_devkit.model.temporal import Temporal3D, TemporalConcat, TemporalConfig, temporal_model
-from deepaccident_devkit.model.temporal_blocks import PooledStep, TemporalBlock
-from deepaccident_devkit.model.warps import GridBounds
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.model.temporal import (
+    Temporal3D,
+    TemporalConcat,
+    TemporalConfig,
+    temporal_model,
+)
+from deepaccident_devkit.model.warps import between_augmented, matrices_from_six, six_from_matrices
 
-GRID = GridBounds(x=(-6, 6, 1), y=(-4, 4, 1))
+GRID = BevGrid(x=(-6, 6, 1), y=(-4, 4, 1))
 KINDS = ["blocks", "concat"]
 TURNED = torch.diag(torch.tensor([1.1, -1.1, 1, 1])) @ matrices_from_six(torch.tensor([0, 0, 0, 0, 0, 0.3]))
 
@@ -100,31 +103,6 @@ def test_blocks_fill_up_to_the_first_invalid_frame_only() -> None:
     assert torch.equal(model(features, egomotion, valid), result)
     features[:, 1] = 7
     assert not torch.allclose(model(features, egomotion, valid), result)
-
-
-def test_the_skip_adds_the_present() -> None:
-    features, egomotion, valid = batch()
-    with_skip, without = (model_of("blocks", with_skip=skip)(features, egomotion, valid) for skip in (True, False))
-    torch.testing.assert_close(with_skip - without, features[:, -1])
-
-
-def test_a_block_sees_no_later_step() -> None:
-    torch.manual_seed(0)
-    block = TemporalBlock(6, 8).eval()
-    steps = torch.randn(1, 6, 4, 5, 7)
-    later = steps.clone()
-    later[:, :, 2:] += 1
-    before, after = block(steps), block(later)
-    torch.testing.assert_close(before[:, :, :2], after[:, :, :2])
-    assert not torch.allclose(before[:, :, 2], after[:, :, 2])
-
-
-def test_pooled_steps_are_means_over_the_map_and_two_steps() -> None:
-    torch.manual_seed(0)
-    pooled = PooledStep(6, 4).eval()
-    steps = torch.randn(2, 6, 3, 5, 7)
-    means = functional.avg_pool3d(steps, (2, 5, 7), (1, 5, 7), (1, 0, 0), count_include_pad=False)[:, :, :3]
-    torch.testing.assert_close(pooled(steps), pooled.conv_bn_relu(means).expand(-1, -1, -1, 5, 7))
 
 
 @pytest.mark.parametrize("kind", KINDS)

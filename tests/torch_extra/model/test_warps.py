@@ -7,17 +7,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.geometry import six_vectors
-from deepaccident_devkit.model.poses import (
+from deepaccident_devkit.geometry import BevGrid, six_vectors
+from deepaccident_devkit.model.warps import (
+    agents_mask,
+    agents_to_ego,
     between_augmented,
+    inside_mask,
     matrices_from_six,
     present_from_frames,
     present_from_past,
     six_from_matrices,
+    warp_features,
 )
-from deepaccident_devkit.model.warps import GridBounds, agents_mask, agents_to_ego, inside_mask, warp_features
 
-GRID = GridBounds(x=(-8, 12, 1), y=(-6, 6, 0.5))
+GRID = BevGrid(x=(-8, 12, 1), y=(-6, 6, 0.5))
 """Neither square nor centred, and with other steps along x than along y."""
 MIRRORED = torch.tensor([[[-1.1, 0, 0, 0], [0, 1.1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]])
 six = st.tuples(*[st.floats(-3, 3, width=32)] * 3, *[st.floats(-1.5, 1.5, width=32)] * 3).map(
@@ -105,7 +108,7 @@ def test_a_shift_by_whole_cells_moves_cells(mode: str) -> None:
 
 def test_a_stretched_warp_blurs_without_motion_as_the_released_one() -> None:
     """128 cells of 0.8 m: cell i samples at 0.4961 + 0.99609 i."""
-    grid = GridBounds(x=(-51.2, 51.2, 0.8), y=(-51.2, 51.2, 0.8))
+    grid = BevGrid(x=(-51.2, 51.2, 0.8), y=(-51.2, 51.2, 0.8))
     rising = torch.arange(128.0).expand(1, 1, 128, 128)
     warped = warp_features(rising, torch.eye(4)[None], grid, warp="stretched")
     torch.testing.assert_close(warped[0, 0, 5], 0.49609375 + 0.99609375 * torch.arange(128), atol=1e-4, rtol=0)
@@ -157,5 +160,5 @@ def test_autocast_does_not_round_poses() -> None:
 
 def test_a_grid_of_no_whole_cells_is_refused() -> None:
     with pytest.raises(ConfigError, match="not a whole number of cells"):
-        GridBounds(x=(-8, 8, 0.7), y=(-8, 8, 1))
+        BevGrid(x=(-8, 8, 0.7), y=(-8, 8, 1))
     assert GRID.shape == (24, 20)

@@ -42,8 +42,7 @@ from deepaccident_devkit.motion import (
     write_label_files,
 )
 from deepaccident_devkit.motion.batch_names import BatchNames
-from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST
-from deepaccident_devkit.motion.stored_labels import NOBODY, NOWHERE, StoredLabels
+from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST, NOBODY, NOWHERE, StoredLabels
 from deepaccident_devkit.taxonomy import AGENTS
 
 PAGE = Path(__file__).parents[3] / "schema" / "motion_labels.md"

@@ -10,7 +10,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
+from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import (
     POST_PROCESSING,
     PostProcessing,

@@ -14,7 +14,7 @@ from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
-from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego, past_to_present
+from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
 from deepaccident_devkit.motion.warps.warping import nearest_indices, rounded_points, sampling_matrix, warp
 
 GRID = BevGrid((-4, 4, 1), (-4, 4, 1))

@@ -364,24 +364,6 @@ def test_a_file_of_too_many_lines_is_refused(write, monkeypatch: pytest.MonkeyPa
         monkeypatch.delenv(LIMITS_VARIABLE)
 
 
-@pytest.mark.parametrize("ends", ["\n", "\r\n"])
-@pytest.mark.parametrize("line", [2, 1000, 1001, 2500, 5001])
-def test_the_first_fault_among_many_boxes_is_named(write, line: int, ends: str) -> None:
-    lines = [HEADER, *[PARKED] * 5000]
-    lines[-1] = "van 1"
-    lines[line - 1] = "bus 1"
-    with pytest.raises(LabelError, match=rf"label\.txt:{line}: expected 13 fields, found 2: 'bus 1'"):
-        read_label(write(ends.join([*lines, "bus 2"])))
-
-
-def test_200_000_boxes(write) -> None:
-    """A second; a walk over their words would take ten."""
-    lines = [HEADER, *[PARKED] * 200_000]
-    assert len(read_label(write("\r\n".join(lines)))) == 200_000
-    with pytest.raises(LabelError, match=r"label\.txt:200002: expected 13 fields, found 2"):
-        read_label(write("\n".join([*lines, "car 1"])))
-
-
 def test_words_alone_on_a_line_are_told(write) -> None:
     assert read_lone_words(write(REAL)) == []
     text = f"one\n{HEADER}\n\n{PARKED}\n two \n{OWN}\ncar"

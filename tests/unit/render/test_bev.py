@@ -16,7 +16,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage
-from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.bev import BevView, draw_bev, draw_underlay, render_bev
 from deepaccident_devkit.render.colors import (
     AGENT_COLORS,

@@ -13,7 +13,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps import town_map
-from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.colors import BEV_COLORS
 from deepaccident_devkit.render.missing import missing_words

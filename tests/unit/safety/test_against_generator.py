@@ -34,7 +34,7 @@ from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.collision import gap
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob
-from deepaccident_devkit.synth.traffic.kinematics import HARDEST_BRAKING
+from deepaccident_devkit.synth.traffic.driving import HARDEST_BRAKING
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, FRAME_PERIOD
 
 pytestmark = pytest.mark.slow

@@ -36,16 +36,6 @@ def test_before_and_after_it_stands(motion):
     np.testing.assert_array_equal(motion.velocities([-9.0, 9.0]), 0.0)
 
 
-def test_its_samples_cannot_be_changed(motion):
-    with pytest.raises(ValueError, match="read-only"):
-        motion.samples[0, 0] = 1.0
-
-
-def test_one_sample_stands_for_ever():
-    still = Sampled(start=0.0, period=0.1, samples=SAMPLES[:1], sample_velocities=VELOCITIES[:1])
-    np.testing.assert_allclose(still.poses([-1.0, 0.0, 1.0]), SAMPLES[[0, 0, 0]])
-
-
 def test_actors_are_where_each_of_them_is(motion, make_actor):
     """Those sampled at the same times are looked up together."""
     later = Sampled(start=0.0, period=0.1, samples=SAMPLES + 9, sample_velocities=VELOCITIES)

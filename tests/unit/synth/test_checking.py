@@ -3,8 +3,8 @@
 import pytest
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth.checking import checked_text
 from deepaccident_devkit.synth.config import SynthConfig
+from deepaccident_devkit.synth.scenario import checked_text
 
 TEXT = """\
 actors:

@@ -68,9 +68,3 @@ def test_a_release_for_the_released_code_has_its_images_and_its_layout():
 def test_what_the_released_code_cannot_read_is_refused(field, value, sentence):
     with pytest.raises(ConfigError, match=f"^{field}, for_released_code: the released .*{sentence}$"):
         SynthConfig(**{field: value}, for_released_code=True)
-
-
-def test_the_round_of_designs():
-    assert sorted(SynthConfig().design_round) == list(range(1, 13))
-    assert SynthConfig(designs=(5, 5, 2)).design_round == (5, 5, 2)
-    assert SynthConfig(view="hidden").design_round == (1, 7)

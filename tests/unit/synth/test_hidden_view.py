@@ -75,13 +75,6 @@ def test_nobody_walks_or_parks_in_the_house(side, number):
         assert not ((x < -edge) & (x > -27) & (sign * y > edge) & (sign * y < 27)).any()
 
 
-def test_all_else_of_the_town_stays_the_same():
-    wide, hidden = (build(SynthConfig(scenarios=1, frames=22, view=view)) for view in ("open", "hidden"))
-    np.testing.assert_array_equal(wide.world.world_from_ground.matrix, hidden.world.world_from_ground.matrix)
-    assert wide.weather == hidden.weather
-    assert wide.meta.spawn_side == hidden.meta.spawn_side
-
-
 def test_another_view_is_refused():
     with pytest.raises(ConfigError, match="view: expected one of open, hidden, or None, found 'foggy'"):
         SynthConfig(view="foggy")

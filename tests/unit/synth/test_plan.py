@@ -6,7 +6,7 @@ import pytest
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.splits import split_records
 from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.plan import _mini, plan_scenarios, plan_splits
+from deepaccident_devkit.synth.plan import plan_scenarios, plan_splits
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.taxonomy import TOWNS
 
@@ -109,22 +109,6 @@ def test_minis_are_whole_pairs_a_fifth_at_most_and_never_empty(scenarios):
         assert bool(mini) == bool(whole)
 
 
-def test_minis_of_single_scenarios_are_a_fifth_too(tmp_path):
-    path = tmp_path / "own.yaml"
-    path.write_text(OWN)
-    for scenarios, train_minis in ((3, 1), (11, 1), (60, 8)):
-        splits = plan_splits(plans_of(spec=path, scenarios=scenarios))
-        assert len(splits.train_mini) == train_minis <= max(1, len(splits.train) // 5)
-        assert 1 <= len(splits.val_mini) <= max(1, len(splits.val) // 5)
-
-
-def test_a_lone_accident_is_the_smallest_unit():
-    """Of a pair and a lone accident in train."""
-    plans = plans_of(scenarios=3)
-    tokens = [plan.token for plan in plans]
-    assert _mini(plans, tokens, tokens) == (tokens[2],)
-
-
 @pytest.mark.parametrize("scenarios", [22, 24, 25, 40])
 def test_no_split_is_empty_from_six_scenarios_on(scenarios):
     assert {plan.split for plan in plans_of(scenarios=scenarios)} == {"train", "val", "test"}
@@ -187,15 +171,6 @@ def test_a_file_in_which_nobody_meets_gives_normal_scenarios(tmp_path):
     plans = plans_of(spec=path, scenarios=5)
     assert [(plan.pair, plan.accident) for plan in plans] == [(k, False) for k in range(5)]
     assert len({plan.token for plan in plans}) == 5
-
-
-def test_plans_survive_pickling():
-    import pickle
-
-    plan = plans_of()[0]
-    again = pickle.loads(pickle.dumps(plan))
-    assert again == plan
-    assert again.draw(np.random.default_rng(1)) == plan.draw(np.random.default_rng(1))
 
 
 @pytest.mark.slow

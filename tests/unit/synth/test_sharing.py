@@ -1,9 +1,7 @@
 """Releases made on executors and by several processes: the very bytes of one call, whatever was interrupted."""
 
 import shutil
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import replace
-from multiprocessing import get_context
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -11,7 +9,7 @@ import pytest
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import temporary_path
 from deepaccident_devkit.synth import SynthConfig, generate, make_release
-from deepaccident_devkit.synth.unfinished import Unfinished
+from deepaccident_devkit.synth.generate import Unfinished
 
 CONFIG = SynthConfig(scenarios=3, frames=2, sensors=False, seed=7)
 
@@ -77,19 +75,6 @@ def test_an_executor_makes_the_same_bytes(out, whole, digests):
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["threads", "processes"])
-def test_an_executor_makes_the_same_images(tmp_path, release_root, config, digests, kind):
-    """Threads of one process are at several scenarios at once, and at several parts of one."""
-    pools = {
-        "threads": lambda: ThreadPoolExecutor(3),
-        "processes": lambda: ProcessPoolExecutor(2, mp_context=get_context("spawn")),
-    }
-    with pools[kind]() as executor:
-        made = make_release(tmp_path / "out", config, executor=executor)
-    assert digests(made) == digests(release_root)
-
-
 def test_several_calls_share_the_parts(out, whole, digests, recorded):
     def make_or_come_late(_: int) -> Path | None:
         try:
@@ -133,13 +118,6 @@ def test_what_broke_off_goes_on(out, unfinished, whole, digests, recorded, stop_
 def test_a_call_that_makes_nothing_leaves_nothing(out, stop_at):
     stop_at(out, 0)
     assert list(out.parent.iterdir()) == []
-
-
-def test_another_configuration_is_refused(out, unfinished, stop_at):
-    stop_at(out, 1)
-    with pytest.raises(ConfigError, match=r"another configuration \(seed: 7 there, 8 asked for\)"):
-        make(out, replace(CONFIG, seed=8))
-    assert len(list((unfinished.folder / "kept").iterdir())) == 1
 
 
 def test_a_worker_whose_caller_was_stopped_marks_nothing_in_what_comes_later(unfinished):

@@ -52,25 +52,6 @@ def test_the_generator_keeps_its_promises(script):
     assert letters.count("c") >= 0.95 * unseen
 
 
-def test_a_stale_page_is_told(script):
-    page = script.PAGE.read_text(encoding="utf-8")
-    for part, key in (("real", "visible"), ("generated", "parked")):
-        measured = script.measured()
-        measured[part][key] += 0.5
-        assert script.with_tables(page, measured) != page
-    measured = script.measured()
-    measured["pairs"][0]["draws"] += 1
-    assert script.with_tables(page, measured) != page
-
-
-def test_what_was_measured_is_kept_to_the_letter(script, tmp_path, monkeypatch):
-    text = script.MEASURED.read_text(encoding="utf-8")
-    content = script.measured()
-    monkeypatch.setattr(script, "MEASURED", tmp_path / "statistics.json")
-    script.save(content)
-    assert (tmp_path / "statistics.json").read_text(encoding="utf-8") == text
-
-
 def test_a_generated_scenario_is_like_the_real_one(script):
     """Where it was moved towards it; the page says where it is not."""
     real, generated = script.measured()["real"], script.measured()["generated"]

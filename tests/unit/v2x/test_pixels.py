@@ -16,9 +16,8 @@ from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob, record_scenario
 from deepaccident_devkit.synth.scenario import Scenario, build_scenario
 from deepaccident_devkit.synth.sensors.agents import Agent, Camera, make_agents
-from deepaccident_devkit.synth.sensors.images.buffers import ray_directions, slopes
-from deepaccident_devkit.synth.sensors.scene import Scene, make_scene
-from deepaccident_devkit.synth.sensors.setting import Setting
+from deepaccident_devkit.synth.sensors.render import ray_directions, slopes
+from deepaccident_devkit.synth.sensors.scene import Scene, Setting, make_scene
 from deepaccident_devkit.taxonomy import frame_timestamp
 
 CONFIG = SynthConfig(scenarios=1, frames=2, image_size=(320, 180), seed=11)

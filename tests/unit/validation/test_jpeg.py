@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from deepaccident_devkit.validation import validate_release
-from deepaccident_devkit.validation.jpeg import ZEROS, ends_early, zero_stretch
+from deepaccident_devkit.validation.sensors import ZEROS, ends_early, zero_stretch
 
 
 def jpeg(image: np.ndarray, **options: object) -> bytes:

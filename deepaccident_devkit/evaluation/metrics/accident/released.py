@@ -57,7 +57,7 @@ from deepaccident_devkit.motion import (
     trajectories,
 )
 from deepaccident_devkit.motion.orientations import to_orientation
-from deepaccident_devkit.motion.postprocessing.redrawing import first_hulls, redrawn_cells
+from deepaccident_devkit.motion.postprocessing.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Pair = tuple[int, int]

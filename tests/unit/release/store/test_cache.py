@@ -22,16 +22,6 @@ def test_the_least_used_copies_go_first(tmp_path: Path) -> None:
     assert not all(there[1:4])
 
 
-def test_a_copy_of_another_size_is_none(tmp_path: Path) -> None:
-    cache = FileCache(tmp_path, 1000)
-    path = cache.path_of("x", "a.jpg")
-    assert not cache.found(path, 3)
-    cache.put(path, b"abc")
-    assert cache.found(path, 3)
-    assert not cache.found(path, 4)
-    assert cache.path_of("y", "a.jpg") != path
-
-
 def test_a_file_larger_than_the_cache_is_kept_alone(tmp_path: Path) -> None:
     cache = FileCache(tmp_path, 100)
     small, large = cache.path_of("small", "a"), cache.path_of("large", "a")

@@ -13,7 +13,7 @@ from replay_page import accident, data_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.maps import town_map
-from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.colors import BEV_COLORS
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.replay.recording import recording_of

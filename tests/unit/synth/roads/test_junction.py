@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Hump, Junction, RoadSpec
+from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction, RoadSpec
 from deepaccident_devkit.synth.roads.junction import REACH
-from deepaccident_devkit.synth.roads.terrain import OUTWARD
+from deepaccident_devkit.synth.roads.layout import OUTWARD
 
 HALF_TRUCK = 1.45
 
@@ -101,12 +101,6 @@ def test_who_meets_whom(first, second, meet):
     assert (meeting is not None) == meet
 
 
-def test_straight_roads_meet_at_the_crossing_of_their_lanes():
-    junction = Junction(RoadSpec())
-    ego, other = junction.route("west", "straight"), junction.route("north", "straight")
-    np.testing.assert_allclose(junction.conflicts(ego, other), (REACH - 1.75, REACH + 1.75), atol=1e-9)
-
-
 def test_crosswalks_go_from_sidewalk_to_sidewalk(junction):
     ground = junction.ground_map()
     for arm in junction.arms:
@@ -159,9 +153,3 @@ def test_a_three_way_junction_has_no_way_north():
 def test_what_is_not_there_is_refused(ask, sentence):
     with pytest.raises(ConfigError, match=sentence):
         ask(Junction(RoadSpec(kind="three-way")))
-
-
-def test_the_ground_is_as_hilly_as_its_roads():
-    hump = Hump(arm="east", distance=60.0)
-    assert Junction(RoadSpec(hump=hump)).terrain.hump == hump
-    assert Junction(RoadSpec()).terrain.is_flat

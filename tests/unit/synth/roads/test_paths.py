@@ -5,13 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.synth.roads.paths import (
     SPACING,
-    Path,
     bent,
     crossing,
-    even_steps,
     lane_change,
     quarter_turn,
     straight,
@@ -48,15 +45,6 @@ def test_clothoids_join_lines_and_arcs_without_jumps():
     np.testing.assert_allclose(path.yaw[-1], 1.0 - 0.1 * (3.5 + 4 + 3.5), atol=1e-12)
 
 
-@given(st.floats(0.01, 500))
-def test_steps_are_even_and_end_exactly(length):
-    steps = even_steps(length)
-    assert steps[0] == 0
-    assert steps[-1] == length
-    assert 0 < np.diff(steps).max() <= SPACING + 1e-9
-    np.testing.assert_allclose(np.diff(steps), steps[1], rtol=1e-6)
-
-
 @given(st.floats(-10, 60), st.floats(-3, 3))
 def test_project_undoes_at(s, left):
     x, y, yaw, _ = CIRCLE.at(s)
@@ -72,11 +60,6 @@ def test_at_goes_straight_on_beyond_the_ends():
     np.testing.assert_allclose(np.column_stack([x, y]), ends + ahead, atol=1e-12)
     np.testing.assert_array_equal(yaw, CIRCLE.yaw[[0, -1]])
     np.testing.assert_array_equal(curvature, 0)
-
-
-def test_at_keeps_the_shape_of_what_is_asked():
-    assert all(values.shape == (2, 3) for values in CIRCLE.at(np.ones((2, 3))))
-    assert CIRCLE.at(1.0)[0].shape == ()
 
 
 def test_reversed_is_the_same_way_back():
@@ -134,26 +117,6 @@ def test_the_first_of_two_crossings_counts():
     assert abs(y) < 1e-2
     assert x < 1
     assert abs(meeting.s_a - 5 - x) < 1e-2
-
-
-def test_a_point_is_no_path():
-    with pytest.raises(GeometryError, match=r"Path.xy: expected two samples or more, found 1; sample the path more"):
-        Path(xy=[[0.0, 0.0]], yaw=[0.0], curvature=[0.0], s=[0.0])
-
-
-def test_two_points_have_no_curvature():
-    with pytest.raises(GeometryError, match="points: expected three points or more, found 2; sample the way more den"):
-        through([[0.0, 0.0], [1.0, 0.0]])
-
-
-def test_samples_go_together():
-    with pytest.raises(GeometryError, match=r"Path.yaw: expected shape \(2\), found \(1,\)"):
-        Path(xy=np.zeros((2, 2)), yaw=[0.0], curvature=[0.0, 0.0], s=[0.0, 1.0])
-
-
-def test_arrays_are_read_only():
-    with pytest.raises(ValueError, match="read-only"):
-        CIRCLE.xy[0] = 0
 
 
 @pytest.mark.parametrize("left", [True, False])

@@ -5,22 +5,13 @@ import pytest
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ARMS, Hump, Terrain
-from deepaccident_devkit.synth.roads.terrain import EXTENT, OUTWARD
+from deepaccident_devkit.synth.roads.layout import EXTENT, OUTWARD
 
 SLOPED = {arm: Terrain(Hump(arm=arm, distance=55.0, height=2.0, length=60.0)) for arm in ARMS}
 
 
 def grid(n=4000, seed=0):
     return np.random.default_rng(seed).uniform(-EXTENT, EXTENT, (n, 2))
-
-
-def test_flat_ground_is_two_triangles_at_0():
-    flat = Terrain()
-    assert flat.is_flat
-    np.testing.assert_array_equal(flat.height(grid()), 0)
-    np.testing.assert_array_equal(flat.normal(grid()), np.tile([0.0, 0.0, 1.0], (4000, 1)))
-    assert flat.triangles().shape == (2, 3, 3)
-    assert Terrain(Hump(height=0.0)).is_flat
 
 
 @pytest.mark.parametrize("arm", ARMS)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.synth import solids
-from deepaccident_devkit.synth.actors import Actor, Actors, Uniform
-from deepaccident_devkit.synth.bodies import MEDIAN_SIZES
+from deepaccident_devkit.synth.actors import MEDIAN_SIZES, Actor, Actors, Uniform
 from deepaccident_devkit.synth.roads import Hump, Junction, RoadSpec
 from deepaccident_devkit.synth.sensors.rig import make_rig
 from deepaccident_devkit.synth.shapes import shape_of

@@ -5,7 +5,6 @@ from deepaccident_devkit.errors import MissingExtraError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.synth.sensors import caster
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, EmbreeCaster, NumpyCaster
-from deepaccident_devkit.synth.solids import face_corners, face_planes
 
 
 @pytest.fixture
@@ -47,12 +46,6 @@ def test_rays_end_at_their_reach(kind, world, grounded):
     np.testing.assert_array_equal(reach, np.array([3.9, 4.1, 0.9, 1.1], dtype=np.float32))
 
 
-def test_normals_point_outwards(corners):
-    normals, offsets = face_planes(face_corners(corners))
-    middle = np.repeat(corners.mean(axis=1), 6, axis=0)
-    assert (np.einsum("fk,fk->f", normals, middle) < offsets).all()
-
-
 @pytest.mark.parametrize("kind", ["flat", "hilly"])
 def test_both_meet_the_ground_alike(corners, rng, world, hilly_world, kind):
     terrain = (world if kind == "flat" else hilly_world).terrain
@@ -69,14 +62,6 @@ def test_both_meet_the_ground_alike(corners, rng, world, hilly_world, kind):
     assert (fast[1][near] == GROUND).all()
     # a few graze the crest
     assert np.isclose(fast[0][near], slow[0][near], rtol=0.01).mean() > 0.998
-
-
-def test_no_solids_and_no_rays_are_met_by_nothing(corners):
-    for kind in (EmbreeCaster, NumpyCaster):
-        distance, face = kind(corners[:0]).cast(np.zeros(3), np.eye(3))
-        assert np.isinf(distance).all()
-        assert face.tolist() == [NOTHING] * 3
-        assert len(kind(corners).cast(np.zeros(3), np.zeros((0, 3)))[0]) == 0
 
 
 def test_without_embree_the_error_names_the_remedy(monkeypatch):

@@ -1,17 +1,13 @@
 """Light, weather and lamps show in the pictures."""
 
-import cv2
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.roads import MAP_CELLS, MAP_RESOLUTION
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING
-from deepaccident_devkit.synth.sensors.images.buffers import look, ray_directions, slopes
-from deepaccident_devkit.synth.sensors.images.facades import facades_of, on_facades
-from deepaccident_devkit.synth.sensors.images.light import light_of, make_sky
-from deepaccident_devkit.synth.sensors.images.shadows import add_shadows, wall_shadows
-from deepaccident_devkit.synth.solids import FACES_A_SOLID, FRONT, REAR, Block, build
-from deepaccident_devkit.taxonomy import TIMES_OF_DAY, WEATHERS
+from deepaccident_devkit.synth.sensors.paint import facades_of, on_facades
+from deepaccident_devkit.synth.sensors.render import look, ray_directions, slopes
+from deepaccident_devkit.synth.sensors.shadows import wall_shadows
+from deepaccident_devkit.synth.solids import FACES_A_SOLID, FRONT, REAR, Block
 
 pytestmark = pytest.mark.slow
 
@@ -19,52 +15,6 @@ pytestmark = pytest.mark.slow
 def picture(rig, signals=None, channel="Camera_Front", agent=0):
     scene = rig.scene(0.0)
     return dict(rig.images(scene, rig.surroundings(scene, signals or {}), rig.agents[agent], 1))[channel]
-
-
-def ground_at(rig, time):
-    return rig.surroundings(rig.scene(time), {}).ground.levels
-
-
-def test_coarser_pictures_of_the_ground_agree_with_the_finest(world, rig_of, actor):
-    """Only changed squares are made from one moment to the next."""
-    rig = rig_of(world, [actor(10, "truck", -20.0, -1.75, speed=8.0), actor(11, "car", -149.5, 20.0, speed=2.0)])
-    before, after = (ground_at(rig, time) for time in (0.0, 1.0))
-    for levels in (before, after):
-        for level, side in enumerate((750, 187), start=1):
-            whole = cv2.resize(levels[level - 1], (side, side), interpolation=cv2.INTER_AREA)
-            np.testing.assert_array_equal(levels[level], whole)
-    assert all((one != other).any() for one, other in zip(before, after, strict=True))
-    assert all(map(np.array_equal, before, ground_at(rig, 0.0)))
-
-
-def test_two_shadows_together_are_not_darker_than_one():
-    corners = np.concatenate([build([Block((x, x + 4.0), (0.0, 2.0), (0.0, 1.0), (0,) * 3)]).corners for x in (0, 2)])
-    picture = np.full((MAP_CELLS, MAP_CELLS, 3), 200, dtype=np.uint8)
-    cells = add_shadows(picture, corners, np.array([0.0, 0.0, 1.0]), 0.5)
-    dark = np.flatnonzero(picture[..., 0].ravel() == 100)
-    assert set(np.unique(picture)) == {100, 200}
-    np.testing.assert_array_equal(np.unique(cells), dark)
-    assert len(dark) * MAP_RESOLUTION**2 == pytest.approx(6 * 2, rel=0.1)
-
-
-@pytest.mark.parametrize("time_of_day", TIMES_OF_DAY)
-@pytest.mark.parametrize("weather", WEATHERS)
-def test_every_sky_has_a_light(weather, time_of_day):
-    light = light_of(weather, time_of_day)
-    assert 0 < light.ambient <= 1
-    assert 0 < light.in_shadow <= 1
-    assert np.linalg.norm(light.to_sun) == pytest.approx(1)
-    assert (light.rain > 0) == ("Rain" in weather)
-
-
-def test_the_sky_has_no_seam(rng):
-    """Straight ahead, just left and just right of it, where the picture begins and ends."""
-    sky = make_sky(light_of("Cloudy", "Sunset"), rng)
-    ahead = np.ones((1, 3), dtype=np.float32)
-    across = np.array([[1e-5, 0.0, -1e-5]], dtype=np.float32)
-    for height in (0.0, 0.3, 0.9):
-        colors = sky.toward(ahead, across, height * ahead)[0].astype(int)
-        assert np.abs(colors - colors[1]).max() <= 1
 
 
 def test_noon_is_brighter_than_sunset_and_sunset_than_night(world, rig_of):
@@ -134,19 +84,6 @@ def front_of_house(rig):
     return front, image.reshape(-1, 3).astype(int), places
 
 
-def test_a_facade_has_whole_windows_as_far_from_either_end(world, bare, rig_of):
-    rig = rig_of(bare(world, [HOUSE]), sky=("Cloudy", "Noon"), image_size=(640, 360), places=OPPOSITE)
-    _, image, places = front_of_house(rig)
-    assert places.across.min() < 0.2
-    assert places.across.max() > 12.8
-    row = np.flatnonzero((np.abs(places.up - 5.6) < 0.1) & (np.abs(places.across - 6.5) < 6.3))  # without the outline
-    row = row[np.argsort(places.across[row])]
-    across, color = places.across[row], image[places.pixel[row]]
-    glass = across[np.abs(color - color[0]).max(axis=1) > 12]
-    assert glass.min() == pytest.approx(13 - glass.max(), abs=0.25)
-    np.testing.assert_array_equal(np.unique(np.floor(glass / 2.6)), range(5))
-
-
 def test_things_throw_shadows_on_facades(world, bare, rig_of):
     """A slab before the house, and the strip of the front that it takes the sun from."""
     slab = Block((-1.0, -0.8), (-4.0, -1.0), (-0.2, 30.0), (90, 90, 90))
@@ -193,20 +130,6 @@ def test_wet_ground_mirrors_what_stands_on_it(ground, request, bare, rig_of):
         before[color[0]] = image[112:125, 140:180].astype(int).mean(axis=(0, 1))
     assert (before[220] - before[20])[0] > 10
     assert (before[20] - before[220])[1] > 10
-
-
-def test_a_wet_slope_mirrors_the_sky_without_a_seam(hilly_world, bare, rig_of):
-    """Up the hump from its foot the road's colour goes on as it is, above the horizon of level ground as below."""
-    toward = {"ego_vehicle": (-8.0, 1.75, np.pi)}
-    column = {}
-    for weather in ("Wet", "Clear"):
-        rig = rig_of(bare(hilly_world), sky=(weather, "Noon"), image_size=(1280, 720), places=toward)
-        scene, agent = rig.scene(0.0), rig.agents[0]
-        pose = agent.ground_from_lidar(scene) @ agent.cameras[0].camera_from_lidar.inverse()
-        rows = np.flatnonzero(look(scene, agent.cameras[0], pose).all.face[:, 640] == GROUND)
-        assert rows.min() < 350
-        column[weather] = picture(rig)[352:368, 620:660].astype(int).mean(axis=(1, 2))
-    assert np.abs(np.diff(column["Wet"] - column["Clear"])).max() < 8
 
 
 def test_pictures_are_the_seeds_alone(world, rig_of):

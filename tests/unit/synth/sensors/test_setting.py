@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.sensors.images.buffers import ray_directions as camera_rays
-from deepaccident_devkit.synth.sensors.images.buffers import slopes
 from deepaccident_devkit.synth.sensors.lidar import AZIMUTHS, CHANNELS, turned_rays
+from deepaccident_devkit.synth.sensors.render import ray_directions as camera_rays
+from deepaccident_devkit.synth.sensors.render import slopes
 
 KINDS = ("lidar", "camera")
 
@@ -38,22 +38,6 @@ def test_rays_that_are_not_cast_would_have_met_the_same(request, rig_of, parked,
         np.testing.assert_array_equal(face, slow_face)
         np.testing.assert_array_equal(distance, slow_distance)
         assert 0.2 < (face >= 0).mean() < 0.9
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_over_flat_ground_many_are_not_cast(world, rig_of, parked, kind, monkeypatch):
-    rig = rig_of(world, parked, sensors="none")
-    scene = rig.scene(0.0)
-    origin, rays = rays_of(scene, rig.agents[0], kind)
-    cast, counts = scene.setting.caster.cast, []
-
-    def counting(origin, directions):
-        counts.append(len(directions))
-        return cast(origin, directions)
-
-    monkeypatch.setattr(scene.setting, "caster", type("", (), {"cast": staticmethod(counting)}))
-    scene.setting.cast_columns(origin, rays, 70.0)
-    assert counts[0] < 0.75 * rays.shape[0] * rays.shape[1]
 
 
 def test_up_to_a_limit_all_is_right(world, rig_of, parked):

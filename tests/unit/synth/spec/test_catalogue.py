@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from scripts import loaded_script
 
-from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.release import Collision, Meta
 from deepaccident_devkit.synth.roads import Hump, RoadSpec
 from deepaccident_devkit.synth.spec import (
     DESIGN_NUMBERS,
@@ -19,40 +17,11 @@ from deepaccident_devkit.synth.spec import (
     EndSpec,
     MeetSpec,
     ScenarioSpec,
-    design_text,
-    designs_text,
     draw,
     field_tables,
     parse_spec,
     read_spec,
 )
-from deepaccident_devkit.tables.accidents import accident_type
-
-
-@pytest.mark.parametrize("number", DESIGN_NUMBERS)
-def test_each_draw_of_a_design_is_of_its_type(number):
-    for seed in range(30):
-        spec = draw(DESIGNS[number], np.random.default_rng(seed))
-        pair = Collision(
-            ids=(1, 2),
-            classes=("car", "car"),
-            impact=1.0,
-            spawn_relation="same",
-            contact_side="front_side",
-            agents=None,
-        )
-        meta = Meta(
-            weather=spec.weather,
-            time_of_day=spec.time_of_day,
-            collision=pair,
-            simulated_frames=50,
-            agent_ids=(1, 3, 2, 4),
-            road_type=f"{spec.road.kind} junction",
-            spawn_side=spec.spawn_side,
-            ego_direction=spec.actor("ego").turn,
-            other_direction=spec.actor("other").turn,
-        )
-        assert accident_type(meta, signalized=spec.road.signalized) == number == spec.design
 
 
 @pytest.mark.parametrize("number", DESIGN_NUMBERS)
@@ -70,16 +39,6 @@ def test_both_parts_fall_to_ego_and_all_weathers_come():
     assert len({spec.weather for spec in made}) == 7
     assert len({spec.time_of_day for spec in made}) == 3
     assert 0.1 < np.mean([spec.road.hump is not None for spec in made]) < 0.4
-
-
-def test_the_catalogue_is_a_mapping():
-    assert tuple(DESIGNS) == DESIGN_NUMBERS
-    assert len(DESIGNS) == 12
-    assert len({template.name for template in DESIGNS.values()}) == 12
-    with pytest.raises(KeyError, match="13"):
-        DESIGNS[13]
-    with pytest.raises(ConfigError, match="design: 13 is not one of 1 to 12; choose one of these"):
-        design_text(13)
 
 
 DOCS = Path(__file__).parents[4] / "docs"
@@ -101,22 +60,6 @@ def test_every_field_has_a_line_with_values_and_meaning():
         keys = [entry.key.replace("from", "from_arm") for entry in tables[path]]
         assert keys == [field.name for field in dataclasses.fields(kind)]
         assert all(len(entry.meaning) > 8 and entry.values for entry in tables[path])
-
-
-def test_a_line_of_each_kind():
-    lines = {(path, entry.key): entry for path, entries in field_tables().items() for entry in entries}
-    assert (lines["actors[]", "role"].default, lines["actors[]", "lane"].values) == ("required", "whole number, 0 to 1")
-    assert lines["actors[]", "max_speed"].values == "number, 0.5 to 20 m/s; or null"
-    assert lines["", "weather"].values == "Clear, Cloudy, HardRain, MidRain, SoftRain, Wet, WetCloudy"
-    assert (lines["", "road"].values, lines["", "road"].default) == ("keys and values", "its defaults")
-    assert (lines["meet", "actors"].default, lines["road", "signalized"].default) == ("[ego, other]", "true")
-
-
-def test_the_designs_are_listed():
-    lines = designs_text().splitlines()
-    assert len(lines) == 13
-    assert re.fullmatch(r" +3  unprotected left turn +four-way, signalised", lines[3])
-    assert lines[12].endswith("three-way, unsignalised")
 
 
 def test_the_page_is_what_the_fields_make():

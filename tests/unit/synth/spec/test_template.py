@@ -81,10 +81,6 @@ def test_a_lane_that_is_not_said_follows_from_the_turn(with_other, turn, lanes):
     assert {spec.actor("other").lane for spec in made} == lanes
 
 
-def test_pedestrians_are_pedestrians():
-    assert draws(EXCHANGING, 1)[0].actor("pedestrian").category == "pedestrian"
-
-
 @given(st.sampled_from(ARMS), st.sampled_from(ARMS))
 def test_spawn_sides_are_seen_from_ego(ego, other):
     spec = ScenarioSpec(actors=(ActorSpec(role="ego", from_arm=ego), ActorSpec(role="other", from_arm=other)))
@@ -94,11 +90,6 @@ def test_spawn_sides_are_seen_from_ego(ego, other):
     left = float(heading[0] * places[other][1] - heading[1] * places[other][0])
     wanted = {(1, 0): "opposite", (0, 1): "left", (0, -1): "right", (-1, 0): "same"}[ahead, left]
     assert spec.spawn_side == wanted
-
-
-def test_an_actor_that_is_not_there_is_a_key_error(small):
-    with pytest.raises(KeyError, match="parked"):
-        draws(small, 1)[0].actor("parked")
 
 
 @pytest.mark.parametrize(
@@ -120,7 +111,3 @@ def test_a_list_of_an_actor_makes_draws_differ(with_other):
     assert parse_spec(with_other("max_speed: [8, 9], ignores: [signal, priority]")).draws_alike
     assert not parse_spec(with_other("turn: [left, straight]")).draws_alike
     assert not any(template.draws_alike for template in DESIGNS.values())
-
-
-def test_a_field_is_named_by_its_line(small):
-    assert parse_spec(small, "f.yaml").place("meet") == "f.yaml:5: meet"

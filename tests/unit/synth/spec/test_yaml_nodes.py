@@ -1,7 +1,7 @@
 import pytest
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth.spec.yaml_nodes import parse_yaml
+from deepaccident_devkit.synth.spec.reading import parse_yaml
 
 
 def test_every_value_knows_the_line_of_its_key_or_item():

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.synth.roads import SIDEWALK, Junction, RoadSpec
-from deepaccident_devkit.synth.solids import build
-from deepaccident_devkit.synth.stage.furniture import lanterns, signal_head, traffic_light, yield_sign
+from deepaccident_devkit.synth.stage.props import traffic_light, yield_sign
 
 
 def middle(prop):
@@ -27,35 +26,3 @@ def test_it_stands_on_the_sidewalk_at_the_right_of_the_line(make, spec):
         along_right = (place - left_end) @ right
         assert spec.road_edge < along_right < spec.road_edge + 0.6
         assert 0 < (place - left_end) @ inward < 1.5
-
-
-def test_a_sign_shows_its_face_to_who_comes():
-    for arm, axis in (("west", 0), ("north", 1)):
-        face = build(yield_sign(RoadSpec(signalized=False), arm).blocks[-1:]).corners[0]
-        assert np.ptp(face[:, axis]) < 0.1
-        assert np.ptp(face[:, 1 - axis]) > 0.4
-        lower, upper = (face[np.argsort(face[:, 2])[rows], 1 - axis] for rows in (slice(4), slice(4, 8)))
-        assert np.ptp(lower) < 0.1 * np.ptp(upper)
-        rim = build(yield_sign(RoadSpec(signalized=False), arm).blocks[-2:-1]).corners[0]
-        outward = {"west": -1, "north": 1}[arm]
-        assert (outward * face[:, axis]).max() > (outward * rim[:, axis]).max()
-
-
-def test_the_rows_of_a_head_are_its_lamps():
-    light = traffic_light(RoadSpec(), "south")
-    head = signal_head("south", light, first_row=40)
-    assert head.rows == (42, 43, 44)
-    assert head.yaw == -np.pi / 2
-    heights = [np.mean(light.blocks[row - 40].z) for row in head.rows]
-    assert heights == sorted(heights, reverse=True)
-    assert head.position[2] == pytest.approx(heights[1])
-
-
-def test_lanterns_stand_behind_the_kerb_on_both_sides():
-    spec = RoadSpec(lanes=2)
-    junction, places = Junction(spec), np.array([middle(each) for each in lanterns(spec)])
-    assert (junction.ground_map().at(places) == SIDEWALK).all()
-    assert len(places) >= 12
-    east = places[places[:, 0] > 30]
-    assert (east[:, 1] > 0).any()
-    assert (east[:, 1] < 0).any()

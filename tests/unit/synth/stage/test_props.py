@@ -10,10 +10,6 @@ LOW = Prop(20, (Block((0.0, 4.0), (0.0, 2.0), (-0.2, 1.0), (1, 2, 3)),))
 HIGH = Prop(21, (Block((3.0, 5.0), (0.0, 2.0), (-0.2, 3.0), (1, 2, 3)), Block((5.0, 6.0), (-1, 1), (0, 2), (4, 5, 6))))
 
 
-def test_footprint_spans_all_blocks():
-    assert HIGH.footprint == (3.0, 6.0, -1.0, 2.0)
-
-
 def test_who_stands_on_the_same_ground_overlaps():
     far = Prop(22, (Block((6.5, 7.0), (0.0, 2.0), (0, 1), (0, 0, 0)),))
     assert overlap(LOW, HIGH)

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.bodies import random_body
+from deepaccident_devkit.synth.actors import random_body
 from deepaccident_devkit.synth.roads import Junction, RoadSpec, straight
 from deepaccident_devkit.synth.traffic.users import RoadUser, lane_span
 

@@ -1,13 +1,12 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.traffic.following import (
+from deepaccident_devkit.synth.traffic.driving import (
     Temper,
     can_stop,
     free_acceleration,
     hardest_braking,
     interaction,
-    stopping,
 )
 from deepaccident_devkit.synth.traffic.rights import find_rights
 from deepaccident_devkit.synth.traffic.simulate import simulate
@@ -26,11 +25,6 @@ def test_a_free_driver_speeds_up_to_its_speed_and_keeps_it():
 def test_a_bend_ahead_slows_down_but_not_without_limit():
     assert free_acceleration(TEMPER, 8 * ONE, 7.5 * ONE)[0] == pytest.approx(-1.25)
     assert free_acceleration(TEMPER, 8 * ONE, 1 * ONE)[0] == pytest.approx(-4.0)
-
-
-def test_nobody_ahead_means_no_braking():
-    assert interaction(TEMPER, 8 * ONE, FREE, 0 * ONE)[0] == 0
-    assert stopping(TEMPER, 8 * ONE, FREE)[0] == 0
 
 
 def test_a_slower_leader_asks_for_more_braking_than_a_faster_one():

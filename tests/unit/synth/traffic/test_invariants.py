@@ -10,12 +10,11 @@ from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction
 from deepaccident_devkit.synth.spec import DESIGNS
 from deepaccident_devkit.synth.stage import random_world
-from deepaccident_devkit.synth.traffic.casting import WARM_UP
+from deepaccident_devkit.synth.traffic.casting import WARM_UP, unplanned
 from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
+from deepaccident_devkit.synth.traffic.driving import HARDEST_BRAKING, MAX_STEER, PERIOD
 from deepaccident_devkit.synth.traffic.impact import touching_pairs
-from deepaccident_devkit.synth.traffic.kinematics import HARDEST_BRAKING, MAX_STEER, PERIOD
-from deepaccident_devkit.synth.traffic.signals import GREEN, RED
-from deepaccident_devkit.synth.traffic.unplanned import unplanned
+from deepaccident_devkit.synth.traffic.rights import GREEN, RED
 
 pytestmark = pytest.mark.slow
 

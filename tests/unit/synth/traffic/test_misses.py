@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.synth.traffic.casting import WARM_UP
-from deepaccident_devkit.synth.traffic.misses import Arrival, Miss, by_far, measured_miss, misses_text
+from deepaccident_devkit.synth.traffic.impact import Arrival, Miss, by_far, measured_miss, misses_text
 from deepaccident_devkit.synth.traffic.simulate import simulate
 
 ROLES = ("ego", "background")

@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.traffic.kinematics import Tracks
-from deepaccident_devkit.synth.traffic.perception import Alarm, Bodies, leaders
-from deepaccident_devkit.synth.traffic.rights import find_rights
-from deepaccident_devkit.synth.traffic.simulate import simulate
+from deepaccident_devkit.synth.traffic.driving import Tracks
+from deepaccident_devkit.synth.traffic.simulate import Alarm, Bodies, leaders
 
 SEES = ~np.eye(2, dtype=bool)
 
@@ -91,14 +89,3 @@ def test_who_has_noticed_brakes_until_the_end():
 def test_nobody_notices_one_who_comes_from_behind():
     poses = np.array([BYSTANDER, [0.0, 0.0, 0.0], [-6.0, 0.0, 0.0]])
     assert alarm(1.0, 1.0).rows(poses, np.array([[0.0, 0.0], [2.0, 0.0], [12.0, 0.0]])).tolist() == [2]
-
-
-@pytest.mark.parametrize("alert", [0.0, 0.3])
-def test_in_a_simulation_only_the_alert_one_is_slower_at_the_impact(driver, alert):
-    users = [driver("west", alert=alert), driver("south")]
-    run = simulate(users, begin=0.0, end=12.0, rights=find_rights(users, blind=(0, 1)), watched=(0, 1))
-    assert run.contact is not None
-    speed = run.states[:, :2, 3]
-    lost = speed.max(axis=0) - speed[-1]
-    assert (lost[0] > 0.5) == (alert > 0)
-    assert lost[1] < 0.01

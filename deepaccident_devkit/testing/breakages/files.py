@@ -1,0 +1,251 @@
+"""Label, calib and meta files that cannot be read, must not be run, or say something wrong."""
+
+from pathlib import Path
+
+import numpy as np
+
+from deepaccident_devkit.errors import BrokenReleaseError, CalibError, LabelError, MetaError
+from deepaccident_devkit.release.store import real_path
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.testing.breakages.kinds import Group, Victim
+from deepaccident_devkit.testing.editing import FIELD
+
+LABEL_FORM = Group("label", opening=BrokenReleaseError, reading=LabelError)
+LABEL_MEANING = Group("label")
+
+
+def _set_field(victim: Victim, name: str, word: str) -> Path:
+    """Change one word of the last box line."""
+    rows = victim.editor.rows(victim.agent, victim.frame)
+    rows[-1][FIELD[name]] = word
+    victim.editor.write_rows(victim.agent, victim.frame, rows)
+    return victim.file("label")
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_empty(victim: Victim) -> Path:
+    """A label file has no bytes."""
+    return victim.replace("label", lambda _: b"")
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_garbage(victim: Victim) -> Path:
+    """A label file contains a picture's bytes."""
+    return victim.replace("label", lambda _: b"\xff\xd8\xff\xe0\x00\x10JFIF\x00\x01" * 20)
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_cut(victim: Victim) -> Path:
+    """A label file ends within a line."""
+    return victim.replace("label", lambda content: content[:-25])
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_zeros(victim: Victim) -> Path:
+    """The second half of a label file is zero bytes, as after a write to a full disk."""
+    return victim.replace("label", lambda content: content[: len(content) // 2] + bytes(len(content) // 2))
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_no_header(victim: Victim) -> Path:
+    """A label file lacks its first line, the agent's velocity."""
+    return victim.replace("label", lambda content: content.split(b"\n", 1)[1])
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_field_missing(victim: Victim) -> Path:
+    """A box line has 12 fields instead of 13."""
+    rows = victim.editor.rows(victim.agent, victim.frame)
+    del rows[-1][FIELD["num_lidar_pts"]]
+    victim.editor.write_rows(victim.agent, victim.frame, rows)
+    return victim.file("label")
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_class_unknown(victim: Victim) -> Path:
+    """A box line names a class that does not exist."""
+    return _set_field(victim, "class", "lorry")
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_number_garbled(victim: Victim) -> Path:
+    """A coordinate has two decimal points."""
+    return _set_field(victim, "x", "1.2.3")
+
+
+@LABEL_FORM.enter("label-unreadable")
+def label_nan(victim: Victim) -> Path:
+    """A position is NaN."""
+    return _set_field(victim, "y", "nan")
+
+
+@LABEL_MEANING.enter("own-row-missing")
+def label_own_row_missing(victim: Victim) -> Path:
+    """A vehicle's label lacks the row of the vehicle itself (id −100)."""
+    rows = victim.editor.rows(victim.agent, victim.frame)
+    others = [row for row in rows[1:] if int(row[FIELD["id"]]) != OWN_ACTOR_ID]
+    victim.editor.write_rows(victim.agent, victim.frame, [rows[0], *others])
+    return victim.file("label")
+
+
+@LABEL_MEANING.enter("duplicate-box", "duplicate-id")
+def label_line_twice(victim: Victim) -> Path:
+    """The box line of a tracked actor is there twice."""
+    rows = victim.editor.rows(victim.agent, victim.frame)
+    victim.editor.write_rows(victim.agent, victim.frame, [*rows, rows[2]])
+    return victim.file("label")
+
+
+@LABEL_MEANING.enter("headings-differ", "own-velocity", "positions-differ", "velocity-off")
+def label_right_handed(victim: Victim) -> Path:
+    """One agent's labels have the other handedness: y, yaw and vy with the wrong sign."""
+
+    def flip(row: list[str]) -> None:
+        for name in ("y", "yaw", "vy"):
+            row[FIELD[name]] = repr(-float(row[FIELD[name]]))
+
+    victim.editor.edit_rows(victim.agent, victim.editor.frames, flip)
+    return victim.editor.folder(victim.agent, "label")
+
+
+@LABEL_MEANING.enter("meta-pair", "positions-differ", "sizes-differ")
+def labels_of_two_agents_swapped(victim: Victim) -> Path:
+    """Two vehicles' labels are swapped at all frames."""
+    for frame in victim.editor.frames:
+        files = (victim.editor.file(agent, "label", frame) for agent in (victim.agent, victim.other))
+        victim.editor.exchange(*files)
+    return victim.editor.folder(victim.agent, "label")
+
+
+CALIB_FORM = Group("calib", opening=BrokenReleaseError, reading=CalibError)
+CALIB_MEANING = Group("calib")
+
+
+@CALIB_FORM.enter("calib-unreadable")
+def calib_empty(victim: Victim) -> Path:
+    """A calib file has no bytes."""
+    return victim.replace("calib", lambda _: b"")
+
+
+@CALIB_FORM.enter("calib-unreadable")
+def calib_cut(victim: Victim) -> Path:
+    """A calib file ends in the middle."""
+    return victim.replace("calib", lambda content: content[: len(content) // 2])
+
+
+@CALIB_FORM.enter("calib-unreadable")
+def calib_code(victim: Victim) -> Path:
+    """A calib file is a pickle that runs a program: it makes a folder, `marker`, beside the release."""
+    name = str(victim.marker).encode("raw_unicode_escape")
+    return victim.replace("calib", lambda _: b"cos\nmkdir\n(V" + name + b"\ntR.")
+
+
+@CALIB_FORM.enter("calib-unreadable")
+def calib_key_missing(victim: Victim) -> Path:
+    """A calib file lacks a camera's intrinsic."""
+    calib = victim.editor.calib(victim.agent, victim.frame)
+    del calib["intrinsic_Camera_Front"]
+    victim.editor.write_calib(victim.agent, victim.frame, calib)
+    return victim.file("calib")
+
+
+@CALIB_FORM.enter("calib-unreadable")
+def calib_wrong_shape(victim: Victim) -> Path:
+    """A pose has three rows."""
+    victim.editor.edit_calib(victim.agent, [victim.frame], "ego_to_world", lambda pose: pose[:3])
+    return victim.file("calib")
+
+
+@CALIB_FORM.enter("calib-unreadable")
+def calib_nan(victim: Victim) -> Path:
+    """A pose contains NaN."""
+    victim.editor.edit_calib(victim.agent, [victim.frame], "ego_to_world", lambda pose: pose * np.nan)
+    return victim.file("calib")
+
+
+@CALIB_FORM.enter("calib-unreadable")
+def calib_mirrored(victim: Victim) -> Path:
+    """A pose is a reflection: its determinant is −1."""
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    victim.editor.edit_calib(victim.agent, [victim.frame], "ego_to_world", lambda pose: pose @ mirror)
+    return victim.file("calib")
+
+
+@CALIB_MEANING.enter("intrinsic-form")
+def calib_wrong_k(victim: Victim) -> Path:
+    """A camera's raw K has the usual order of axes, not that of the release."""
+
+    def ordinary(raw: np.ndarray) -> np.ndarray:
+        return np.array([[raw[0, 1], 0, raw[0, 0]], [0, raw[0, 1], raw[1, 0]], [0, 0, 1]])
+
+    victim.editor.edit_calib(victim.agent, victim.editor.frames, "intrinsic_Camera_Front", ordinary)
+    return victim.editor.folder(victim.agent, "calib")
+
+
+@CALIB_MEANING.enter("headings-differ", "own-box-apart", "positions-differ", "speed-off", "velocity-off")
+def calib_inverse(victim: Victim) -> Path:
+    """An agent's poses are inverted: `ego_from_world`."""
+    victim.editor.edit_calib(victim.agent, victim.editor.frames, "ego_to_world", np.linalg.inv)
+    return victim.editor.folder(victim.agent, "calib")
+
+
+@CALIB_MEANING.enter("camera-misplaced")
+def calib_cameras_swapped(victim: Victim) -> Path:
+    """The extrinsics of two cameras of one agent are swapped."""
+    keys = ("lidar_to_Camera_FrontLeft", "lidar_to_Camera_BackRight")
+    for frame in victim.editor.frames:
+        calib = victim.editor.calib(victim.agent, frame)
+        swapped = dict(zip(keys, (calib[keys[1]], calib[keys[0]]), strict=True))
+        victim.editor.write_calib(victim.agent, frame, {**calib, **swapped})
+    return victim.editor.folder(victim.agent, "calib")
+
+
+META_FORM = Group("meta", opening=BrokenReleaseError, reading=MetaError)
+META_MEANING = Group("meta")
+
+
+def _edit_first_line(victim: Victim, word: int, new: str) -> Path:
+    first, *rest = victim.editor.meta_lines()
+    words = first.split()
+    words[word] = new
+    victim.editor.write_meta_lines([" ".join(words), *rest])
+    return real_path(victim.editor.scenario.meta_path)
+
+
+@META_FORM.enter("meta-unreadable")
+def meta_empty(victim: Victim) -> Path:
+    """A meta file has no bytes."""
+    victim.editor.write_meta_lines([])
+    return real_path(victim.editor.scenario.meta_path)
+
+
+@META_FORM.enter("meta-unreadable")
+def meta_cut(victim: Victim) -> Path:
+    """A meta file ends within its first line."""
+    victim.editor.write_meta_lines([victim.editor.meta_lines()[0][:20]])
+    return real_path(victim.editor.scenario.meta_path)
+
+
+@META_FORM.enter("meta-unreadable")
+def meta_id_no_number(victim: Victim) -> Path:
+    """A colliding actor's id is a word."""
+    return _edit_first_line(victim, 1, "ego")
+
+
+@META_MEANING.enter("meta-missing")
+def meta_missing(victim: Victim) -> Path:
+    """A labelled scenario has no meta file."""
+    victim.editor.remove(real_path(victim.editor.scenario.meta_path))
+    return real_path(victim.editor.scenario.meta_path)
+
+
+@META_MEANING.enter("meta-frames")
+def meta_frames_wrong(victim: Victim) -> Path:
+    """The number of frames in meta is not that of the recorded frames."""
+    return _edit_first_line(victim, 8, "99")
+
+
+@META_MEANING.enter("meta-pair", "pair-not-seen")
+def meta_pair_wrong(victim: Victim) -> Path:
+    """Meta names a colliding actor that is in no label."""
+    return _edit_first_line(victim, 1, "7777")
