@@ -1,32 +1,241 @@
-"""Figures of a release's statistics: one for each group of panels, and their files."""
+"""Figures of a release's statistics, their panels (one for each table), and their files."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.files import path_of
-from deepaccident_devkit.render.axes import detached_figure, figure_or_new
+from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import SPLIT_COLORS
-from deepaccident_devkit.render.pictures import write_figure
-from deepaccident_devkit.render.statistics_panels import (
-    draw_quantile_boxes,
-    render_angles,
-    render_counts,
-    render_histogram,
-    render_quantiles,
-    render_relative_positions,
+from deepaccident_devkit.render.colors import (
+    CATEGORY_COLORS,
+    CATEGORY_MARKERS,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    SPLIT_COLORS,
 )
+from deepaccident_devkit.render.legends import draw_legend
+from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.statistics import GROUPS, DatasetStatistics
+from deepaccident_devkit.statistics import (
+    GROUPS,
+    PROBABILITIES,
+    CollisionPair,
+    CountTable,
+    DatasetStatistics,
+    Histogram,
+    QuantileRow,
+    QuantileTable,
+)
+from deepaccident_devkit.taxonomy import CATEGORIES
 from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+
+
+_PANEL = (7.0, 4.5)
+
+
+@in_own_settings
+def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
+    """Render a table of counts as horizontal bars, the splits one after the other, each with its sum and share.
+
+    Args:
+        table: of `DatasetStatistics.counts`.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes.
+    """
+    ax = axes_or_new(ax, _PANEL)
+    values, whole = list(table.counts), table.total()
+    starts = [0] * len(values)
+    for group in GROUPS[1:]:
+        widths = [table.counts[value][group] for value in values]
+        if any(widths):
+            colors = SPLIT_COLORS[group]
+            ax.barh(range(len(values)), widths, left=starts, color=colors, label=group, height=0.72)
+        starts = [start + width for start, width in zip(starts, widths, strict=True)]
+    for position, total in enumerate(starts):
+        share = f" ({100 * total / whole:.0f} %)" if whole else ""
+        how: Any = {"textcoords": "offset points", "va": "center", "fontsize": SMALLEST_TEXT}
+        ax.annotate(f"{total:,}{share}", (total, position), (4, 0), **how)
+    ax.set_yticks(range(len(values)), values)
+    ax.invert_yaxis()
+    ax.set(xlabel=table.counted, title=table.title, xlim=(0, 1.3 * max([1, *starts])))
+    _counting(ax.xaxis)
+    return with_light_grid(ax, "x")
+
+
+@in_own_settings
+def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
+    """Render a histogram as bars, the splits on top of each other.
+
+    Args:
+        histogram: of `DatasetStatistics.histograms`.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes; its title says how many values lie outside of the bins.
+    """
+    ax = axes_or_new(ax, _PANEL)
+    widths = [high - low for low, high in pairwise(histogram.edges)]
+    _draw_stacked(histogram, ax, histogram.edges[:-1], widths, align="edge")
+    unit = "" if histogram.unit == histogram.field else f" ({histogram.unit})"
+    ax.set(xlabel=f"{histogram.field}{unit}", ylabel=histogram.counted, title=_title(histogram))
+    ax.set_xlim(histogram.edges[0], histogram.edges[-1])
+    ax.set_xticks(histogram.edges[:: -(-len(histogram.edges) // 12)])
+    _counting(ax.yaxis)
+    return with_light_grid(ax, "y")
+
+
+@in_own_settings
+def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None) -> Axes:
+    """Render a number's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %.
+
+    Args:
+        table: of `DatasetStatistics.quantiles`.
+        field: which of its numbers.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes.
+    """
+    ax = axes_or_new(ax, _PANEL)
+    rows = [row for row in table.quantiles if row.field == field and row.group == GROUPS[0] and row.values]
+    draw_quantile_boxes({row.category: row for row in rows}, ax)
+    ax.set(ylabel=f"{field} ({table.unit})", title=f"{field.capitalize()} by category", ylim=(0, None))
+    ax.tick_params(axis="x", labelsize=SMALLEST_TEXT)
+    return ax
+
+
+@in_own_settings
+def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
+    """Render a histogram of angles around a circle: 0° up, counter-clockwise.
+
+    Args:
+        histogram: in degrees.
+        ax: polar axes to render on; new ones if None.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ChoiceError: the axes are not polar.
+    """
+    from matplotlib.projections.polar import PolarAxes
+
+    if ax is None:
+        ax = figure_or_new(None, (5, 5)).add_subplot(projection="polar")
+    if not isinstance(ax, PolarAxes):
+        raise ChoiceError(f"ax: expected polar axes (projection='polar'), found {type(ax).__name__}")
+    ax.set_theta_zero_location("N")
+    edges = histogram.edges
+    middles = [radians((low + high) / 2) for low, high in pairwise(edges)]
+    _draw_stacked(histogram, ax, middles, radians(edges[1] - edges[0]))
+    ax.set_xticks([radians(angle) for angle in range(0, 360, 30)])
+    ax.tick_params(labelsize=SMALLEST_TEXT)
+    counts = histogram.counts[GROUPS[0]]
+    lowest = min(range(len(counts)), key=lambda bar: counts[bar - 1] + counts[bar])
+    ax.set_rlabel_position(edges[lowest])  # beside the bars
+    highest = max(1, *counts)
+    ax.set_ylim(0, highest)
+    ax.set_yticks(sorted({-(-highest * part // 3) for part in (1, 2, 3)}))
+    ax.set_title(_title(histogram), fontsize=10)
+    ax.grid(color=GRID_COLOR, linewidth=0.6)
+    ax.set_axisbelow("line")
+    return ax
+
+
+@in_own_settings
+def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None = None) -> Axes:
+    """Render where the other actor of each colliding pair was at the last frame, seen from the first, forward up.
+
+    Args:
+        pairs: `DatasetStatistics.collisions`.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes, in metres from the centre of the first: its forward up, its left to the left.
+    """
+    from matplotlib.patches import Rectangle
+
+    ax = axes_or_new(ax, (5.5, 5.5))
+    for category in CATEGORIES:
+        others = [pair for pair in pairs if pair.other_category == category]
+        if others:
+            positions = ([pair.y for pair in others], [pair.x for pair in others])
+            color, marker = CATEGORY_COLORS[category], CATEGORY_MARKERS.get(category, "s")
+            how: Any = {"s": 30, "marker": marker, "alpha": 0.75, "linewidths": 0}
+            ax.scatter(*positions, color=color, label=category, zorder=3, **how)
+    ax.add_patch(Rectangle((-0.97, -2.3), 1.94, 4.6, fill=False, edgecolor=COLLIDER_COLOR, linewidth=1.2))
+    ax.annotate("", (0, 2.3), (0, 0.4), arrowprops={"arrowstyle": "->", "color": COLLIDER_COLOR})
+    reach = max([6.0, *(1.1 * max(abs(pair.x), abs(pair.y)) for pair in pairs)])
+    ax.set(xlim=(reach, -reach), ylim=(-reach, reach), aspect="equal")
+    ax.set(xlabel="to the left of the first (m)", ylabel="forward of the first (m)")
+    ax.set_title("Centre of the other actor\n(red: the first, as a median car)", fontsize=10)
+    if pairs:
+        handles, _ = ax.get_legend_handles_labels()
+        draw_legend(ax, handles, columns=3, loc="upper center", bbox_to_anchor=(0.5, -0.22))  # below the axis' label
+    return with_light_grid(ax, "both")
+
+
+def draw_quantile_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
+    """A box for each labelled row of quantiles, with its median in figures."""
+    boxes = [
+        {"label": label, "whislo": q[1], "q1": q[2], "med": q[3], "q3": q[4], "whishi": q[5]}
+        for label, row in rows.items()
+        if (q := row.values)
+    ]
+    if boxes:
+        parts = ax.bxp(boxes, showfliers=False, patch_artist=True, widths=0.45, medianprops={"color": "black"})
+        for patch, row in zip(parts["boxes"], rows.values(), strict=True):
+            patch.set(facecolor=CATEGORY_COLORS.get(row.category, SPLIT_COLORS["unknown"]), alpha=0.75)
+        medians = [row.values[PROBABILITIES.index(0.5)] for row in rows.values() if row.values]
+        for position, median in enumerate(medians, 1):
+            text = f"{median:.{1 if median >= 10 else 2}f}"
+            ax.annotate(text, (position + 0.25, median), va="center", fontsize=SMALLEST_TEXT)
+        ax.set_xlim(0.6, len(boxes) + 0.75)
+    ax.set_xlabel("line: median; box: 25–75 %; whiskers: 5–95 %", fontsize=SMALLEST_TEXT)
+    with_light_grid(ax, "y")
+
+
+def _draw_stacked(
+    histogram: Histogram, ax: Axes, places: Sequence[float], width: float | Sequence[float], **how: Any
+) -> None:
+    """Bars at some places, the splits on top of each other; splits with only zeros have no bars."""
+    base, style = [0] * len(places), {"edgecolor": "white", "linewidth": 0.5, **how}
+    for group in GROUPS[1:]:
+        counts = histogram.counts[group]
+        if any(counts):
+            ax.bar(places, counts, width, base, color=SPLIT_COLORS[group], label=group, **style)
+            base = [below + count for below, count in zip(base, counts, strict=True)]
+
+
+def _title(histogram: Histogram) -> str:
+    outside = histogram.outside[GROUPS[0]]
+    if not outside:
+        return histogram.title
+    share = 100 * outside / histogram.total()
+    return f"{histogram.title}\n({share:.2g} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
+
+
+def _counting(axis: Axis) -> None:
+    """Whole numbers with a comma at thousands, in at most six steps."""
+    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+
+    axis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    axis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+
 
 PictureFormat = Literal["png", "pdf"]
 

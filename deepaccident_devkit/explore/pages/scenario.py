@@ -18,7 +18,7 @@ from deepaccident_devkit.explore.pages.answers import explorer_of, page, rendere
 from deepaccident_devkit.explore.pages.pictures import SCENARIO, sample_of, token_of
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.render.replay import script_json
-from deepaccident_devkit.render.roles import agent_actors
+from deepaccident_devkit.render.roles import recorders_of
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, describe, lead_times, twin_diff, twin_of
 from deepaccident_devkit.taxonomy import short_name
 from deepaccident_devkit.validation import findings
@@ -151,7 +151,7 @@ def _pairs(dataset: Dataset, token: str) -> dict[str, Any]:
 
 
 def _actor_names(dataset: Dataset, token: str) -> Callable[[int], str]:
-    agents = {actor: short_name(agent) for agent, actor in agent_actors(dataset, token).items()}
+    agents = {actor: short_name(agent) for actor, agent in recorders_of(dataset, token).items()}
 
     def name(actor: int) -> str:
         kind = dataset.get("instance", f"{token}/actor/{actor}")["category"]

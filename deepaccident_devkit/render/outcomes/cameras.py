@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -12,22 +13,19 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
-from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry import SE3, Boxes, PinholeCamera
 from deepaccident_devkit.maps.polygons import outlines
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, settled
-from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image
+from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image, write_beside
 from deepaccident_devkit.render.camera import draw_image
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, OUTCOME_COLORS
-from deepaccident_devkit.render.legends import draw_legend
-from deepaccident_devkit.render.missing import is_there
+from deepaccident_devkit.render.colors import CASING_COLOR, COLLIDER_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.legends import draw_legend, is_there
 from deepaccident_devkit.render.moments import CAMERA_GRID
 from deepaccident_devkit.render.motion_maps import MotionMaps
-from deepaccident_devkit.render.outcomes.accident import FORESEEN_COLOR, alarm_words
-from deepaccident_devkit.render.outcomes.camera_view import CASINGS, CameraView, view_of
-from deepaccident_devkit.render.outcomes.detection import DASHED
-from deepaccident_devkit.render.outcomes.verdicts import (
+from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR, alarm_words
+from deepaccident_devkit.render.outcomes.evaluation import (
     AccidentVerdict,
     DetectionVerdict,
     MotionVerdict,
@@ -36,13 +34,101 @@ from deepaccident_devkit.render.outcomes.verdicts import (
 )
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
-from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, OWN_ACTOR_ID, POLE_HEIGHT
 from deepaccident_devkit.text import choice
+from deepaccident_devkit.v2x.projection import camera_of
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+_POST: Final = 1.5
+"""Metres: the height of the posts at places, since rings far away are flat."""
+_MARK: Final = (-6.0, -6.0, 6.0, 6.0)
+"""Points around a post that no words cover: left, low, right and high."""
+_CASING: Final = 1.4
+"""Points by which the casing of a line is wider."""
+CASINGS: Final = {OUTCOME_COLORS["missed"]: "black"}
+"""Edges around lines that are pale; others have white edges."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraView:
+    """A camera's panel, and what lies on the ground in it.
+
+    The ground is flat: z = 0 in a vehicle's ego frame, `POLE_HEIGHT` below the infrastructure's.
+
+    Attributes:
+        channel: the camera's.
+        sample: token.
+        lens: its intrinsics.
+        optical_from_ego: of the sample.
+        ground: z of the ground in the ego frame, metres.
+        ax: in pixels.
+    """
+
+    channel: str
+    sample: str
+    lens: PinholeCamera
+    optical_from_ego: SE3
+    ground: float
+    ax: Axes
+
+    def optical(self, places: FloatArray, height: float = 0.0) -> FloatArray:
+        """Points (N, 3) of the optical frame, so many metres above places (N, 2) of the ego frame."""
+        return self.optical_from_ego.apply(np.column_stack([places, np.full(len(places), self.ground + height)]))
+
+    def on_ground(self, lines: Sequence[FloatArray]) -> list[FloatArray]:
+        """Lines (P, 2) on the ground, metres of the ego frame, as pixels (V, 2) of their parts in front of the camera.
+
+        The ends of a cut are far below the image, and so is the line between two of them.
+        """
+        if not lines:
+            return []
+        points, owner = self.optical(np.concatenate(lines)), np.repeat(np.arange(len(lines)), [*map(len, lines)])
+        within = owner[1:] == owner[:-1]
+        pixels, drawn = segments_in_image(np.stack([points[:-1], points[1:]], axis=1)[within], self.lens)
+        rows, starts = np.unique(owner[1:][within][drawn], return_index=True)
+        return np.split(pixels.reshape(-1, 2), 2 * starts[1:]) if len(rows) else []
+
+    def draw_lines(self, lines: Sequence[FloatArray], color: str, *, width: float, dashed: bool = False) -> None:
+        """Render lines (V, 2) in pixels, on wider ones that set them off from the image."""
+        from matplotlib.collections import LineCollection
+
+        casing = CASINGS.get(color, CASING_COLOR)
+        below = LineCollection(lines, colors=casing, linewidths=width + _CASING, alpha=0.7)
+        above = LineCollection(lines, colors=color, linewidths=width, linestyles=DASHED if dashed else "solid")
+        self.ax.add_collection(below, autolim=False)  # the image has set the limits
+        self.ax.add_collection(above, autolim=False)
+
+    def posts(self, places: FloatArray) -> FloatArray:
+        """Feet and tops (V, 2, 2), pixels, of posts at places (N, 2) of the ego frame; of those in front alone."""
+        pixels, _ = segments_in_image(np.stack([self.optical(places), self.optical(places, _POST)], axis=1), self.lens)
+        return pixels
+
+    def write(self, words: str, places: FloatArray, color: str) -> None:
+        """Write words beside places (N, 2) of the ego frame: between the feet of the posts that the image shows."""
+        posts = self.posts(places)
+        seen = posts[self.lens.in_image(posts[:, 0])]
+        if len(seen):
+            u, v = seen[:, 0].mean(axis=0).tolist()
+            keep_free(self.ax, seen, margin=_MARK)
+            write_beside(self.ax, words, (u, v), color)
+
+
+def view_of(dataset: Dataset, sample: str, channel: str, ax: Axes) -> CameraView:
+    """The panel of a camera of a sample (a token), to be rendered on axes."""
+    return CameraView(
+        channel=channel,
+        sample=sample,
+        lens=camera_of(dataset, f"{sample}/{channel}"),
+        optical_from_ego=dataset.world_from(sample, channel).inverse() @ dataset.world_from(sample, "ego"),
+        ground=-POLE_HEIGHT if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE else 0.0,
+        ax=ax,
+    )
+
 
 _COLUMNS: Final = 3
 _WIDTH, _WIDER = 8.0, 3.35
@@ -114,8 +200,7 @@ def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, an
         ax.set_axis_off()
     for channel, ax in zip(channels, axes.flat, strict=False):
         draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
-    handles = _handles(verdict)
-    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    draw_legend(fig, _handles(verdict))
     set_scene_title(fig, dataset, verdict.sample, words, below=verdict.words)
     return settled(fig)
 

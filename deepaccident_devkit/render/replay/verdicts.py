@@ -16,7 +16,7 @@ from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.outcomes.accident import count_words
+from deepaccident_devkit.render.outcomes.above import count_words
 from deepaccident_devkit.render.replay.recording import Recording
 from deepaccident_devkit.taxonomy import short_name
 

@@ -18,11 +18,15 @@ from deepaccident_devkit.pages import document, part
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.axes import detached_figure
+from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.replay import tried_replay
-from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, render_avoidability
-from deepaccident_devkit.render.safety.lead_time import LEAD_TIME_SIZE, render_lead_times
-from deepaccident_devkit.render.theme import page_style
+from deepaccident_devkit.render.safety.figures import (
+    AVOIDABILITY_SIZE,
+    LEAD_TIME_SIZE,
+    render_avoidability,
+    render_lead_times,
+)
 from deepaccident_devkit.safety import COALITIONS, OUTCOMES, PARTNERS, AccidentRow, OutcomeShares, SafetyReport
 from deepaccident_devkit.safety.avoidability import GROUPS
 from deepaccident_devkit.safety.lead_times import CAVEAT

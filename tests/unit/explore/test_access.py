@@ -12,8 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.explore.access import HEADERS, Access, App, Gate, Message
-from deepaccident_devkit.explore.addresses import HostPort, RootPath
+from deepaccident_devkit.explore.access import HEADERS, Access, App, Gate, HostPort, Message, RootPath
 from deepaccident_devkit.explore.serving import Served, serving
 
 ROOT = "/user/me/proxy/8000"

@@ -35,9 +35,9 @@ from deepaccident_devkit.evaluation.runs import (
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.explore import Explorer, make_app
 from deepaccident_devkit.explore.background import Jobs
-from deepaccident_devkit.explore.pages.model_addresses import sample_path
-from deepaccident_devkit.explore.verdicts import verdict
-from deepaccident_devkit.render.outcomes.accident import count_words
+from deepaccident_devkit.explore.evaluations import verdict
+from deepaccident_devkit.explore.pages.samples import sample_path
+from deepaccident_devkit.render.outcomes.above import count_words
 
 pytestmark = pytest.mark.slow
 

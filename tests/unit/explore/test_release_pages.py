@@ -21,9 +21,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.explore import Explorer, make_app
-from deepaccident_devkit.explore.pages import findings, maps, release
-from deepaccident_devkit.explore.pages.findings import ANY, chosen_findings, kinds_of
-from deepaccident_devkit.explore.pages.release_tabs import TABS, part_of
+from deepaccident_devkit.explore.pages import release
+from deepaccident_devkit.explore.pages.answers import part_of
+from deepaccident_devkit.explore.pages.release import ANY, TABS, chosen_findings, kinds_of
 from deepaccident_devkit.maps import kept_town_map, town_map, towns_of
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.statistics import dataset_statistics
@@ -294,7 +294,7 @@ def test_the_links_of_kinds_and_severities_filter(of_damaged: Reader, report: Va
 
 
 def test_long_lists_have_pages(of_damaged: Reader, report: ValidationReport, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(findings, "part_of", partial(part_of, size=1))
+    monkeypatch.setattr(release, "part_of", partial(part_of, size=1))
     page, whats = of_damaged.ready(f"/release/findings?severity={ANY}"), []
     for number in range(1, len(report.findings) + 1):
         whats += [row[4] for row in page.table("scenario")]
@@ -439,7 +439,7 @@ def test_a_map_is_made_for_who_asks_for_it(mapped: Reader) -> None:
 
 
 def test_a_map_that_cannot_be_kept_is_shown(mapped: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(maps, "kept_town_map", lambda *_: None)
+    monkeypatch.setattr(release, "kept_town_map", lambda *_: None)
     town = towns_of(mapped.explorer.dataset)[0]
     get(mapped.app, f"/release/maps?make={town}")
     assert mapped.explorer.jobs.wait(60)
@@ -455,7 +455,7 @@ def test_no_picture_makes_a_map_anew(mapped: Reader, monkeypatch: pytest.MonkeyP
     path.rename(path.with_suffix(".later"))
     town_map(dataset, town)
     path.with_suffix(".later").rename(path)
-    monkeypatch.setattr(maps, "town_map", lambda *_, **__: pytest.fail("made"))
+    monkeypatch.setattr(release, "town_map", lambda *_, **__: pytest.fail("made"))
     assert get(mapped.app, f"/release/map/{town}.png").status == 200
 
 

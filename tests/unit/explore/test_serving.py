@@ -24,8 +24,7 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
 from deepaccident_devkit.explore import serving as module
-from deepaccident_devkit.explore.access import Access, Receive, Scope, Send
-from deepaccident_devkit.explore.addresses import RootPath
+from deepaccident_devkit.explore.access import Access, Receive, RootPath, Scope, Send
 from deepaccident_devkit.explore.serving import Served, need_extra, serve, serving
 
 ANYWHERE = "0.0.0.0"  # noqa: S104

@@ -19,9 +19,9 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableErr
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import read_rows, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.explore import Explorer, export_pages, static_pages, static_work
+from deepaccident_devkit.explore import Explorer, export_pages, static_pages
+from deepaccident_devkit.explore.evaluations import verdict
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_html
-from deepaccident_devkit.explore.verdicts import verdict
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.taxonomy import short_name
 
@@ -186,10 +186,10 @@ def test_the_next_model_is_shown_where_one_cannot_be(
         asked.append(prediction)
         return None if prediction == "second" else "no"
 
-    monkeypatch.setattr(static_work, "tried_replay", tried)
+    monkeypatch.setattr(static_pages, "tried_replay", tried)
     names: Mapping[str, Any] = {name: name for name in ("first", "second", "third")}
-    work = static_work.Work(token=accident(da_motion), folder="a/b", predictions=tuple(names.items()))
-    told = static_work.tell(da_motion, tmp_path, work)
+    work = static_pages.Work(token=accident(da_motion), folder="a/b", predictions=tuple(names.items()))
+    told = static_pages.tell(da_motion, tmp_path, work)
     assert (told.model, told.reason, asked) == ("second", "", ["first", "second"])
 
 
@@ -229,7 +229,7 @@ def test_the_same_call_gives_the_same_bytes(made: Made, da_motion: DeepAccident,
 
 @pytest.fixture
 def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(static_work, "tried_replay", lambda *_, **__: "not in this test")
+    monkeypatch.setattr(static_pages, "tried_replay", lambda *_, **__: "not in this test")
 
 
 def listed(index: Path) -> list[str]:
@@ -330,7 +330,7 @@ def test_images_that_cannot_be_read_are_told(da: DeepAccident, tmp_path: Path) -
 @pytest.fixture
 def one(da_b: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Arguments for an export of a scenario without a replay."""
-    monkeypatch.setattr(static_work, "tried_replay", lambda *_, **__: "not in this test")
+    monkeypatch.setattr(static_pages, "tried_replay", lambda *_, **__: "not in this test")
     return {"dataset": da_b, "scenarios": [da_b.scenario[0]], "workers": 1}
 
 

@@ -17,7 +17,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
-from deepaccident_devkit.render.bev import BevView, draw_bev, draw_underlay, render_bev
+from deepaccident_devkit.render.bev import BevView, draw_bev, render_bev
 from deepaccident_devkit.render.colors import (
     AGENT_COLORS,
     BEV_COLORS,
@@ -26,6 +26,7 @@ from deepaccident_devkit.render.colors import (
     OWN_COLOR,
     POINT_COLOR,
 )
+from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.roles import collider_ids
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, short_name
@@ -214,10 +215,10 @@ def test_the_bev_camera_lies_under_the_picture_the_right_way_round(x: float, y: 
 
 def test_a_picture_can_be_centred_elsewhere(da: DeepAccident, approach: str) -> None:
     ax = new_axes()
-    drawn = draw_bev(da, approach, BevView(view_range=8, center=(20.0, 5.0)), frozenset(("bev", "boxes")), ax)
+    colors, clouds = draw_bev(da, approach, BevView(view_range=8, center=(20.0, 5.0)), frozenset(("bev", "boxes")), ax)
     assert (ax.get_xlim(), ax.get_ylim()) == ((12, 28), (-3, 13))
-    assert drawn.colors == set(outlines(ax).values())
-    assert drawn.clouds == ()
+    assert colors == set(outlines(ax).values())
+    assert clouds == ()
 
 
 def test_a_release_without_sensor_files_is_drawn_from_its_labels(da_b: DeepAccident) -> None:

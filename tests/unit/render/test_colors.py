@@ -14,7 +14,7 @@ from scripts import loaded_script
 
 import deepaccident_devkit
 from deepaccident_devkit.render import colors
-from deepaccident_devkit.render.motion_cells import direction_colors
+from deepaccident_devkit.render.motion_maps import direction_colors
 
 PACKAGE = Path(deepaccident_devkit.__file__).parent
 PAINTED = ("synth", "testing")

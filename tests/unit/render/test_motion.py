@@ -32,7 +32,7 @@ from deepaccident_devkit.render import (
     draw_motion_trail,
 )
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, OWN_COLOR
-from deepaccident_devkit.render.motion_cells import PALEST
+from deepaccident_devkit.render.motion_maps import PALEST
 from deepaccident_devkit.render.roles import collider_ids
 
 CONFIG = MotionLabelConfig(

@@ -8,8 +8,7 @@ from picture_texts import text_faults
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.statistics import STATISTICS_FIGURES, render_statistics, save_statistics
-from deepaccident_devkit.render.statistics_panels import render_angles
+from deepaccident_devkit.render.statistics import STATISTICS_FIGURES, render_angles, render_statistics, save_statistics
 from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ from matplotlib.markers import MarkerStyle
 
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.colors import CATEGORY_MARKERS
-from deepaccident_devkit.render.statistics_panels import (
+from deepaccident_devkit.render.statistics import (
     render_angles,
     render_counts,
     render_histogram,

@@ -11,8 +11,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, TokenError
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.sights import sights
-from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
+from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix, sights
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 

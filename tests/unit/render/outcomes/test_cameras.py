@@ -35,8 +35,8 @@ from deepaccident_devkit.render.outcomes import (
     render_outcome_in_cameras,
     sample_verdict,
 )
-from deepaccident_devkit.render.outcomes.accident import FORESEEN_COLOR
-from deepaccident_devkit.render.outcomes.verdicts import AccidentVerdict
+from deepaccident_devkit.render.outcomes.above import FORESEEN_COLOR
+from deepaccident_devkit.render.outcomes.evaluation import AccidentVerdict
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.projection import camera_of
 
@@ -253,7 +253,7 @@ def test_instances_beyond_the_range_are_left_out(
 ) -> None:
     output, counts = blocks(labels, (20.0, 22.0, 3.0, 4.0)), []
     for ranges in ({"100x100": 100.0}, {"30x30": 30.0}):
-        monkeypatch.setattr("deepaccident_devkit.render.outcomes.motion.RANGES", ranges)
+        monkeypatch.setattr("deepaccident_devkit.render.outcomes.above.RANGES", ranges)
         verdict = sample_verdict(da_motion, sample, output, label=labels)
         ax = draw_outcome_in_camera(da_motion, verdict, "Camera_Front", ax=new_axes())
         counts.append(len(lines_in(ax, OUTCOME_COLORS["false"])))

@@ -28,7 +28,7 @@ from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
-from deepaccident_devkit.render.outcomes.accident import verdict_words
+from deepaccident_devkit.render.outcomes.above import verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
 from deepaccident_devkit.render.roles import collider_ids
 

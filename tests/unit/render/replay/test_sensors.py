@@ -15,10 +15,9 @@ from replay_page import accident, data_of, picture
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render.replay import render_replay, sensors
-from deepaccident_devkit.render.replay.follow import Followed
 from deepaccident_devkit.render.replay.recording import recording_of
 from deepaccident_devkit.render.replay.replay import SIZE_LIMIT
-from deepaccident_devkit.render.replay.sensors import CameraPictures, camera_files, camera_pictures
+from deepaccident_devkit.render.replay.sensors import CameraPictures, Followed, camera_files, camera_pictures
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
