@@ -212,7 +212,8 @@ def _by_query(scenarios: Scenarios, choices: Choices, plain: Sequence[str]) -> t
                 waiting.append(_waiting_text(line, late))
                 continue
             values = scenarios.values(looked.name) or []
-            condition = condition_of(wanted, looked, _words(values) if looked.kind == "word" else ())
+            words = {word for value in values for word in (value if isinstance(value, tuple) else (value,))}
+            condition = condition_of(wanted, looked, words if looked.kind == "word" else ())
             matching &= np.array([condition.holds(value) for value in values], dtype=bool)
         except DeepAccidentError as error:
             faults.append(str(error))
@@ -223,10 +224,6 @@ def _waiting_text(what: str, job: Job) -> str:
     if job.state == "failed":
         return f"{what}: cannot be computed ({job.error})"
     return f"{what}: is being computed ({job.title}); it counts as soon as it is there"
-
-
-def _words(values: Sequence[Any]) -> set[Any]:
-    return {word for value in values for word in (value if isinstance(value, tuple) else (value,))}
 
 
 def _sorted(

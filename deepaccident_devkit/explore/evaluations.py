@@ -72,46 +72,6 @@ class _Shown(msgspec.Struct):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeadlineRow:
-    """A headline number of all samples.
-
-    Attributes:
-        name: such as `apa`.
-        text: the value with its unit.
-        interval: `0.525 to 0.750`; empty if there is none.
-        better: `higher`, `lower`, or empty.
-    """
-
-    name: str
-    text: str
-    interval: str
-    better: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bar:
-    """The main number of the samples that have one value of an attribute.
-
-    Attributes:
-        value: of the attribute; `unknown` where it is not known.
-        samples: how many.
-        scenarios: that they are of.
-        text: the number with its unit.
-        interval: as in `HeadlineRow`.
-        width: of the bar in percent of the longest; None where there is no number.
-        ends: of the interval, likewise; None if there is none.
-    """
-
-    value: str
-    samples: int
-    scenarios: int
-    text: str
-    interval: str
-    width: float | None
-    ends: Ends | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class MainNumber:
     """The number by which samples are ranked.
 
@@ -135,21 +95,22 @@ class Evaluated:
     Attributes:
         facts: name → what was evaluated, and how.
         mark: that it is partial; empty if it is not.
-        headlines: of all samples.
+        headlines: of all samples: `name`, `text`, `interval` (empty if there is none), `better` (`higher`, `lower` or
+            empty).
         interval: heading of the intervals: `95 % interval`.
         notes: on the intervals.
         main: the number that the bars show; None if the result has none.
-        breakdowns: attribute → a bar for each of several values.
+        breakdowns: attribute → a bar for each of several values, as `_bar` describes it.
         same: attribute → the only value that the samples have.
     """
 
     facts: Mapping[str, str]
     mark: str
-    headlines: tuple[HeadlineRow, ...]
+    headlines: tuple[dict[str, str], ...]
     interval: str
     notes: tuple[str, ...]
     main: MainNumber | None
-    breakdowns: Mapping[str, tuple[Bar, ...]]
+    breakdowns: Mapping[str, tuple[dict[str, Any], ...]]
     same: Mapping[str, str]
 
 
@@ -176,7 +137,7 @@ def evaluated(bundle: Bundle) -> Evaluated:
         notes=() if group is None else tuple(group["notes"]),
         main=main,
         breakdowns={by: each for by, each in bars.items() if len(each) > 1},
-        same={by: each[0].value for by, each in bars.items() if len(each) == 1},
+        same={by: each[0]["value"] for by, each in bars.items() if len(each) == 1},
     )
 
 
@@ -209,26 +170,31 @@ def _main_number(summary: Json) -> MainNumber | None:
     return MainNumber(name=there[path]["name"], path=path, unit=unit, limit=LIMITS.get(unit, 1.0))
 
 
-def _headline_row(headline: Json, group: Json | None) -> HeadlineRow:
+def _headline_row(headline: Json, group: Json | None) -> dict[str, str]:
     higher, unit = headline.get("higher_is_better"), headline["unit"]
     better = "higher" if higher is True else "lower" if higher is False else ""
     interval = _interval_text(_ends(group, headline["path"]), unit)
-    return HeadlineRow(name=headline["name"], text=headline["text"], interval=interval, better=better)
+    return {"name": headline["name"], "text": headline["text"], "interval": interval, "better": better}
 
 
-def _bar(group: Json, main: MainNumber | None) -> Bar:
+def _bar(group: Json, main: MainNumber | None) -> dict[str, Any]:
+    """The main number of the samples that have one value of an attribute.
+
+    `value` is the attribute's, `samples` and `scenarios` count them, `text` and `interval` are for readers; `width` of
+    the bar and both `ends` of the interval are percents of the longest bar, None where there is no number.
+    """
     value = None if main is None else finite(group["headlines"].get(main.path))
     ends = None if main is None else _ends(group, main.path)
     shown = None if main is None or ends is None else _percents(ends, main.limit)
-    return Bar(
-        value=UNKNOWN if group["value"] is None else group["value"],
-        samples=group["samples"],
-        scenarios=group["scenarios"],
-        text="–" if main is None else value_text(value, main.unit),
-        interval="" if main is None else _interval_text(ends, main.unit),
-        width=None if main is None or value is None else _percents([value], main.limit)[0],
-        ends=None if shown is None else (shown[0], shown[1]),
-    )
+    return {
+        "value": UNKNOWN if group["value"] is None else group["value"],
+        "samples": group["samples"],
+        "scenarios": group["scenarios"],
+        "text": "–" if main is None else value_text(value, main.unit),
+        "interval": "" if main is None else _interval_text(ends, main.unit),
+        "width": None if main is None or value is None else _percents([value], main.limit)[0],
+        "ends": shown,
+    }
 
 
 def _percents(values: Iterable[float], limit: float) -> list[float]:

@@ -36,7 +36,7 @@ from deepaccident_devkit.files import (
 )
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.pages import rendered, result_text
-from deepaccident_devkit.parallel import Places, run_batch
+from deepaccident_devkit.parallel import Engine, Places, run_batch
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.replay import recording_of, tried_replay
 from deepaccident_devkit.render.replay.replay import facts
@@ -46,6 +46,8 @@ from deepaccident_devkit.selection.fields import measures_of_moving_pairs
 from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 
@@ -205,8 +207,7 @@ def export_pages(
     bundles: Iterable[Path] = (),
     results: Iterable[Path] = (),
     scenarios: Iterable[RowArgument] | None = None,
-    workers: int | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> Path:
     """Write pages of some scenarios as files: a list, and for each a replay, its story, pairs, lead times and findings.
 
@@ -221,8 +222,7 @@ def export_pages(
         results: files or folders of results; those of a bundle join it. A replay shows the predictions of the first
             ones that tell of the scenario.
         scenarios: tokens or records, of which those that match are written, in this order; None for all.
-        workers: processes; None chooses by the number of scenarios.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Returns:
         The first page, `index.html`.
@@ -232,7 +232,7 @@ def export_pages(
         NotAvailableError: no scenario matches.
         FieldError, ChoiceError, TokenError: there is no such filter or scenario.
         ResultsError: bundles or results cannot be read.
-        WorkerError: a worker was killed, or cannot do the work.
+        WorkerError: as `parallel.Engine` says.
 
     Examples:
         >>> export_pages(da, "night", where=["time_of_day=Night", "collision=true"])  # doctest: +SKIP
@@ -243,7 +243,7 @@ def export_pages(
     models = _scored_models(bundles, results)
     filters = [*where, *([] if given is None else [f"token={','.join(given)}"])]
     with exported(target) as made:
-        _Pages(dataset, made, records, models).write(filters, workers=workers, progress=progress)
+        _Pages(dataset, made, records, models).write(filters, **how)
     return target / INDEX
 
 
@@ -294,12 +294,12 @@ class _Pages:
         self._dataset, self._folder, self._records, self._models = dataset, folder, records, models
         self._names = _folders(records)
 
-    def write(self, filters: Sequence[str], **how: Any) -> None:
+    def write(self, filters: Sequence[str], **how: Unpack[Engine]) -> None:
         """Write all pages, and what they show.
 
         Args:
             filters: by which the scenarios were found.
-            **how: of `run_batch`.
+            **how: as of `export_pages`.
         """
         items = [Work(token=token, folder=name, predictions=self._predictions(token)) for token, name in self._named]
         places = Places(reads=self._dataset.places, writes=(self._folder,))

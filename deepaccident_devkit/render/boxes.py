@@ -233,8 +233,7 @@ def _draw_small(boxes: Boxes, ax: Axes, colors: Sequence[str], *, filled: bool) 
 
 
 def _moving(boxes: Boxes) -> BoolArray:
-    moving: BoolArray = np.linalg.norm(boxes.velocity, axis=1) > 0  # False for NaN, an unknown speed
-    return moving
+    return np.asarray(np.linalg.norm(boxes.velocity, axis=1) > 0)  # False for NaN, an unknown speed
 
 
 def _write_ids(places: FloatArray, actor_ids: IntArray, ax: Axes, colors: Sequence[str]) -> None:

@@ -74,8 +74,7 @@ class MotionMaps(FrozenArrays):
         maps = getattr(self, name)
         if maps is None:
             raise ChoiceError(f"map: this prediction has only {', '.join(self.names)}, not {name}; give heads for it")
-        chosen: AnyArray = maps
-        return chosen
+        return np.asarray(maps)
 
     def longest(self, name: DrawnMap) -> float:
         """The length of a map's longest vector in all frames, in cells, at least 1; 1 for maps without vectors."""
@@ -163,8 +162,7 @@ def _found(
 ) -> AnyArray:
     """(T, H, W) the instances of one prediction, in its own orientation."""
     if output.instances is not None:
-        given: AnyArray = output.instances[number]
-        return given
+        return np.asarray(output.instances[number])
     if heads is None:  # only for the type checker: an output has one of them
         raise ChoiceError("prediction: has neither heads nor instances")
     return predict_instances(heads, post_processing).instance

@@ -65,8 +65,7 @@ def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str
 def label_ids(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[int]:
     """The label ids, in this sample, of boxes that may have CARLA's: the agent itself is −100."""
     own = dataset.get("agent", dataset.get("sample", sample)["agent_token"])["actor_id"]
-    ids: list[int] = np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist()
-    return ids
+    return list(np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist())
 
 
 def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:

@@ -76,8 +76,7 @@ class Sights(FrozenArrays):
     @property
     def own(self) -> BoolArray:
         """(N, A) whether the actor is the agent itself."""
-        own: BoolArray = self.boxes.actor_id[:, None] == self.actor
-        return own
+        return np.asarray(self.boxes.actor_id[:, None] == self.actor)
 
     @property
     def collides(self) -> BoolArray:
@@ -97,8 +96,7 @@ class Sights(FrozenArrays):
         if agent not in self.agents or not self.pair:
             return np.zeros(len(self.boxes), dtype=bool)
         column = self.agents.index(agent)
-        hidden: BoolArray = (self.collides | self.records) & ~self.seen[:, column] & ~self.own[:, column]
-        return hidden
+        return np.asarray((self.collides | self.records) & ~self.seen[:, column] & ~self.own[:, column])
 
 
 def sights(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: str = "ego") -> Sights:
@@ -150,11 +148,8 @@ def sights(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: 
 def sample_at(dataset: Dataset, moment: RowArgument) -> str:
     """Token of a sample, or of a frame's first sample; raises TokenError if `moment` is neither."""
     token = str(moment["token"]) if isinstance(moment, Mapping) else moment
-    if token.count("/") == _FRAME_SLASHES:
-        first: str = dataset.samples_of(token)[0]["token"]
-        return first
-    sample: str = dataset.get("sample", token)["token"]
-    return sample
+    is_frame = token.count("/") == _FRAME_SLASHES
+    return str((dataset.samples_of(token)[0] if is_frame else dataset.get("sample", token))["token"])
 
 
 VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "velocities", "visibility", "grid")
@@ -379,8 +374,7 @@ def _write_hidden(known: Sights, hidden: BoolArray, ax: Axes) -> None:
 
 
 def _draw_agents(known: Sights, ax: Axes) -> None:
-    for agent, place in zip(known.agents, known.place.tolist(), strict=True):
-        x, y = place
+    for agent, (x, y) in zip(known.agents, known.place.tolist(), strict=True):
         ax.plot(x, y, "*", color=AGENT_COLORS[agent], markeredgecolor="white", markersize=10, zorder=5)
     if known.ego in known.agents:
         x, y = known.place[known.agents.index(known.ego)].tolist()

@@ -163,7 +163,7 @@ def _comparison(request: Request) -> Response:
         marks=[(name, each.mark) for name, each in zip(_BETTER, told, strict=True) if each.mark],
         tests=tests,
         comparison=compared,
-        numbers=_sides(*told) if compared is None else [_tested(each) for each in _headlines(compared)],
+        numbers=_sides(*told) if compared is None else [_tested(each) for each in compared.numbers if each.headline],
         partly=not common and a.rows.keys() != b.rows.keys(),
         found=found,
         fault="" if differences is None else differences.error,
@@ -188,10 +188,6 @@ def _address(**chosen: object) -> str:
     return f"?{urlencode(given)}" if given else ""
 
 
-def _headlines(comparison: Comparison) -> list[ComparedNumber]:
-    return [each for each in comparison.numbers if each.headline is not None]
-
-
 def _tested(number: ComparedNumber) -> dict[str, str]:
     """A headline number of both, and whether its difference is real."""
     unit: Any = number.unit
@@ -209,7 +205,7 @@ def _tested(number: ComparedNumber) -> dict[str, str]:
 
 def _sides(a: Evaluated, b: Evaluated) -> list[dict[str, str]]:
     """The headline numbers of both, without tests."""
-    values = [{each.name: each.text for each in told.headlines} for told in (a, b)]
+    values = [{each["name"]: each["text"] for each in told.headlines} for told in (a, b)]
     names = list(dict.fromkeys(name for each in values for name in each))
     return [
         {"name": name, **{side: each.get(name, "–") for side, each in zip(_BETTER, values, strict=True)}}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, Final
@@ -28,7 +29,7 @@ from deepaccident_devkit.explore.pages import comparison, samples
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, with_slash
 from deepaccident_devkit.explore.pages.samples import model_of, models_of_task, rows_of, titles
 from deepaccident_devkit.explore.sample_lists import SampleChoices, listed
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, SPLITS
+from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
@@ -38,33 +39,19 @@ if TYPE_CHECKING:
     from deepaccident_devkit.explore.models import Model
 
 
-_USUAL_HORIZON: Final = 2.0
 _USUAL_VERSION: Final = "v1"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvaluateCommand:
-    """How results are evaluated.
-
-    Attributes:
-        text: the command, for a shell.
-        note: what the results lack of the samples, or have besides; empty if they have just these.
-    """
-
-    text: str
-    note: str
-
-
 def command_job(explorer: Explorer, model: Model, results: Results) -> Job:
-    """The work that gives the `EvaluateCommand` of results: it looks for the samples that they were made for."""
+    """The work that gives the `evaluate_command` of results: it looks for the samples that they were made for."""
+    return explorer.jobs.ask(
+        f"command {model.name}",
+        f"how {model.name} is evaluated",
+        lambda: evaluate_command(explorer.dataset, results, model.setup, f"{model.name}_bundle"),
+    )
 
-    def work() -> EvaluateCommand:
-        return evaluate_command(explorer.dataset, results, model.setup, f"{model.name}_bundle")
 
-    return explorer.jobs.ask(f"command {model.name}", f"how {model.name} is evaluated", work)
-
-
-def evaluate_command(dataset: Dataset, results: Results, setup: EvaluationSetup, out: str) -> EvaluateCommand:
+def evaluate_command(dataset: Dataset, results: Results, setup: EvaluationSetup, out: str) -> dict[str, str]:
     """The command that makes a bundle of results.
 
     Args:
@@ -72,6 +59,10 @@ def evaluate_command(dataset: Dataset, results: Results, setup: EvaluationSetup,
         results: of the task.
         setup: task and rules.
         out: the bundle's folder.
+
+    Returns:
+        `text`, the command for a shell; and `note`, what the results lack of the samples, or have besides: empty if
+        they have just these.
 
     Raises:
         NotAvailableError: the release has no labelled samples of the split that most of the results are of.
@@ -85,8 +76,7 @@ def evaluate_command(dataset: Dataset, results: Results, setup: EvaluationSetup,
     words += ["--version", dataset.version] if dataset.version != _USUAL_VERSION else []
     words += ["--results", str(results.path), *_selecting(setup, selection), "--protocol", setup.protocol]
     words += ["--allow-partial"] * (not found.is_complete) + ["--out", out]
-    note = "" if found.is_complete else replace(found, guess=None).to_text()
-    return EvaluateCommand(text=shlex.join(words), note=note)
+    return {"text": shlex.join(words), "note": "" if found.is_complete else replace(found, guess=None).to_text()}
 
 
 def split_of(dataset: Dataset, results: Results) -> str:
@@ -97,20 +87,14 @@ def split_of(dataset: Dataset, results: Results) -> str:
     return max(known, key=lambda name: known[name], default="val")
 
 
-def _selecting(setup: EvaluationSetup, selection: SampleSelection) -> list[str]:
-    """The options that choose the samples, without those that are the default."""
-    usual = default_selection(setup, selection.split, samples=selection.samples)
-    options: dict[str, Any] = {"split": selection.split}
-    if selection.samples != "evaluate":
-        options["samples"] = selection.samples
-    if selection.scope != usual.scope:
-        options["scope"] = selection.scope
-    if selection.agents is not None:
-        options["agents"] = ",".join(selection.agents)
-    horizon = selection.horizon if selection.samples == "evaluate" else setup.horizon
-    if abs(horizon - _USUAL_HORIZON) > FRAME_PERIOD / 2:
-        options["horizon"] = f"{horizon:g}"
-    return [word for name, value in options.items() for word in (f"--{name}", value)]
+def _selecting(setup: EvaluationSetup, selection: SampleSelection) -> Iterator[str]:
+    """The options that choose the samples."""
+    chosen = selection.choices()
+    if selection.samples == "all":  # which are those of all scenarios
+        del chosen["scope"]
+        chosen |= {} if setup.task == "detection" else {"horizon": f"{setup.horizon:g}"}
+    for name, value in chosen.items():
+        yield from (f"--{name}", ",".join(value) if name == "agents" else str(value))
 
 
 _WORST: Final = 12

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -72,13 +72,9 @@ def why_not(explorer: Explorer, model: Model, token: str) -> str:
         SampleLoader(explorer.dataset, model.results, model.setup)
     except EvaluationError as error:
         return str(error)
-    return _why_no_truth(explorer, token, needs_meta=_task(model) == "accident")
-
-
-def _why_no_truth(explorer: Explorer, token: str, *, needs_meta: bool) -> str:
     if not explorer.dataset.get("sample", token)["labelled"]:
         return "This sample has no label, so that there is no truth to compare with."
-    if needs_meta and explorer.dataset.get("scenario", scenario_of(token))["weather"] is None:
+    if _task(model) == "accident" and explorer.dataset.get("scenario", scenario_of(token))["weather"] is None:
         return "This scenario has no meta file, which names the colliding pair."
     return ""
 
@@ -187,8 +183,7 @@ def routes() -> list[Route]:
     return [
         Route("/model/{model}/samples", _samples),
         Route(f"/model/{{model}}/sample/{SAMPLE}", _sample),
-        Route(f"/model/{{model}}/sample/{SAMPLE}/above.png", _above),
-        Route(f"/model/{{model}}/sample/{SAMPLE}/cameras.png", _cameras),
+        Route(f"/model/{{model}}/sample/{SAMPLE}/{{kind}}.png", _picture),
     ]
 
 
@@ -279,10 +274,7 @@ def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, An
 
 def _remedy(model: Model) -> str:
     """Where the results were of a bundle that has none to show; empty if there are results."""
-    if model.results is not None or model.bundle is None:
-        return ""
-    path: str = model.bundle.summary["results"]["path"]
-    return path
+    return "" if model.results is not None or model.bundle is None else str(model.bundle.summary["results"]["path"])
 
 
 def place_in(tokens: Sequence[str], token: str) -> dict[str, Any] | None:
@@ -299,21 +291,13 @@ def place_in(tokens: Sequence[str], token: str) -> dict[str, Any] | None:
     }
 
 
-def _above(request: Request) -> Response:
-    return _picture(request, Shown(kind="above", size=_size(request)))
-
-
-def _cameras(request: Request) -> Response:
-    return _picture(request, Shown(kind="cameras", size=_size(request), ahead=asked_ahead(request)))
-
-
-def _picture(request: Request, shown: Shown) -> Response:
-    explorer, model = explorer_of(request), model_of(request)
+def _picture(request: Request) -> Response:
+    explorer, model, kind = explorer_of(request), model_of(request), request.path_params["kind"]
+    if kind not in get_args(Kind):
+        raise HTTPException(404)
+    size: Size = "half" if request.query_params.get("size") == "half" else "whole"
+    shown = Shown(kind=kind, size=size, ahead=asked_ahead(request) if kind == "cameras" else 0)
     return picture(picture_of(explorer, model, known_sample(request, model), shown), "png")
-
-
-def _size(request: Request) -> Any:
-    return "half" if request.query_params.get("size") == "half" else "whole"
 
 
 def asked_ahead(request: Request) -> int:

@@ -124,14 +124,6 @@ def part_context(dataset: Dataset, token: str, name: str) -> dict[str, Any]:
     return {"token": token, "missing": None, **context}
 
 
-def _story(dataset: Dataset, token: str) -> dict[str, Any]:
-    return {"text": describe(dataset, token).text}
-
-
-def _findings(dataset: Dataset, token: str) -> dict[str, Any]:
-    return {"findings": findings(dataset, token)}
-
-
 def _pairs(dataset: Dataset, token: str) -> dict[str, Any]:
     """Pairs that come near each other, the soonest collision first."""
     pairs = interactions(dataset, token).pairs
@@ -193,11 +185,11 @@ PARTS: Final[Mapping[str, str]] = {
 }
 """Part → its heading."""
 _CONTEXTS: Final[Mapping[str, Callable[[Dataset, str], dict[str, Any]]]] = {
-    "story": _story,
+    "story": lambda dataset, token: {"text": describe(dataset, token).text},
     "pairs": _pairs,
     "ledger": _ledger,
     "twins": _twins,
-    "findings": _findings,
+    "findings": lambda dataset, token: {"findings": findings(dataset, token)},
 }
 
 

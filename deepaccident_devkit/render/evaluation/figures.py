@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -63,13 +63,6 @@ samples are ranked by it; the others are shown only by time to impact."""
 _BY_TIME: Final = "time_to_impact"
 
 
-class Draw(Protocol):
-    """Renders on axes, and returns them."""
-
-    def __call__(self, *, ax: Axes) -> Axes:
-        """Draw."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFigure:
     """One figure of a run.
@@ -78,14 +71,14 @@ class RunFigure:
         name: of its file, without the ending.
         caption: what the figure shows, for the reader of the report.
         alt: the same in words and numbers, for readers who cannot see it.
-        draw: renders it on axes.
+        draw: renders it on `ax=`, axes.
         height: in inches.
     """
 
     name: str
     caption: str
     alt: str
-    draw: Draw
+    draw: Callable[..., Axes]
     height: float = PANEL[1]
 
 
@@ -231,13 +224,7 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
             alt="Chance that an accident's score is above another recording's at the same moment, by predictor.",
             draw=partial(warning.render_predictors, result),
         )
-        yield from _prevention(run)
-
-
-def _prevention(run: EvaluationRun) -> Iterator[RunFigure]:
-    if run.prevented is None:
-        return
-    for group in run.prevented.groups:
+    for group in () if run.prevented is None else run.prevented.groups:
         result = group.result
         for name in result.groups:
             yield RunFigure(
@@ -383,7 +370,6 @@ def _ranked(run: EvaluationRun) -> list[tuple[str, str]]:
 def _actors(prediction: MotionOutput, frame: int) -> BoolArray:
     """(H, W) which cells have an actor by the last prediction, in its own orientation."""
     if prediction.instances is not None:
-        cells: BoolArray = prediction.instances[-1, frame] > 0
-        return cells
+        return np.asarray(prediction.instances[-1, frame] > 0)
     background, actor = (prediction.heads or ())[-1].segmentation[frame]
     return np.asarray(actor > background)

@@ -121,7 +121,8 @@ def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes
         bars.append(_bar(group, headline, AGENT_COLORS.get(group.value or "", ESTIMATE_COLOR)))
     draw_bars(bars, ax, None if shown is None else LIMITS.get(shown.unit))
     set_title(ax, f"{number if shown is None else shown.name} by {broken.by.replace('_', ' ')}", fontsize="medium")
-    ax.set_xlabel("" if shown is None else _with_unit(shown))
+    unit = "" if shown is None or shown.unit == "share" else f" ({shown.unit})"
+    ax.set_xlabel("" if shown is None else f"{shown.name}{unit}")
     return ax
 
 
@@ -136,11 +137,6 @@ def _bar(group: Group[Any], headline: Headline | None, color: str) -> Bar:
         text="" if headline is None else headline.text(),
         color=color,
     )
-
-
-def _with_unit(headline: Headline) -> str:
-    """What an axis says of a headline number: `position_error (m)`."""
-    return headline.name if headline.unit == "share" else f"{headline.name} ({headline.unit})"
 
 
 _WIDTH: Final = 7.2

@@ -13,8 +13,6 @@ from deepaccident_devkit.evaluation.metrics.warning.prevention import (
     BUDGET,
     NOMINAL,
     SETTINGS,
-    OutcomeFigures,
-    PreventionFigures,
 )
 from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
@@ -47,7 +45,7 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     bars = [
         Bar(
             label=name,
-            value=_known(each.auc_ahead),
+            value=None if math.isnan(each.auc_ahead) else each.auc_ahead,
             text=f"{each.auc_ahead:.3f}",
             color=ESTIMATE_COLOR if name == "given" else TRUE_PLACE_COLOR,
         )
@@ -58,10 +56,6 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     ax.set(xlabel="chance that an accident's score is above\nanother recording's at the same moment")
     set_title(ax, f"Accidents distinguished from other recordings\n{group}", fontsize="medium")
     return ax
-
-
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value
 
 
 _MOST: Final = 60.0
@@ -119,7 +113,7 @@ def _points(ax: Axes, result: PreventedResult, group: str) -> None:
         "given": result.groups[group],
         **{key: of[group] for key, of in result.references.items()},
     }.items():
-        found = _nominal(each, result.alarms)
+        found = next(iter(getattr(each, result.alarms).values()))[NOMINAL]
         x, y = found.braking_seconds_per_minute, found.shares["avoided"]
         if math.isnan(x) or math.isnan(y):
             continue
@@ -127,9 +121,3 @@ def _points(ax: Axes, result: PreventedResult, group: str) -> None:
         ax.plot([x], [y], "o", color=ESTIMATE_COLOR if given else TRUE_PLACE_COLOR, markersize=5, zorder=3)
         chips.append((name, (x, y)))
     place_chips(ax, chips)
-
-
-def _nominal(figures: PreventionFigures, alarms: str) -> OutcomeFigures:
-    settings = next(iter(getattr(figures, alarms).values()))
-    found: OutcomeFigures = settings[NOMINAL]
-    return found

@@ -364,14 +364,10 @@ def draw_motion_side(
     half = outcome.extent / 2
     ax.plot(np.array([-1, 1, 1, -1, -1]) * half, np.array([-1, -1, 1, 1, -1]) * half, ":", color="black", linewidth=0.8)
     draw_legend_of_fills(ax, colors)
-    total = sum(np.unique(frame[frame > 0]).size for frame in _counted(maps, outcome.extent))
+    counted = maps.instance[(slice(None), *cells_within(maps.grid, outcome.extent))]
+    total = sum(np.unique(frame[frame > 0]).size for frame in counted)
     found = len(outcome.matches)
     return titled_from_above(ax, f"{side} instances: {found} {right}, {total - found} {wrong}", grid="grid" in shown)
-
-
-def _counted(maps: MotionMaps, extent: float) -> AnyArray:
-    counted: AnyArray = maps.instance[(slice(None), *cells_within(maps.grid, extent))]
-    return counted
 
 
 def _cut(maps: MotionMaps, frames: int) -> MotionMaps:

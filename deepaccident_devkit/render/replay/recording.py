@@ -75,8 +75,7 @@ class Recording(FrozenArrays):
 
     def places(self, xy: ArrayLike) -> list[Any]:
         """Places (…, 2) in world, metres, as the page has them: whole centimetres from the origin."""
-        places: list[Any] = np.rint((as_floats(xy) - self.origin) * 100).astype(np.int64).tolist()
-        return places
+        return list(np.rint((as_floats(xy) - self.origin) * 100).astype(np.int64).tolist())
 
 
 def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents) -> Recording:
@@ -96,7 +95,11 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
     record = dataset.scenario[dataset.getind("scenario", default_scenario(dataset) if scenario is None else scenario)]
     first = sample_token(record["token"], agents_of(dataset, record)[0], 1)
     chosen = cooperating_agents(dataset, first, agents)
-    contact, unknown = _contact(dataset, record)
+    contact, unknown = None, ""
+    try:
+        contact = collision(dataset, record)
+    except NotAvailableError as error:
+        unknown = str(error)
     return Recording(
         dataset=dataset,
         scenario=record,
@@ -105,13 +108,6 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
         unknown=unknown,
         origin=_origin(dataset, record, contact),
     )
-
-
-def _contact(dataset: Dataset, record: ScenarioRecord) -> tuple[Contact | None, str]:
-    try:
-        return collision(dataset, record), ""
-    except NotAvailableError as error:
-        return None, str(error)
 
 
 def _origin(dataset: Dataset, record: ScenarioRecord, contact: Contact | None) -> FloatArray:
@@ -197,7 +193,7 @@ def _actor(
     boxes, agent = tracks.boxes.select(rows), recorders.get(actor)
     category = boxes.category_names[0]
     length, width, height = np.rint(boxes.size[0] * 100).astype(int).tolist()
-    role = _role(recording, actor, agent)
+    role = "pair" if actor in recording.pair else "other" if agent is None else "agent"
     states: list[Any] = [None] * len(recording.frames)
     moments = zip(
         tracks.index[rows].tolist(),
@@ -224,13 +220,6 @@ def _actor(
         "states": states,
         "seen": seen.tolist(),
     }
-
-
-def _role(recording: Recording, actor: int, agent: str | None) -> str:
-    """`pair`, `agent` for an agent that does not collide, or `other`."""
-    if actor in recording.pair:
-        return "pair"
-    return "other" if agent is None else "agent"
 
 
 def _seen(recording: Recording, ids: IntArray) -> AnyArray:

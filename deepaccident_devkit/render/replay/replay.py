@@ -60,7 +60,9 @@ def notes(recording: Recording, pictures: CameraPictures, *, points: bool) -> li
         pictures: the cameras' pictures.
         points: whether there are LiDAR points.
     """
-    return [*_labels(recording), *_pictures(pictures), *_points(recording, points=points)]
+    title = short_name(recording.agents[0])
+    absent = f"No LiDAR points: no file of {title} is here; unpack the archive of lidar01."
+    return [*_labels(recording), *_pictures(pictures), *[absent] * (not points)]
 
 
 def served_notes(recording: Recording, files: CameraFiles) -> list[str]:
@@ -153,12 +155,6 @@ def _missing_pictures(found: int, wanted: int) -> Iterator[str]:
     elif found < wanted:
         missing = wanted - found
         yield f"{missing} of {wanted} camera files are missing in the release; unpack the cameras' archives."
-
-
-def _points(recording: Recording, *, points: bool) -> Iterator[str]:
-    if not points:
-        title = short_name(recording.agents[0])
-        yield f"No LiDAR points: no file of {title} is here; unpack the archive of lidar01."
 
 
 SIZE_LIMIT: Final = 15_000_000
@@ -288,7 +284,10 @@ def served_replay(
 
 
 def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles) -> tuple[dict[str, Any], Followed]:
-    """The page's data, except pictures and points, and the cameras that follow the pair."""
+    """The page's data, except pictures and points, and the cameras that follow the pair.
+
+    `automatic` has for each frame the number of the agent that shows the pair best, and for each agent its camera.
+    """
     contact = recording.contact
     moments = [
         recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}") for frame in recording.frames
@@ -315,15 +314,11 @@ def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles)
     seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
     there = {key: [path is not None for path in paths] for key, paths in files.items()}
     followed = follow_pair(recording, seen, there)
-    return data | {"automatic": _automatic(recording, followed)}, followed
-
-
-def _automatic(recording: Recording, followed: Followed) -> dict[str, Any]:
-    """For each frame the number of the agent that shows the pair best, and for each agent its camera."""
-    return {
+    data["automatic"] = {
         "agents": [recording.agents.index(agent) for agent in followed.agents],
         "cameras": [[camera_title(channel) for channel in followed.channels[agent]] for agent in recording.agents],
     }
+    return data, followed
 
 
 def _with_pictures(

@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -206,7 +206,7 @@ _Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
 def camera_files(recording: Recording) -> CameraFiles:
     """The image files of all cameras of the agents."""
     return {
-        (agent, channel): [_file(recording, agent, frame, channel) for frame in recording.frames]
+        (agent, channel): [path if path.exists() else None for path in _paths(recording, agent, channel)]
         for agent in recording.agents
         for channel in CAMERAS
     }
@@ -249,9 +249,9 @@ def camera_pictures(
     return CameraPictures(jpegs=jpegs, settings=settings, found=found, wanted=wanted)
 
 
-def _file(recording: Recording, agent: str, frame: int, channel: str) -> ReleasePath | None:
-    path = recording.dataset.sensor_path(f"{recording.sample(agent, frame)}/{channel}")
-    return path if path.exists() else None
+def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePath]:
+    samples = (recording.sample(agent, frame) for frame in recording.frames)
+    return (recording.dataset.sensor_path(f"{sample}/{channel}") for sample in samples)
 
 
 def _ladder(width: int | None, quality: int | None, frames: int) -> Iterator[PictureSettings]:
@@ -361,8 +361,5 @@ def cloud_text(recording: Recording, agent: str, frame: int) -> str | None:
     cells = np.floor(world / _CELL).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     kept = world[first[:: max(1, -(-len(first) // _MOST))]]
-    return _coded(np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1))
-
-
-def _coded(decimetres: Any) -> str:
+    decimetres = np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1)
     return base64.b64encode(decimetres.astype("<i2").tobytes()).decode("ascii")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.arrays import FloatArray, IntArray, as_floats
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.render.axes import axis_words, figure_or_new, with_light_grid
@@ -300,8 +300,7 @@ def _boxes(diff: TwinDiff, at: int, frame: int, rows: IntArray) -> Boxes:
 
 
 def _poses_at(diff: TwinDiff, at: int, frame: int) -> FloatArray:
-    poses: FloatArray = diff.poses[at, :, frame - 1]
-    return poses
+    return as_floats(diff.poses[at, :, frame - 1])
 
 
 def _color(diff: TwinDiff, row: int) -> str:

@@ -147,7 +147,7 @@ def test_what_cannot_be_counted_down_to_is_named(da_motion: DeepAccident) -> Non
 
 def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccident, accident: str) -> None:
     fig = detached_figure((12.8, 7.2))
-    draw_countdown(da, f"{accident}/004", AGENTS, None, fig)
+    draw_countdown(da, f"{accident}/004", agents=AGENTS, layers=None, fig=fig)
     agents = [ax.get_title().split(":")[0] for ax in fig.axes if ":" in ax.get_title()]
     assert agents == ["ego", "ego behind", "other", "other behind", "infrastructure"]
     assert ": 0.2 s to the impact other (car" in title_of(fig)
@@ -164,7 +164,7 @@ def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccide
 
 def test_an_agent_that_is_not_asked_for_has_an_empty_place(da: DeepAccident, accident: str) -> None:
     fig = detached_figure((12.8, 7.2))
-    draw_countdown(da, f"{accident}/006", ["infrastructure"], ["boxes"], fig)
+    draw_countdown(da, f"{accident}/006", agents=["infrastructure"], layers=["boxes"], fig=fig)
     assert sum(ax.axison for ax in fig.axes) == 3  # a camera, from above, speeds
     assert not any(ax.images for ax in fig.axes)
     assert ": the impact other (car" in title_of(fig)

@@ -57,7 +57,7 @@ def test_a_shared_moment_has_large_cameras_and_one_view_from_above_of_all_agents
     da: DeepAccident, frame: str, size: tuple[float, float], least: float
 ) -> None:
     fig = detached_figure(size)
-    draw_shared_moment(da, frame, AGENTS, None, fig)
+    draw_shared_moment(da, frame, agents=AGENTS, layers=None, fig=fig)
     fig.draw_without_rendering()
     *cameras, above = fig.axes
     assert [ax.get_title() for ax in cameras] == list(map(short_name, AGENTS))
