@@ -90,19 +90,14 @@ def render_sample_data(
         ax = axes_or_new(ax, (8, 5.4))
         colors, below = draw_camera(dataset, record, chosen, ax), 0.5
     else:
+        lidar = record["channel"] == LIDAR
+        chosen = layers_of(layers, ("points" if lidar else "bev", "boxes", "grid"), BEV_LAYERS)
         ax = axes_or_new(ax, (6, 7.2))
-        colors, below = _draw_from_above(dataset, record, layers, ax), 4.5
+        view = BevView(frame="lidar" if lidar else "ego")
+        colors, below = draw_bev(dataset, record["sample_token"], view, chosen, ax)[0], 4.5
     set_scene_title(ax, dataset, record["token"], record["channel"])
     draw_legend(ax, box_handles(colors), loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=below)
     return ax
-
-
-def _draw_from_above(dataset: Dataset, record: Any, layers: Iterable[Layer] | None, ax: Axes) -> frozenset[str]:
-    """A LiDAR's or a BEV camera's record of `render_sample_data`; returns the colours of its boxes."""
-    lidar = record["channel"] == LIDAR
-    default: tuple[Layer, ...] = ("points" if lidar else "bev", "boxes", "grid")
-    chosen = layers_of(layers, default, BEV_LAYERS)
-    return draw_bev(dataset, record["sample_token"], BevView(frame="lidar" if lidar else "ego"), chosen, ax)[0]
 
 
 def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Axes) -> frozenset[str]:

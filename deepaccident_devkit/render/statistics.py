@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.files import path_of
-from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
+from deepaccident_devkit.render.axes import detached_figure, figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import (
     CATEGORY_COLORS,
@@ -42,21 +42,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_PANEL = (7.0, 4.5)
-
-
-@in_own_settings
-def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
+def draw_counts(table: CountTable, ax: Axes) -> Axes:
     """Render a table of counts as horizontal bars, the splits one after the other, each with its sum and share.
 
     Args:
         table: of `DatasetStatistics.counts`.
-        ax: axes to render on; new ones if None.
+        ax: axes to render on.
 
     Returns:
         The axes.
     """
-    ax = axes_or_new(ax, _PANEL)
     values, whole = list(table.counts), table.total()
     starts = [0] * len(values)
     for group in GROUPS[1:]:
@@ -76,18 +71,16 @@ def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
     return with_light_grid(ax, "x")
 
 
-@in_own_settings
-def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
+def draw_histogram(histogram: Histogram, ax: Axes) -> Axes:
     """Render a histogram as bars, the splits on top of each other.
 
     Args:
         histogram: of `DatasetStatistics.histograms`.
-        ax: axes to render on; new ones if None.
+        ax: axes to render on.
 
     Returns:
         The axes; its title says how many values lie outside of the bins.
     """
-    ax = axes_or_new(ax, _PANEL)
     widths = [high - low for low, high in pairwise(histogram.edges)]
     _draw_stacked(histogram, ax, histogram.edges[:-1], widths, align="edge")
     unit = "" if histogram.unit == histogram.field else f" ({histogram.unit})"
@@ -98,19 +91,17 @@ def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     return with_light_grid(ax, "y")
 
 
-@in_own_settings
-def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None) -> Axes:
+def draw_quantiles(table: QuantileTable, field: str, ax: Axes) -> Axes:
     """Render a number's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %.
 
     Args:
         table: of `DatasetStatistics.quantiles`.
         field: which of its numbers.
-        ax: axes to render on; new ones if None.
+        ax: axes to render on.
 
     Returns:
         The axes.
     """
-    ax = axes_or_new(ax, _PANEL)
     rows = [row for row in table.quantiles if row.field == field and row.group == GROUPS[0] and row.values]
     draw_quantile_boxes({row.category: row for row in rows}, ax)
     ax.set(ylabel=f"{field} ({table.unit})", title=f"{field.capitalize()} by category", ylim=(0, None))
@@ -118,13 +109,12 @@ def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None
     return ax
 
 
-@in_own_settings
-def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
+def draw_angles(histogram: Histogram, ax: Axes) -> Axes:
     """Render a histogram of angles around a circle: 0° up, counter-clockwise.
 
     Args:
         histogram: in degrees.
-        ax: polar axes to render on; new ones if None.
+        ax: polar axes to render on.
 
     Returns:
         The axes.
@@ -134,8 +124,6 @@ def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     """
     from matplotlib.projections.polar import PolarAxes
 
-    if ax is None:
-        ax = figure_or_new(None, (5, 5)).add_subplot(projection="polar")
     if not isinstance(ax, PolarAxes):
         raise ChoiceError(f"ax: expected polar axes (projection='polar'), found {type(ax).__name__}")
     ax.set_theta_zero_location("N")
@@ -156,20 +144,18 @@ def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-@in_own_settings
-def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None = None) -> Axes:
+def draw_relative_positions(pairs: Sequence[CollisionPair], ax: Axes) -> Axes:
     """Render where the other actor of each colliding pair was at the last frame, seen from the first, forward up.
 
     Args:
         pairs: `DatasetStatistics.collisions`.
-        ax: axes to render on; new ones if None.
+        ax: axes to render on.
 
     Returns:
         The axes, in metres from the centre of the first: its forward up, its left to the left.
     """
     from matplotlib.patches import Rectangle
 
-    ax = axes_or_new(ax, (5.5, 5.5))
     for category in CATEGORIES:
         others = [pair for pair in pairs if pair.other_category == category]
         if others:
@@ -252,19 +238,19 @@ def _scenarios(statistics: DatasetStatistics, fig: Figure) -> None:
     heights = [2 + max(len(statistics.counts[name].counts) for name in row) for row in rows]
     axes = fig.subplot_mosaic([list(row) for row in rows], height_ratios=heights)
     for name, ax in axes.items():
-        render_counts(statistics.counts[name], ax=ax)
+        draw_counts(statistics.counts[name], ax=ax)
 
 
 def _ends(statistics: DatasetStatistics, fig: Figure) -> None:
     axes = fig.subplots(1, 2, width_ratios=(3, 2))
-    render_counts(statistics.counts["ends"], ax=axes[0])
+    draw_counts(statistics.counts["ends"], ax=axes[0])
     axes[0].set_xlabel("scenarios (designs 1–6: at traffic lights, 7–12: without)")
-    render_histogram(statistics.histograms["lengths"], ax=axes[1])
+    draw_histogram(statistics.histograms["lengths"], ax=axes[1])
 
 
 def _ego(statistics: DatasetStatistics, fig: Figure) -> None:
     axes = fig.subplots(1, 2, width_ratios=(3, 2))
-    render_histogram(statistics.histograms["ego_speeds"], ax=axes[0])
+    draw_histogram(statistics.histograms["ego_speeds"], ax=axes[0])
     sizes = statistics.quantiles["ego_sizes"]
     rows = [row for row in sizes.quantiles if row.group == GROUPS[0] and row.values]
     draw_quantile_boxes({row.field: row for row in rows}, axes[1])
@@ -274,33 +260,33 @@ def _ego(statistics: DatasetStatistics, fig: Figure) -> None:
 def _actors(statistics: DatasetStatistics, fig: Figure) -> None:
     axes = fig.subplots(2, 2)
     for name, ax in zip(("instances", "parked_instances", "annotations"), axes.flat, strict=False):
-        render_counts(statistics.counts[name], ax=ax)
-    render_histogram(statistics.histograms["actors"], ax=axes[1, 1])
+        draw_counts(statistics.counts[name], ax=ax)
+    draw_histogram(statistics.histograms["actors"], ax=axes[1, 1])
 
 
 def _boxes(statistics: DatasetStatistics, fig: Figure) -> None:
     axes = fig.subplot_mosaic([["length", "width"], ["height", "."]])
     for field, ax in axes.items():
-        render_quantiles(statistics.quantiles["box_sizes"], field, ax=ax)
+        draw_quantiles(statistics.quantiles["box_sizes"], field, ax=ax)
 
 
 def _motion(statistics: DatasetStatistics, fig: Figure) -> None:
     axes = fig.subplots(2, 2, width_ratios=(4, 5))
     for row, (name, field) in enumerate((("distances", "distance"), ("speeds", "speed"))):
-        render_histogram(statistics.histograms[name], ax=axes[row, 0])
-        render_quantiles(statistics.quantiles[f"{field}_quantiles"], field, ax=axes[row, 1])
+        draw_histogram(statistics.histograms[name], ax=axes[row, 0])
+        draw_quantiles(statistics.quantiles[f"{field}_quantiles"], field, ax=axes[row, 1])
 
 
 def _collisions(statistics: DatasetStatistics, fig: Figure) -> None:
     fig.suptitle("The colliding pair at the last frame: the other actor, seen from the first")
     angles = fig.add_subplot(1, 3, 1, projection="polar")
     bearings = fig.add_subplot(1, 3, 2, projection="polar")
-    render_angles(statistics.histograms["collision_angles"], ax=angles)
-    render_angles(statistics.histograms["collision_bearings"], ax=bearings)
+    draw_angles(statistics.histograms["collision_angles"], ax=angles)
+    draw_angles(statistics.histograms["collision_bearings"], ax=bearings)
     headings = "collisions by the other's heading: 0° the same,\n90° to the left, 180° head-on, 270° to the right"
     angles.set_xlabel(headings, fontsize=SMALLEST_TEXT)
     bearings.set_xlabel("collisions by where the other is:\n0° ahead, 90° left, 270° right", fontsize=SMALLEST_TEXT)
-    render_relative_positions(statistics.collisions, ax=fig.add_subplot(1, 3, 3))
+    draw_relative_positions(statistics.collisions, ax=fig.add_subplot(1, 3, 3))
 
 
 _Draw = Callable[[DatasetStatistics, "Figure"], None]

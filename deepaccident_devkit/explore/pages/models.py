@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, Final
 
@@ -187,26 +187,16 @@ def _results_context(explorer: Explorer, model: Model) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TruthCheck:
-    """A bundle's truth beside the release's.
+def truth_job(explorer: Explorer, name: str, bundle: Bundle) -> Job:
+    """The work that compares the truth of a model's bundle with the release's: it reads the files of all its scenarios.
 
-    Attributes:
-        checked: how many scenarios both have.
-        differing: those of them whose label, meta or calib files are not the same.
+    It gives `checked`, how many scenarios both have, and `differing`, those whose label, meta or calib files differ.
     """
 
-    checked: int
-    differing: tuple[str, ...]
-
-
-def truth_job(explorer: Explorer, name: str, bundle: Bundle) -> Job:
-    """The work that gives the `TruthCheck` of a model's bundle: it reads the files of all its scenarios."""
-
-    def work() -> TruthCheck:
+    def work() -> dict[str, Any]:
         stated = bundle.scenarios()
         found = scenario_hashes(explorer.dataset, stated, workers=explorer.workers)
         differing = tuple(token for token, each in found.items() if each.as_dict() != stated[token])
-        return TruthCheck(checked=len(found), differing=differing)
+        return {"checked": len(found), "differing": differing}
 
     return explorer.jobs.ask(f"truth {name}", f"whether the labels are those that {name} was evaluated with", work)

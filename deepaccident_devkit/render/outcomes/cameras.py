@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -130,11 +130,8 @@ def view_of(dataset: Dataset, sample: str, channel: str, ax: Axes) -> CameraView
     )
 
 
-_COLUMNS: Final = 3
-_WIDTH, _WIDER = 8.0, 3.35
-"""Inches: the width of a figure of one column, and what each other column adds."""
-_PANEL_WORDS, _WORDS = 0.3, 1.0
-"""Inches of height for the words of a panel, and for those of the figure."""
+_SIZE: Final = (14.7, 7.1125)
+"""Inches."""
 _RADIUS: Final = 1.0
 """Metres: of the rings and crosses around places."""
 _CORNERS: Final = 32
@@ -146,7 +143,7 @@ _FILL: Final = 0.3
 
 
 @in_own_settings
-def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, and which cameras and frame
+def render_outcome_in_cameras(
     dataset: Dataset,
     sample: RowArgument,
     prediction: Prediction | DetectedBoxes,
@@ -154,7 +151,6 @@ def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, an
     task: str | None = None,
     protocol: Any = None,
     label: MotionLabels | None = None,
-    cameras: Iterable[str] = CAMERAS,
     frame: int | None = None,
     fig: Figure | None = None,
 ) -> Figure:
@@ -176,29 +172,23 @@ def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, an
         task: as in `render_evaluation`.
         protocol: as in `render_evaluation`.
         label: as in `render_evaluation`.
-        cameras: channels, in any order: the panels are always in that of all pictures.
         frame: of motion: 0 or None for the present; later frames show where instances will be, in the image of now.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure, up to three panels in a row, the verdict above. An image that was not downloaded is a grey panel.
+        The figure, three panels in a row, the verdict above. An image that was not downloaded is a grey panel.
 
     Raises:
         TokenError: no such sample.
         NotAvailableError: the sample has no label, or its scenario no meta that an accident needs.
-        ChoiceError: no such task, protocol, camera or frame, or the prediction is not of this task.
+        ChoiceError: no such task, protocol or frame, or the prediction is not of this task.
         EvaluationError: the protocol cannot evaluate such a prediction.
     """
-    channels = _in_order(cameras)
     verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
     words = _frame_words(verdict, frame)
-    rows, columns = -(-len(channels) // _COLUMNS), min(_COLUMNS, len(channels))
-    width = _WIDTH + _WIDER * (columns - 1)
-    fig = figure_or_new(fig, (width, rows * (width / columns * 9 / 16 + _PANEL_WORDS) + _WORDS))
-    axes = fig.subplots(rows, columns, squeeze=False)
-    for ax in axes.flat[len(channels) :]:
-        ax.set_axis_off()
-    for channel, ax in zip(channels, axes.flat, strict=False):
+    fig = figure_or_new(fig, _SIZE)
+    axes = fig.subplot_mosaic([[*row] for row in CAMERA_GRID])
+    for channel, ax in axes.items():
         draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
     draw_legend(fig, _handles(verdict))
     set_scene_title(fig, dataset, verdict.sample, words, below=verdict.words)
@@ -237,14 +227,6 @@ def draw_outcome_in_camera(
     else:
         _draw_accidents(verdict, view)
     return ax
-
-
-def _in_order(cameras: Iterable[str]) -> list[str]:
-    given = [cameras] if isinstance(cameras, str) else [*cameras]
-    chosen = {choice("cameras", each, CAMERAS) for each in given}
-    if not chosen:
-        raise ChoiceError(f"cameras: expected some of {', '.join(CAMERAS)}, found none")
-    return [channel for row in CAMERA_GRID for channel in row if channel in chosen]
 
 
 def _checked_frame(verdict: Verdict, frame: int | None) -> int:

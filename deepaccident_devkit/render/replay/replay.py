@@ -34,8 +34,9 @@ from deepaccident_devkit.render.replay.recording import (
 from deepaccident_devkit.render.replay.road import road_picture
 from deepaccident_devkit.render.replay.sensors import (
     CameraFiles,
-    CameraPictures,
     Followed,
+    Jpegs,
+    PictureSettings,
     camera_files,
     camera_pictures,
     check_picture_settings,
@@ -52,17 +53,18 @@ def facts(recording: Recording) -> list[list[str]]:
     return [[name, value] for name, value in (*_setting(recording), *_ending(recording)) if value]
 
 
-def notes(recording: Recording, pictures: CameraPictures, *, points: bool) -> list[str]:
+def notes(recording: Recording, files: CameraFiles, settings: PictureSettings | None, *, points: bool) -> list[str]:
     """Sentences on what is missing in the release or was left out.
 
     Args:
         recording: the scenario and the agents.
-        pictures: the cameras' pictures.
+        files: of all cameras.
+        settings: how their pictures are written; None if there is none.
         points: whether there are LiDAR points.
     """
     title = short_name(recording.agents[0])
     absent = f"No LiDAR points: no file of {title} is here; unpack the archive of lidar01."
-    return [*_labels(recording), *_pictures(pictures), *[absent] * (not points)]
+    return [*_labels(recording), *_missing_pictures(files), *_pictures(files, settings), *[absent] * (not points)]
 
 
 def served_notes(recording: Recording, files: CameraFiles) -> list[str]:
@@ -72,8 +74,7 @@ def served_notes(recording: Recording, files: CameraFiles) -> list[str]:
         recording: the scenario and the agents.
         files: of all cameras.
     """
-    paths = [path for each in files.values() for path in each]
-    return [*_labels(recording), *_missing_pictures(sum(path is not None for path in paths), len(paths))]
+    return [*_labels(recording), *_missing_pictures(files)]
 
 
 def _setting(recording: Recording) -> Iterator[tuple[str, str]]:
@@ -128,13 +129,9 @@ def _labels(recording: Recording) -> Iterator[str]:
         yield f"Meta and the recording disagree: {'; '.join(recording.contact.disagreements)}."
 
 
-def _pictures(pictures: CameraPictures) -> Iterator[str]:
-    settings = pictures.settings
-    yield from _missing_pictures(pictures.found, pictures.wanted)
-    if not pictures.found:
-        return
+def _pictures(files: CameraFiles, settings: PictureSettings | None) -> Iterator[str]:
     if settings is None:
-        yield "No pictures: the file would be too large with them."
+        yield from ["No pictures: the file would be too large with them."] * any(map(any, files.values()))
         return
     yield f"Pictures are up to {settings.width} pixels wide, of JPEG quality {settings.quality}."
     if settings.every > 1:
@@ -149,12 +146,13 @@ def _pictures(pictures: CameraPictures) -> Iterator[str]:
         )
 
 
-def _missing_pictures(found: int, wanted: int) -> Iterator[str]:
+def _missing_pictures(files: CameraFiles) -> Iterator[str]:
+    paths = [path for each in files.values() for path in each]
+    found, wanted = sum(path is not None for path in paths), len(paths)
     if not found:
         yield f"No pictures: none of the {wanted} camera files is here; unpack the cameras' archives."
     elif found < wanted:
-        missing = wanted - found
-        yield f"{missing} of {wanted} camera files are missing in the release; unpack the cameras' archives."
+        yield f"{wanted - found} of {wanted} camera files are missing in the release; unpack the cameras' archives."
 
 
 SIZE_LIMIT: Final = 15_000_000
@@ -217,7 +215,7 @@ def render_replay(
     data["points"] = lidar_points(recording, recording.agents[0])
     free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
     free -= _BESIDE * len(recording.frames) * len(files)
-    pictures = camera_pictures(
+    settings, jpegs = camera_pictures(
         files,
         followed,
         math.inf if image_width and quality else free,
@@ -225,8 +223,8 @@ def render_replay(
         quality=quality,
         progress=progress,
     )
-    said = notes(recording, pictures, points=data["points"] is not None)
-    data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], pictures)}
+    said = notes(recording, files, settings, points=data["points"] is not None)
+    data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], jpegs)}
     title = f"Accident replay: {recording.scenario['name']}"
     write_bytes(target, replay_page(title, data).encode())
     return target
@@ -322,18 +320,14 @@ def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles)
 
 
 def _with_pictures(
-    recording: Recording, cameras: list[list[dict[str, Any]]], pictures: CameraPictures
+    recording: Recording, cameras: list[list[dict[str, Any]]], jpegs: Jpegs
 ) -> list[list[dict[str, Any]]]:
     """For each agent its cameras that have pictures, with one for each frame in base64; null where there is none."""
     shown = []
     for agent, entries in zip(recording.agents, cameras, strict=True):
-        jpegs = {camera_title(channel): each for channel, each in pictures.jpegs.get(agent, {}).items()}
+        own = {camera_title(channel): each for channel, each in jpegs.get(agent, {}).items()}
         shown.append(
-            [
-                {**entry, "pictures": [*map(_coded, jpegs[entry["title"]])]}
-                for entry in entries
-                if entry["title"] in jpegs
-            ]
+            [{**entry, "pictures": [*map(_coded, own[entry["title"]])]} for entry in entries if entry["title"] in own]
         )
     return shown
 

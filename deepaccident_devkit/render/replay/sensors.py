@@ -159,23 +159,6 @@ class PictureSettings:
         return min(self.width, max(self.width // 2, _LEAST_OTHER))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraPictures:
-    """The pictures of a scenario.
-
-    Attributes:
-        jpegs: agent → camera → one picture for each frame; None where there is none. Cameras without any are left out.
-        settings: how they are written; None if there is no picture.
-        found: how many of the wanted files exist.
-        wanted: how many files the pictures need.
-    """
-
-    jpegs: Mapping[str, Mapping[str, tuple[bytes | None, ...]]]
-    settings: PictureSettings | None
-    found: int
-    wanted: int
-
-
 def check_picture_settings(width: int | None, quality: int | None) -> None:
     """Raise ConfigError if pictures cannot have a width or quality; None stands for a value that fits."""
     if width is not None and width < _LEAST_WIDTH:
@@ -200,7 +183,8 @@ class _Image:
 CameraFiles = Mapping[tuple[str, str], Sequence[ReleasePath | None]]
 """Agent and camera → one file for each frame; None where there is none."""
 _Images = dict[tuple[str, str], list[_Image | None]]
-_Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
+Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
+"""Agent → camera → one picture for each frame; None where there is none. Cameras without any are left out."""
 
 
 def camera_files(recording: Recording) -> CameraFiles:
@@ -220,8 +204,8 @@ def camera_pictures(
     width: int | None = None,
     quality: int | None = None,
     progress: bool = False,
-) -> CameraPictures:
-    """The pictures of the agents' cameras.
+) -> tuple[PictureSettings | None, Jpegs]:
+    """The pictures of the agents' cameras, and how they are written; None if there is no picture.
 
     Args:
         files: of all cameras.
@@ -242,11 +226,8 @@ def camera_pictures(
         ]
         for (agent, channel), paths in files.items()
     }
-    wanted = sum(len(paths) for paths in files.values())
-    found = sum(path is not None for paths in files.values() for path in paths)
     frames = max(map(len, files.values()))
-    settings, jpegs = _fitting(images, limit, _ladder(width, quality, frames), progress=progress)
-    return CameraPictures(jpegs=jpegs, settings=settings, found=found, wanted=wanted)
+    return _fitting(images, limit, _ladder(width, quality, frames), progress=progress)
 
 
 def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePath]:
@@ -271,7 +252,7 @@ def _ladder(width: int | None, quality: int | None, frames: int) -> Iterator[Pic
 
 def _fitting(
     images: _Images, limit: float, ladder: Iterator[PictureSettings], *, progress: bool
-) -> tuple[PictureSettings | None, _Jpegs]:
+) -> tuple[PictureSettings | None, Jpegs]:
     probes = _probes(images)
     for settings in ladder if probes else ():
         kept = _kept(images, settings)
@@ -307,9 +288,9 @@ def _encoded(images: Sequence[_Image], settings: PictureSettings, *, progress: b
         return run_batch(work, images, executor=threads, label="pictures", progress=progress)
 
 
-def _by_agent(kept: _Images, encoded: Sequence[bytes]) -> _Jpegs:
+def _by_agent(kept: _Images, encoded: Sequence[bytes]) -> Jpegs:
     following = iter(encoded)
-    jpegs: _Jpegs = {}
+    jpegs: Jpegs = {}
     for (agent, channel), images in kept.items():
         pictures = tuple(None if image is None else next(following) for image in images)
         if any(pictures):

@@ -414,17 +414,6 @@ def command_of(site: Site, name: str) -> list[str]:
     return shlex.split(html.unescape(re.findall(r'<pre class="wide" id="command">(.*?)</pre>', page)[0]))
 
 
-def test_the_command_is_understood(site: Site) -> None:
-    words = command_of(site, "alone")
-    assert words[:3] == ["deepaccident", "evaluate", "accident"]
-    context = deepaccident.make_context("deepaccident", words[1:], resilient_parsing=False)
-    assert context is not None
-    assert words[words.index("--out") + 1] == "alone_bundle"
-    assert words[words.index("--split") + 1] == "train"
-    assert words[words.index("--protocol") + 1] == "boxes"
-    assert "--allow-partial" not in words
-
-
 def test_the_command_makes_a_bundle(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(

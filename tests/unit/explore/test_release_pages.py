@@ -23,12 +23,10 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.explore import Explorer, make_app
 from deepaccident_devkit.explore.pages import release
 from deepaccident_devkit.explore.pages.answers import part_of
-from deepaccident_devkit.explore.pages.release import ANY, TABS, chosen_findings, kinds_of
+from deepaccident_devkit.explore.pages.release import ANY, TABS, kinds_of
 from deepaccident_devkit.maps import kept_town_map, town_map, towns_of
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.statistics import dataset_statistics
-from deepaccident_devkit.tables import SEVERITIES, Finding
-from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.validation import CODES, ValidationReport, release_completeness, validate_release
 
 pytestmark = pytest.mark.slow
@@ -313,27 +311,6 @@ def test_a_release_without_findings_says_so(da: DeepAccident) -> None:
     assert "None: the files are all there, and agree." in Reader(da).ready("/release/findings").text
 
 
-def test_notes_are_hidden_unless_asked_for() -> None:
-    found = [
-        Finding(code=code, severity=severity, scenario=None, where="", what=code, remedy="")
-        for severity in SEVERITIES
-        for code in (f"{severity}-1", f"{severity}-2")
-    ]
-    codes = {
-        (severity, code): [each.code for each in chosen_findings(found, severity=severity, code=code)]
-        for severity in ("", "note", ANY)
-        for code in ("", "note-1")
-    }
-    assert codes == {
-        ("", ""): ["error-1", "error-2", "warning-1", "warning-2"],
-        ("", "note-1"): ["note-1"],
-        ("note", ""): ["note-1", "note-2"],
-        ("note", "note-1"): ["note-1"],
-        (ANY, ""): [each.code for each in found],
-        (ANY, "note-1"): ["note-1"],
-    }
-
-
 # statistics
 
 
@@ -479,9 +456,3 @@ def test_conventions_name_what_is_there(reader: Reader) -> None:
     assert [name for name in names if not hasattr(DeepAccident, name)] == []
     assert [row[0] for row in page.table("orientation")] == ["devkit", "released", "fiery"]
     assert {"world", "ego", "lidar"} < {row[0] for row in page.table("name")}
-
-
-def test_agents_are_named_in_order(da_partial: DeepAccident) -> None:
-    page = Reader(da_partial).ready("/release/files")
-    (heading,) = [table[0] for table in page.tables if table[0][0] == "kind"]
-    assert heading[1:6] == [agent.replace("_vehicle", "").replace("_", " ") for agent in AGENTS]

@@ -255,19 +255,27 @@ def test_scenarios_are_chosen_by_filters_and_by_name(da_b: DeepAccident, tmp_pat
     assert "There is no replay: not in this test" in shown(tmp_path / "c" / wanted[0] / "index.html").text
 
 
-def test_what_cannot_be_exported(da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "out"
+@pytest.mark.parametrize(
+    ("chosen", "error", "sentence"),
+    [
+        ({}, ConfigError, "6 scenarios match, and at most 3 are exported; narrow --where"),
+        ({"where": ["length>=1000"]}, NotAvailableError, "no scenario matches"),
+        ({"scenarios": []}, NotAvailableError, "no scenario matches"),
+        ({"scenarios": ["no such"]}, TokenError, "no such"),
+        ({"where": ["collision=true"], "workers": 0}, ChoiceError, "workers"),
+    ],
+)
+def test_what_cannot_be_exported(
+    da_b: DeepAccident,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    chosen: dict[str, Any],
+    error: type[Exception],
+    sentence: str,
+) -> None:
     monkeypatch.setattr(static_pages, "MOST", 3)
-    with pytest.raises(ConfigError, match="6 scenarios match, and at most 3 are exported; narrow --where"):
-        export_pages(da_b, out)
-    with pytest.raises(NotAvailableError, match="no scenario matches"):
-        export_pages(da_b, out, where=["length>=1000"])
-    with pytest.raises(NotAvailableError, match="no scenario matches"):
-        export_pages(da_b, out, scenarios=[])
-    with pytest.raises(TokenError, match="no such"):
-        export_pages(da_b, out, scenarios=["no such"])
-    with pytest.raises(ChoiceError, match="workers"):
-        export_pages(da_b, out, where=["collision=true"], workers=0)
+    with pytest.raises(error, match=sentence):
+        export_pages(da_b, tmp_path / "out", **chosen)
     assert [*tmp_path.iterdir()] == []
 
 

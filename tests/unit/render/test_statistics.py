@@ -8,7 +8,7 @@ from picture_texts import text_faults
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.statistics import STATISTICS_FIGURES, render_angles, render_statistics, save_statistics
+from deepaccident_devkit.render.statistics import STATISTICS_FIGURES, draw_angles, render_statistics, save_statistics
 from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
 
 pytestmark = pytest.mark.slow
@@ -22,7 +22,7 @@ def test_every_group_is_drawn_on_the_figure_given(statistics: DatasetStatistics)
     with pytest.raises(ChoiceError, match="expected one of scenarios, ends, ego"):
         render_statistics(statistics, "weather")
     with pytest.raises(ChoiceError, match="expected polar axes"):
-        render_angles(statistics.histograms["collision_angles"], ax=figure.add_subplot())
+        draw_angles(statistics.histograms["collision_angles"], ax=figure.add_subplot())
 
 
 @pytest.mark.parametrize("group", STATISTICS_FIGURES)
