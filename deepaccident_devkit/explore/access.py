@@ -23,6 +23,30 @@ _HOST: Final = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::([0-9]{1,5})
 _ROOT: Final = re.compile(r"(/[A-Za-z0-9._~!$&'()*+,=:@%-]+)*/?")
 PORTS: Final = {"http": 80, "https": 443}
 """Scheme → its own port."""
+Scope = MutableMapping[str, Any]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+"""An ASGI application."""
+_log = logging.getLogger(__name__)
+_LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+_METHODS: Final = ("GET", "HEAD")
+_TICKET_SECONDS: Final = 60.0
+_SAFE: Final = "!$&'()*+,;=:@/?%[]|^`{}-._~"
+"""What a relative address keeps as it is: all that cannot end it or a header."""
+HEADERS: Final[Mapping[bytes, bytes]] = {
+    b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    b"connect-src 'self'; frame-src 'self'; frame-ancestors 'self'; form-action 'self'; base-uri 'none'",
+    b"x-content-type-options": b"nosniff",
+    b"referrer-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+    b"cross-origin-opener-policy": b"same-origin",
+    b"x-frame-options": b"SAMEORIGIN",
+    b"permissions-policy": b"camera=(), microphone=(), geolocation=()",
+    b"cache-control": b"no-store",
+}
+"""Of every answer, unless the application has set another value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,33 +133,6 @@ class RootPath:
         if not self.path or [*map(unquote, own)] != [*map(unquote, given[: len(own)])]:
             return None
         return "".join(f"/{segment}" for segment in given[len(own) :])
-
-
-Scope = MutableMapping[str, Any]
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
-"""An ASGI application."""
-
-_log = logging.getLogger(__name__)
-_LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
-_METHODS: Final = ("GET", "HEAD")
-_TICKET_SECONDS: Final = 60.0
-_SAFE: Final = "!$&'()*+,;=:@/?%[]|^`{}-._~"
-"""What a relative address keeps as it is: all that cannot end it or a header."""
-HEADERS: Final[Mapping[bytes, bytes]] = {
-    b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    b"connect-src 'self'; frame-src 'self'; frame-ancestors 'self'; form-action 'self'; base-uri 'none'",
-    b"x-content-type-options": b"nosniff",
-    b"referrer-policy": b"same-origin",
-    b"cross-origin-resource-policy": b"same-origin",
-    b"cross-origin-opener-policy": b"same-origin",
-    b"x-frame-options": b"SAMEORIGIN",
-    b"permissions-policy": b"camera=(), microphone=(), geolocation=()",
-    b"cache-control": b"no-store",
-}
-"""Of every answer, unless the application has set another value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,6 +26,13 @@ _METHOD: Final = ("method", "name", "authors", "url", "date")
 """What results say of themselves, and is shown if they do."""
 Json = Mapping[str, Any]
 Ends = tuple[float, float]
+Row = Mapping[str, Any]
+_WHICH: Final = ("token", "scenario", "agent", "frame", "time_to_impact", "accident_visibility", "recording")
+"""Columns that say which sample it is."""
+_NUMBER: Final = r"[0-9]+(?:\.[0-9]+)?"
+_CASES: Final = ("tp", "fp", "fn")
+_ERRORS: Final = {"position_error": "places {:.1f} m off in sum", "time_error": "time {:.1f} s off"}
+"""Column → what is said of it."""
 
 
 class _Counted(msgspec.Struct):
@@ -223,15 +230,6 @@ def finite(value: object) -> float | None:
     except OverflowError:
         return None
     return number if math.isfinite(number) else None
-
-
-Row = Mapping[str, Any]
-_WHICH: Final = ("token", "scenario", "agent", "frame", "time_to_impact", "accident_visibility", "recording")
-"""Columns that say which sample it is."""
-_NUMBER: Final = r"[0-9]+(?:\.[0-9]+)?"
-_CASES: Final = ("tp", "fp", "fn")
-_ERRORS: Final = {"position_error": "places {:.1f} m off in sum", "time_error": "time {:.1f} s off"}
-"""Column → what is said of it."""
 
 
 def verdict(task: str, row: Row, *, whole: bool = False) -> str:

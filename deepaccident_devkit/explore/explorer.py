@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-
 SIZE: Final = (320, 180)
 """Pixels."""
 VERSION: Final = 1
@@ -45,6 +44,14 @@ _QUALITY: Final = 75
 _REACH: Final = 40.0
 """Metres from the middle of a picture from above to its left edge."""
 _FRONT: Final = "Camera_Front"
+_MOST_PICTURES: Final = 64_000_000
+"""Bytes of pictures in memory."""
+_MOST_REPLAYS: Final = 6
+"""Scenarios whose replay is in memory: some megabytes each."""
+DPI: Final = 80
+"""Pixels of rendered figures to an inch."""
+_MANY: Final = 64
+"""Scenarios from which on processes are worth their start."""
 
 
 def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
@@ -116,16 +123,6 @@ def _from_above(dataset: Dataset, record: ScenarioRecord, boxes: Boxes, pair: Bo
         color = actor_color(category, recorders.get(actor), collides=actor in pair.actor_id)
         pen.polygon([tuple(place) for place in outline.tolist()], fill=color)
     return picture
-
-
-_MOST_PICTURES: Final = 64_000_000
-"""Bytes of pictures in memory."""
-_MOST_REPLAYS: Final = 6
-"""Scenarios whose replay is in memory: some megabytes each."""
-DPI: Final = 80
-"""Pixels of rendered figures to an inch."""
-_MANY: Final = 64
-"""Scenarios from which on processes are worth their start."""
 
 
 class Explorer:

@@ -50,10 +50,27 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-
 MARK: Final = ".deepaccident_pages"
 """The file by which an export knows the folder of an earlier one: it names all files that were written."""
 _HEAD: Final = "DeepAccident pages"
+REPLAY: Final = "replay.html"
+THUMBNAIL: Final = "thumbnail.jpg"
+MOST: Final = 50
+"""Scenarios of an export: a replay takes some seconds and up to 15 MB."""
+INDEX: Final = "index.html"
+_STATIC: Final = "static"
+_ASSETS: Final = ("pages.css", "explore.css", "keys.js", "sorting.js")
+_FORESEEN: Final = ("motion", "accident")
+"""Results that a replay can show."""
+_POLICY: Final = (
+    "default-src 'none'; script-src 'self' file:; style-src 'self' file:; img-src 'self' file: data:; "
+    "frame-src 'self' file:; base-uri 'none'; form-action 'none'"
+)
+"""Nothing is loaded but the files of the export, from a disk or from a server."""
+_WHICH: Final = ("agent", "frame", "time_to_impact", "accident_visibility")
+"""Columns of an evaluation's rows that say which sample it is."""
+_SAME: Final = ("token", "scenario")
+"""Columns that are the same for all samples of a scenario, or stand in others."""
 
 
 def target_folder(folder: str | os.PathLike[str]) -> Path:
@@ -102,10 +119,6 @@ def _earlier(folder: Path) -> list[str]:
         return []
     head, *names = read_bytes(mark, "index").decode(errors="replace").splitlines()
     return [*names, MARK] if head == _HEAD else []
-
-
-REPLAY: Final = "replay.html"
-THUMBNAIL: Final = "thumbnail.jpg"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,24 +192,6 @@ def _part(dataset: Dataset, token: str, name: str) -> str:
 def _without_place(dataset: Dataset, text: str) -> str:
     """A text in which paths of the release's files begin in its folder: pages for others do not tell where it lies."""
     return text.replace(f"{dataset.dataroot}/", "")
-
-
-MOST: Final = 50
-"""Scenarios of an export: a replay takes some seconds and up to 15 MB."""
-INDEX: Final = "index.html"
-_STATIC: Final = "static"
-_ASSETS: Final = ("pages.css", "explore.css", "keys.js", "sorting.js")
-_FORESEEN: Final = ("motion", "accident")
-"""Results that a replay can show."""
-_POLICY: Final = (
-    "default-src 'none'; script-src 'self' file:; style-src 'self' file:; img-src 'self' file: data:; "
-    "frame-src 'self' file:; base-uri 'none'; form-action 'none'"
-)
-"""Nothing is loaded but the files of the export, from a disk or from a server."""
-_WHICH: Final = ("agent", "frame", "time_to_impact", "accident_visibility")
-"""Columns of an evaluation's rows that say which sample it is."""
-_SAME: Final = ("token", "scenario")
-"""Columns that are the same for all samples of a scenario, or stand in others."""
 
 
 def export_pages(

@@ -34,10 +34,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 _POSSIBLE: Final = tuple(layer for layer in LAYERS if layer in {"image", *BEV_LAYERS})
 _LETTERS_AN_INCH: Final = 12
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "bev", "points", "boxes", "grid")
+_LAYERS: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
+_CROPS: Final = ("first", "second", "third", "fourth")
+_MOSAIC: Final[list[Any]] = [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]]
+_FRAMES_A_SECOND: Final = round(1 / FRAME_PERIOD)
+_AROUND: Final = 10.0
+"""At least so many metres are rendered around the path, on each side."""
 
 
 @in_own_settings
@@ -149,14 +154,6 @@ def _facts(dataset: Dataset, record: dict[str, Any], own: Boxes) -> list[list[st
             f"impact: {countdown}{', with this actor' if record['is_collider'] else ''}",
         ],
     ]
-
-
-_LAYERS: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
-_CROPS: Final = ("first", "second", "third", "fourth")
-_MOSAIC: Final[list[Any]] = [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]]
-_FRAMES_A_SECOND: Final = round(1 / FRAME_PERIOD)
-_AROUND: Final = 10.0
-"""At least so many metres are rendered around the path, on each side."""
 
 
 @in_own_settings

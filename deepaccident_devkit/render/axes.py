@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 Layer = Literal[
     "image", "map", "bev", "points", "boxes", "ids", "velocities", "trajectories", "labels", "visibility", "grid"
 ]

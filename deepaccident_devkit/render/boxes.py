@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.collections import LineCollection
     from matplotlib.patches import PathPatch
 
-
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
 SMALLEST_MARK = 6.0
@@ -34,6 +33,10 @@ _EDGE, _CASING = 1.2, 1.2
 """Points: the width of an edge in an image, and by how much its casing is wider."""
 NEAREST_DRAWN = 0.1
 """Metres in front of the camera at which edges are cut off."""
+_FAINTEST: Final = 0.1
+"""How opaque the far end of a trail is."""
+_STANDING: Final = 0.5
+"""Metres: an actor that moves less has no trail."""
 
 
 @in_own_settings
@@ -247,12 +250,6 @@ def _write_ids(places: FloatArray, actor_ids: IntArray, ax: Axes, colors: Sequen
 def write_beside(ax: Axes, words: str, place: tuple[float, float], color: str) -> None:
     """Write a few words near a place in data coordinates, on a chip whose edge has the colour; not outside the axes."""
     place_chips(ax, [(words, place)], colors=[color])
-
-
-_FAINTEST: Final = 0.1
-"""How opaque the far end of a trail is."""
-_STANDING: Final = 0.5
-"""Metres: an actor that moves less has no trail."""
 
 
 def draw_trail(path: FloatArray, ax: Axes, color: str, **how: Any) -> LineCollection:

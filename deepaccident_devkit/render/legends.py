@@ -25,12 +25,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
 """A place in axes, so that nothing stands beside them."""
 _HANDLE: Final = 0.4
 """Inches of a sign and the blanks around it."""
 _SPACING: Final[Mapping[str, Any]] = {"handlelength": 1.2, "columnspacing": 1.0}
+_GID: Final = "missing"
+"""Marks the words in a figure, so that `missing_words` finds them."""
+_LETTERS: Final = 50
+"""In a line of a corner."""
 
 
 def box_handles(colors: Collection[str]) -> list[Artist]:
@@ -84,12 +87,6 @@ def draw_legend_of_fills(ax: Axes, colors: Mapping[str, str]) -> None:
 
     handles = [Patch(label=name, facecolor=(color, 0.4), edgecolor=color) for name, color in colors.items()]
     draw_legend(ax, handles, columns=1, **INSIDE)
-
-
-_GID: Final = "missing"
-"""Marks the words in a figure, so that `missing_words` finds them."""
-_LETTERS: Final = 50
-"""In a line of a corner."""
 
 
 def is_there(dataset: Dataset, sample_data: str) -> bool:

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 CAMERA_GRID: Final = (
     ("Camera_FrontLeft", "Camera_Front", "Camera_FrontRight"),
     ("Camera_BackLeft", "Camera_Back", "Camera_BackRight"),
@@ -64,6 +63,11 @@ _MOST_CAMERAS: Final = 0.66
 _BESIDE, _ABOUT = 0.9, 1.6
 """Inches of room for words beside panels, and above and below them."""
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
+CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
+_DEFAULT: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
+_FARTHEST: Final = 60.0
+"""Metres from the camera up to which boxes are rendered: farther ones are as small as the errors to be found."""
+_COLUMNS: Final = 3
 
 
 @in_own_settings
@@ -222,13 +226,6 @@ def _tallness(fig: Figure, columns: int) -> float:
     width = (fig.bbox.width / fig.dpi - _BESIDE) / columns
     height = fig.bbox.height / fig.dpi - _ABOUT
     return min(max(height / width - 9 / 16, 1.0), _TALLEST)
-
-
-CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
-_DEFAULT: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
-_FARTHEST: Final = 60.0
-"""Metres from the camera up to which boxes are rendered: farther ones are as small as the errors to be found."""
-_COLUMNS: Final = 3
 
 
 @in_own_settings

@@ -31,9 +31,12 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID, short_name
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
 DrawnMap = Literal["instance", "centerness", "offset", "flow"]
 MAPS: Final[tuple[DrawnMap, ...]] = get_args(DrawnMap)
+PALEST: Final = 0.22
+"""How opaque the last frame of a trail is; the present is 1."""
+_STILL: Final = 0.92
+"""Grey of what does not move."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -205,12 +208,6 @@ def _palette(highest: int, marked: Collection[int]) -> FloatArray:
         if 0 < identity <= highest:
             colors[identity] = to_rgb(COLLIDER_COLOR)
     return colors
-
-
-PALEST: Final = 0.22
-"""How opaque the last frame of a trail is; the present is 1."""
-_STILL: Final = 0.92
-"""Grey of what does not move."""
 
 
 def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[Layer], ax: Axes) -> Axes:

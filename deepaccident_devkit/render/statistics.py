@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError
-from deepaccident_devkit.files import path_of
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.render.axes import detached_figure, figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import (
@@ -40,6 +40,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+
+_DPI = 120
+_Draw = Callable[[DatasetStatistics, "Figure"], None]
+_WIDTH: Final = 10.7
+"""Inches of a page of A4 in landscape."""
 
 
 def draw_counts(table: CountTable, ax: Axes) -> Axes:
@@ -223,11 +228,6 @@ def _counting(axis: Axis) -> None:
     axis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
 
 
-PictureFormat = Literal["png", "pdf"]
-
-_DPI = 120
-
-
 def _scenarios(statistics: DatasetStatistics, fig: Figure) -> None:
     rows = [
         ("weathers", "weather_frames"),
@@ -289,9 +289,6 @@ def _collisions(statistics: DatasetStatistics, fig: Figure) -> None:
     draw_relative_positions(statistics.collisions, ax=fig.add_subplot(1, 3, 3))
 
 
-_Draw = Callable[[DatasetStatistics, "Figure"], None]
-_WIDTH: Final = 10.7
-"""Inches of a page of A4 in landscape."""
 _FIGURES: Mapping[str, tuple[tuple[float, float], _Draw]] = {
     "scenarios": ((_WIDTH, 10.5), _scenarios),
     "ends": ((_WIDTH, 5.5), _ends),
@@ -338,31 +335,21 @@ def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure 
     return fig
 
 
-def save_statistics(
-    statistics: DatasetStatistics,
-    folder: str | os.PathLike[str],
-    formats: Sequence[PictureFormat] = ("png", "pdf"),
-) -> list[Path]:
-    """Render all groups of statistics into files `<group>.<format>`, each atomically; earlier ones are replaced.
+def save_statistics(statistics: DatasetStatistics, folder: str | os.PathLike[str]) -> list[Path]:
+    """Render each group of statistics into `<group>.png` and `<group>.pdf`, atomically; earlier files are replaced.
 
     Args:
         statistics: of `dataset_statistics`.
         folder: where; it is made if it is not there.
-        formats: of the files, one or more of `png` and `pdf`.
 
     Returns:
         The files' paths.
 
     Raises:
-        ChoiceError: no such format.
-        ConfigError: `folder` is a file.
+        ConfigError: `folder` cannot be written to, or is a file.
     """
-    folder, formats = path_of(folder), [choice("formats", name, get_args(PictureFormat)) for name in formats]
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"{folder}: is a file; give a folder")
-    paths = []
+    folder, paths = writable_folder(folder), []
     for group, (size, _) in _FIGURES.items():
         figure = render_statistics(statistics, group, fig=detached_figure(size))
-        for name in [name for name in get_args(PictureFormat) if name in formats]:  # one order: the same bytes
-            paths += [write_figure(figure, folder / f"{group}.{name}", dpi=_DPI)]
+        paths += [write_figure(figure, folder / f"{group}.{kind}", dpi=_DPI) for kind in ("png", "pdf")]
     return paths

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import FrameRecord
 
-
 _CRF: Final = "20"
 """Quality of H.264: 0 loses nothing, 51 is the worst."""
 _WEBP_QUALITY: Final = 70
@@ -55,6 +54,11 @@ _COLORS: Final = 255
 """Colours of a GIF; one more is kept for pixels that do not change."""
 _LOOKED_AT: Final = 2_000_000
 """About so many pixels of all pictures are used to choose the palette."""
+OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
+"""Renders a moment, given by its record, on an empty figure; its result is not used."""
+_DPI: Final = 100.0
+_DPI_AT: Final = 1280 * 720
+"""A picture with so many pixels has `_DPI` pixels an inch; larger ones have more, so words keep their share."""
 
 
 def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
@@ -145,13 +149,6 @@ SUFFIXES: Final[Mapping[str, Callable[[Path, Iterable[ByteArray], float], None]]
     ".webp": _write_webp,
 }
 """Suffix → the writer of such files."""
-
-
-OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
-"""Renders a moment, given by its record, on an empty figure; its result is not used."""
-_DPI: Final = 100.0
-_DPI_AT: Final = 1280 * 720
-"""A picture with so many pixels has `_DPI` pixels an inch; larger ones have more, so words keep their share."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

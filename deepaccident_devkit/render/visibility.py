@@ -37,9 +37,27 @@ from deepaccident_devkit.v2x.cooperation import visible_actors
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
 _FRAME_SLASHES: Final = 2
 """The slashes of a frame's token, `<scenario_type>/<name>/<NNN>`; a sample's token has one more, for the agent."""
+VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "velocities", "visibility", "grid")
+_SHOWN: Final[tuple[Layer, ...]] = ("boxes", "visibility", "grid")
+_MARGIN: Final = 10.0
+"""Metres that are shown around the agents and the colliding pair."""
+_LEAST: Final = 25.0
+"""At least so many metres are shown to each side."""
+_SLOT: Final = 4.6
+"""Points from one agent's dot to the next."""
+_ABOVE: Final = 5.0
+"""Points from an actor's box up to its dots."""
+_ASIDE: Final = 0.006
+"""Of the width of the view that a line lies to the right of its way, so that two that look at each other have two."""
+_EDGE: Final = 0.05
+"""Of half the view, between its edge and a box that has made it larger."""
+_MIDDLE: Final = 0.36
+"""Of the table's width, about: where the middle of the picture is, with the names of actors on the left."""
+_MOST_ROWS: Final = 24
+_BRIGHT: Final = 0.3
+"""Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,27 +168,6 @@ def sample_at(dataset: Dataset, moment: RowArgument) -> str:
     token = str(moment["token"]) if isinstance(moment, Mapping) else moment
     is_frame = token.count("/") == _FRAME_SLASHES
     return str((dataset.samples_of(token)[0] if is_frame else dataset.get("sample", token))["token"])
-
-
-VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "velocities", "visibility", "grid")
-_SHOWN: Final[tuple[Layer, ...]] = ("boxes", "visibility", "grid")
-_MARGIN: Final = 10.0
-"""Metres that are shown around the agents and the colliding pair."""
-_LEAST: Final = 25.0
-"""At least so many metres are shown to each side."""
-_SLOT: Final = 4.6
-"""Points from one agent's dot to the next."""
-_ABOVE: Final = 5.0
-"""Points from an actor's box up to its dots."""
-_ASIDE: Final = 0.006
-"""Of the width of the view that a line lies to the right of its way, so that two that look at each other have two."""
-_EDGE: Final = 0.05
-"""Of half the view, between its edge and a box that has made it larger."""
-_MIDDLE: Final = 0.36
-"""Of the table's width, about: where the middle of the picture is, with the names of actors on the left."""
-_MOST_ROWS: Final = 24
-_BRIGHT: Final = 0.3
-"""Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
 
 
 @in_own_settings

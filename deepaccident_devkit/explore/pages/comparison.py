@@ -38,8 +38,9 @@ if TYPE_CHECKING:
     from deepaccident_devkit.explore.explorer import Explorer
     from deepaccident_devkit.explore.models import Model
 
-
 Better = Literal["", "a", "b"]
+_BETTER: Final = ("a", "b")
+_OTHER: Final = {"a": "b", "b": "a"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,10 +122,6 @@ def _compared(a: Model, b: Model) -> ComparedSamples:
     samples.sort(key=lambda each: -abs(each.difference))
     left_out = len(first.samples) + len(second.samples) - 2 * len(shared)
     return ComparedSamples(number=first.name, samples=tuple(samples), left_out=left_out)
-
-
-_BETTER: Final = ("a", "b")
-_OTHER: Final = {"a": "b", "b": "a"}
 
 
 def routes() -> list[Route]:

@@ -38,8 +38,13 @@ if TYPE_CHECKING:
     from deepaccident_devkit.explore.explorer import Explorer
     from deepaccident_devkit.explore.models import Model
 
-
 _USUAL_VERSION: Final = "v1"
+_WORST: Final = 12
+"""Samples on a model's page."""
+_FEW: Final = 64
+"""Scenarios up to which their files are read without being asked to."""
+_FIRST: Final = 3
+"""Headline numbers in the list of models."""
 
 
 def command_job(explorer: Explorer, model: Model, results: Results) -> Job:
@@ -95,14 +100,6 @@ def _selecting(setup: EvaluationSetup, selection: SampleSelection) -> Iterator[s
         chosen |= {} if setup.task == "detection" else {"horizon": f"{setup.horizon:g}"}
     for name, value in chosen.items():
         yield from (f"--{name}", ",".join(value) if name == "agents" else str(value))
-
-
-_WORST: Final = 12
-"""Samples on a model's page."""
-_FEW: Final = 64
-"""Scenarios up to which their files are read without being asked to."""
-_FIRST: Final = 3
-"""Headline numbers in the list of models."""
 
 
 def routes() -> list[Route]:

@@ -46,6 +46,11 @@ TABS: Final[Mapping[str, str]] = {
     "conventions": "Conventions",
 }
 """Last part of the address → its name for readers."""
+_SIZE: Final = (8.0, 8.0)
+ANY: Final = "any"
+"""The severity that stands for all, notes too."""
+_NONE: Final = "none"
+"""How an overview calls an unknown value."""
 
 
 def release_page(
@@ -89,9 +94,6 @@ def work_before(explorer: Explorer, job: Job) -> list[str]:
 def pages_of(explorer: Explorer) -> frozenset[str]:
     """The scenarios that have a page: of the index, and broken ones."""
     return frozenset(explorer.scenarios.row_of) | {problem.scenario for problem in explorer.dataset.problems}
-
-
-_SIZE: Final = (8.0, 8.0)
 
 
 def _maps(request: Request) -> Response:
@@ -155,10 +157,6 @@ def _map(request: Request) -> Response:
         return figure
 
     return picture(explorer.drawn(("map", town, found.looks, found.missing, found.damaged), draw), "png")
-
-
-ANY: Final = "any"
-"""The severity that stands for all, notes too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,10 +244,6 @@ def kinds_of(findings: Sequence[Finding]) -> list[Kind]:
 def _address(**chosen: str) -> str:
     """The parameters of the address with these choices."""
     return f"?{urlencode({name: value for name, value in chosen.items() if value})}"
-
-
-_NONE: Final = "none"
-"""How an overview calls an unknown value."""
 
 
 def routes() -> list[Route]:

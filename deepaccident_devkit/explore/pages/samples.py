@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from deepaccident_devkit.explore.explorer import Explorer
     from deepaccident_devkit.explore.models import Model
 
-
 Kind = Literal["above", "cameras"]
 Size = Literal["whole", "half"]
 _SIZES: Final[Mapping[tuple[Kind, Size], tuple[float, float]]] = {
@@ -43,6 +42,9 @@ _SIZES: Final[Mapping[tuple[Kind, Size], tuple[float, float]]] = {
 """Inches; half is for two side by side."""
 _OTHER_HORIZON: Final = 2.0
 """Seconds that the pictures of explicit accidents look ahead."""
+SAMPLE = "{type}/{name}/{agent}/{frame:int}"
+PAGE: Final = 60
+"""Samples on a page of the list."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,9 +74,13 @@ def why_not(explorer: Explorer, model: Model, token: str) -> str:
         SampleLoader(explorer.dataset, model.results, model.setup)
     except EvaluationError as error:
         return str(error)
+    return _why_no_truth(explorer, token, needs_meta=_task(model) == "accident")
+
+
+def _why_no_truth(explorer: Explorer, token: str, *, needs_meta: bool) -> str:
     if not explorer.dataset.get("sample", token)["labelled"]:
         return "This sample has no label, so that there is no truth to compare with."
-    if _task(model) == "accident" and explorer.dataset.get("scenario", scenario_of(token))["weather"] is None:
+    if needs_meta and explorer.dataset.get("scenario", scenario_of(token))["weather"] is None:
         return "This scenario has no meta file, which names the colliding pair."
     return ""
 
@@ -131,9 +137,6 @@ def _figure(explorer: Explorer, model: Model, token: str, shown: Shown) -> Any:
     return render_outcome_in_cameras(explorer.dataset, token, prediction, **how, frame=frame, fig=figure)
 
 
-SAMPLE = "{type}/{name}/{agent}/{frame:int}"
-
-
 def model_of(request: Request, name: str = "model") -> Model:
     """The model that a part of an address names; raises NotAvailableError."""
     given, models = request.path_params[name], explorer_of(request).models
@@ -172,10 +175,6 @@ def titles(jobs: Iterable[Job]) -> list[str]:
 def models_of_task(explorer: Explorer, task: str) -> list[Model]:
     """The evaluated models of a task."""
     return [each for each in explorer.models.values() if each.bundle is not None and each.setup.task == task]
-
-
-PAGE: Final = 60
-"""Samples on a page of the list."""
 
 
 def routes() -> list[Route]:

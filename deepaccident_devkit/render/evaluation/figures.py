@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 _DPI: Final = 160
 _ROW: Final = 0.38
 """The least height of a bar in inches."""
@@ -61,6 +60,10 @@ MAIN_NUMBERS: Final = {
 """Task → paths of the headline numbers that figures show by attribute. The first one is shown by all attributes, and
 samples are ranked by it; the others are shown only by time to impact."""
 _BY_TIME: Final = "time_to_impact"
+_EACH: Final = 3
+"""How many of the worst, and of the best, samples are shown."""
+_HEIGHT: Final = 5.6
+"""Inches of a view from above with its title."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -270,12 +273,6 @@ def _headline(task: str, result: object, path: str) -> Headline | None:
 def _listed(values: Iterable[tuple[str, float | None]]) -> str:
     known = [(name, None if value is None or math.isnan(value) else value) for name, value in values]
     return ", ".join(f"{name} {'–' if value is None else f'{value:.3g}'}" for name, value in known)
-
-
-_EACH: Final = 3
-"""How many of the worst, and of the best, samples are shown."""
-_HEIGHT: Final = 5.6
-"""Inches of a view from above with its title."""
 
 
 def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tuple[RunFigure, ...]:

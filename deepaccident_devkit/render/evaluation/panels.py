@@ -20,11 +20,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 PANEL: Final = (5.2, 3.0)
 """Width and height of one panel in inches: a page of a printed report has two rows of two."""
 _BESIDE: Final = 1.3
 """The axis' length in lengths of the longest bar, so that the words beside the bars have room."""
+UNKNOWN: Final = "not known"
+_WIDTH: Final = 7.2
+"""Inches, as the heights below."""
+_ROW: Final = 0.42
+_AXIS: Final = 0.6
+"""Of the ticks and the label of a panel."""
+_TITLE: Final = 0.9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,9 +104,6 @@ def draw_nothing(ax: Axes, why: str = "nothing to count") -> Axes:
     return ax
 
 
-UNKNOWN: Final = "not known"
-
-
 @in_own_settings
 def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes | None = None) -> Axes:
     """Render one headline number of each group as a bar, with its interval as a whisker.
@@ -137,14 +140,6 @@ def _bar(group: Group[Any], headline: Headline | None, color: str) -> Bar:
         text="" if headline is None else headline.text(),
         color=color,
     )
-
-
-_WIDTH: Final = 7.2
-"""Inches, as the heights below."""
-_ROW: Final = 0.42
-_AXIS: Final = 0.6
-"""Of the ticks and the label of a panel."""
-_TITLE: Final = 0.9
 
 
 @in_own_settings

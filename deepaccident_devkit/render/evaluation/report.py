@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
@@ -22,7 +21,7 @@ from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.evaluation.runs.prevention import prevention_tables
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
 from deepaccident_devkit.evaluation.runs.text import reading_notes
-from deepaccident_devkit.files import path_of, place_in, write_bytes
+from deepaccident_devkit.files import place_in, writable_folder, write_bytes
 from deepaccident_devkit.pages import document, result_text, scalar
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.colors import page_style
@@ -42,6 +41,8 @@ _COUNTED: Final = ("thresholds", "truths", "detections")
 """What is known of a class without true boxes."""
 _SHOWN_META: Final = ("method", "name", "authors", "url", "date")
 """Fields that results give about themselves and that are shown at the top, if there are any."""
+REPORT_FILE: Final = "report.html"
+FIGURES_FOLDER: Final = "figures"
 
 
 def report_context(run: EvaluationRun) -> dict[str, Any]:
@@ -185,10 +186,6 @@ def _share(value: float | None) -> str:
     return "–" if value is None else f"{value:.3f}"
 
 
-REPORT_FILE: Final = "report.html"
-FIGURES_FOLDER: Final = "figures"
-
-
 def save_report(
     run: EvaluationRun,
     folder: str | os.PathLike[str],
@@ -211,12 +208,10 @@ def save_report(
         The report's path.
 
     Raises:
-        ConfigError: the folder is a file.
+        ConfigError: the folder cannot be written to, or is a file.
         OutputFolderError: its `figures` is a link.
     """
-    target = path_of(folder)
-    if target.exists() and not target.is_dir():
-        raise ConfigError(f"{target}: is a file; give a folder")
+    target = writable_folder(folder)
     drawn = [*run_figures(run)]
     if dataset is not None and results is not None:
         drawn += sample_figures(run, dataset, results)

@@ -26,6 +26,9 @@ from deepaccident_devkit.render.titles import set_title
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_MOST: Final = 60.0
+"""Braking seconds a minute."""
+
 
 @in_own_settings
 def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> Axes:
@@ -56,10 +59,6 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     ax.set(xlabel="chance that an accident's score is above\nanother recording's at the same moment")
     set_title(ax, f"Accidents distinguished from other recordings\n{group}", fontsize="medium")
     return ax
-
-
-_MOST: Final = 60.0
-"""Braking seconds a minute."""
 
 
 @in_own_settings

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -37,9 +37,7 @@ from deepaccident_devkit.render.styles import in_own_settings
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
 ACCIDENT_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "trajectories", "ids", "grid")
-_ACCIDENT_SHOWN: Final[tuple[Layer, ...]] = ("boxes", "trajectories", "grid")
 _LEAST: Final = 20.0
 _MOST: Final = 60.0
 """Metres around an accident that are shown, at least and at most."""
@@ -47,6 +45,20 @@ _MARK: Final = (-7.0, -7.0, 7.0, 7.0)
 """Points around circles, crosses and the lines between them that no words cover: left, low, right and high."""
 FORESEEN_COLOR: Final = "black"
 """Whether it is right is what the picture shows."""
+DETECTION_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "ids", "grid")
+WINDOW: Final = 50.0
+"""Metres around the agent that are shown."""
+DASHED: Final = (0, (2, 1))
+"""The lines around true boxes and instances that are missed."""
+Side = Literal["true", "predicted"]
+MOTION_LAYERS: Final[tuple[Layer, ...]] = ("labels", "trajectories", "ids", "grid")
+_RIGHT, _WRONG, _UNCOUNTED = 1, 2, 3
+_WORDS: Final[dict[Side, tuple[str, str]]] = {"true": ("found", "missed"), "predicted": ("right", "false")}
+
+
+def layers_but_ids(given: Iterable[Layer] | None, possible: Sequence[Layer]) -> frozenset[Layer]:
+    """The layers to render, by default all of the possible ones but `ids`. Raises ChoiceError."""
+    return layers_of(given, [layer for layer in possible if layer != "ids"], possible)
 
 
 @in_own_settings
@@ -71,7 +83,7 @@ def draw_accident_outcome(
     Raises:
         ChoiceError: no such layer.
     """
-    shown = layers_of(layers, _ACCIDENT_SHOWN, ACCIDENT_LAYERS)
+    shown = layers_but_ids(layers, ACCIDENT_LAYERS)
     ax = axes_or_new(ax, (6, 6.4))
     if truth is not None:
         _draw_actors(truth, compared, shown, ax)
@@ -182,14 +194,6 @@ def _look_at(compared: ComparedAccidents, ax: Axes) -> None:
     ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
 
 
-DETECTION_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "ids", "grid")
-_DETECTION_SHOWN: Final[tuple[Layer, ...]] = ("boxes", "grid")
-WINDOW: Final = 50.0
-"""Metres around the agent that are shown."""
-DASHED: Final = (0, (2, 1))
-"""The lines around true boxes and instances that are missed."""
-
-
 @in_own_settings
 def draw_detection_outcome(
     prediction: DetectedBoxes,
@@ -217,7 +221,7 @@ def draw_detection_outcome(
     Raises:
         ChoiceError: no such protocol, threshold or layer.
     """
-    shown = layers_of(layers, _DETECTION_SHOWN, DETECTION_LAYERS)
+    shown = layers_but_ids(layers, DETECTION_LAYERS)
     matches = detection_matches(prediction, truth, protocol, threshold)
     ax = axes_or_new(ax, (6, 6.4))
     if "boxes" in shown:
@@ -265,13 +269,6 @@ def _draw_offsets(detected: Boxes, truth: Boxes, matches: DetectionMatches, ax: 
 
     ends = detected.center[matches.detection, :2], truth.center[matches.truth, :2]
     ax.add_collection(LineCollection(list(np.stack(ends, axis=1)), colors="black", linewidths=1.0, zorder=4))
-
-
-Side = Literal["true", "predicted"]
-MOTION_LAYERS: Final[tuple[Layer, ...]] = ("labels", "trajectories", "ids", "grid")
-_MOTION_SHOWN: Final[tuple[Layer, ...]] = ("labels", "trajectories", "grid")
-_RIGHT, _WRONG, _UNCOUNTED = 1, 2, 3
-_WORDS: Final[dict[Side, tuple[str, str]]] = {"true": ("found", "missed"), "predicted": ("right", "false")}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -354,7 +351,7 @@ def draw_motion_side(
     Raises:
         ChoiceError: no such layer.
     """
-    shown = layers_of(layers, _MOTION_SHOWN, MOTION_LAYERS)
+    shown = layers_but_ids(layers, MOTION_LAYERS)
     ax = axes_or_new(ax, (6, 6.4))
     maps = outcome.true if side == "true" else outcome.predicted
     right, wrong = _WORDS[side]

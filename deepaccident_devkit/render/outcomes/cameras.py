@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 _POST: Final = 1.5
 """Metres: the height of the posts at places, since rings far away are flat."""
 _MARK: Final = (-6.0, -6.0, 6.0, 6.0)
@@ -52,6 +51,16 @@ _CASING: Final = 1.4
 """Points by which the casing of a line is wider."""
 CASINGS: Final = {OUTCOME_COLORS["missed"]: "black"}
 """Edges around lines that are pale; others have white edges."""
+_SIZE: Final = (14.7, 7.1125)
+"""Inches."""
+_RADIUS: Final = 1.0
+"""Metres: of the rings and crosses around places."""
+_CORNERS: Final = 32
+"""Of a ring."""
+_MISSING: Final = (-58.0, -48.0, 58.0, 0.0)
+"""Points around the middle of a panel's upper edge, where words about a missing image are: left, low, right, high."""
+_FILL: Final = 0.3
+"""How opaque the ground of instances is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,18 +137,6 @@ def view_of(dataset: Dataset, sample: str, channel: str, ax: Axes) -> CameraView
         ground=-POLE_HEIGHT if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE else 0.0,
         ax=ax,
     )
-
-
-_SIZE: Final = (14.7, 7.1125)
-"""Inches."""
-_RADIUS: Final = 1.0
-"""Metres: of the rings and crosses around places."""
-_CORNERS: Final = 32
-"""Of a ring."""
-_MISSING: Final = (-58.0, -48.0, 58.0, 0.0)
-"""Points around the middle of a panel's upper edge, where words about a missing image are: left, low, right, high."""
-_FILL: Final = 0.3
-"""How opaque the ground of instances is."""
 
 
 @in_own_settings

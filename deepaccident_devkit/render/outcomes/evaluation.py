@@ -31,7 +31,7 @@ from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, Prediction, checked_prediction
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels
-from deepaccident_devkit.render.axes import Layer, figure_or_new, layers_of, settled, titled_from_above
+from deepaccident_devkit.render.axes import Layer, figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
@@ -47,6 +47,7 @@ from deepaccident_devkit.render.outcomes.above import (
     draw_detection_outcome,
     draw_motion_side,
     draw_true,
+    layers_but_ids,
     motion_outcome,
     verdict_words,
 )
@@ -60,10 +61,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 Judged: TypeAlias = MotionOutput | list[Accident] | DetectedBoxes
 _RELEASED: Final = MotionLabelConfig()
 """Half a second from frame to frame, two seconds ahead."""
+_POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
+    "motion": MOTION_LAYERS,
+    "accident": ACCIDENT_LAYERS,
+    "detection": DETECTION_LAYERS,
+}
+_SIZE: Final = (12.4, 6.9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -230,14 +236,6 @@ def _label(dataset: Dataset, token: str, given: Prediction, protocol: str | None
     return motion_labels(dataset, token, config)
 
 
-_POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
-    "motion": MOTION_LAYERS,
-    "accident": ACCIDENT_LAYERS,
-    "detection": DETECTION_LAYERS,
-}
-_SIZE: Final = (12.4, 6.9)
-
-
 @in_own_settings
 def render_evaluation(
     dataset: Dataset,
@@ -279,8 +277,7 @@ def render_evaluation(
         EvaluationError: the protocol cannot evaluate such a prediction.
     """
     given, chosen = judged_as(prediction, task)
-    possible = _POSSIBLE[chosen]
-    shown = layers_of(layers, [layer for layer in possible if layer != "ids"], possible)
+    shown = layers_but_ids(layers, _POSSIBLE[chosen])
     verdict = sample_verdict(dataset, sample, given, task=chosen, protocol=protocol, label=label)
     fig = figure_or_new(fig, _SIZE)
     left, right = fig.subplots(1, 2)

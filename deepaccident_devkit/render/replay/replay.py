@@ -47,6 +47,12 @@ from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
 from deepaccident_devkit.v2x import Agents
 
+SIZE_LIMIT: Final = 15_000_000
+"""The most bytes of a page, so that it can be sent by mail."""
+_BASE64: Final = 4 / 3
+_BESIDE: Final = 8
+"""Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
+
 
 def facts(recording: Recording) -> list[list[str]]:
     """Names and values of the facts about a scenario and its end; unknown values are left out."""
@@ -153,13 +159,6 @@ def _missing_pictures(files: CameraFiles) -> Iterator[str]:
         yield f"No pictures: none of the {wanted} camera files is here; unpack the cameras' archives."
     elif found < wanted:
         yield f"{wanted - found} of {wanted} camera files are missing in the release; unpack the cameras' archives."
-
-
-SIZE_LIMIT: Final = 15_000_000
-"""The most bytes of a page, so that it can be sent by mail."""
-_BASE64: Final = 4 / 3
-_BESIDE: Final = 8
-"""Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
 
 
 def render_replay(

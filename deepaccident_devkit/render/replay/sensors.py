@@ -32,6 +32,31 @@ _LARGE: Final = 0.1
 """Share of the image's width from which on the size of an actor matters less."""
 _LAYERS: Final = as_floats([1, 2, 3]) / 3
 """Sizes of the nested boxes at whose corners an actor is looked for; 1 is the actor's own."""
+FRONT: Final = CAMERAS[0]
+_LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
+"""Width in pixels and JPEG quality; the first pair that fits is taken."""
+_WIDTHS: Final = (960, 800, 640, 560, 480, 400, 320, 256)
+_QUALITIES: Final = (80, 70, 60, 50, 40, 30)
+"""The widths to try if the quality is given, and the qualities to try if the width is given."""
+_OTHERS: Final = (1, 2, 2, 2, 4)
+"""For each step of a ladder, one of how many frames has a picture of the other cameras; the last is for the rest."""
+_LEAST_OTHER: Final = 256
+"""Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this."""
+_PROBED: Final = 12
+"""The number of pictures from which the size of all is estimated."""
+_QUALITY_RANGE: Final = (1, 95)
+_LEAST_WIDTH: Final = 32
+_CELL: Final = 0.4
+"""Metres: side of a square; of the points in it one is kept."""
+_MOST: Final = 1500
+_LEAST_HEIGHT: Final = 0.3
+"""Metres above the ground: lower points are on the road."""
+_GROUND: Final = 5.0
+"""Percentile of the points' heights that counts as the ground: the infrastructure's ego frame is not on the ground."""
+CameraFiles = Mapping[tuple[str, str], Sequence[ReleasePath | None]]
+"""Agent and camera → one file for each frame; None where there is none."""
+Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
+"""Agent → camera → one picture for each frame; None where there is none. Cameras without any are left out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,29 +139,6 @@ def _steady(scores: AnyArray) -> list[int]:
     return path[::-1]
 
 
-FRONT: Final = CAMERAS[0]
-_LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
-"""Width in pixels and JPEG quality; the first pair that fits is taken."""
-_WIDTHS: Final = (960, 800, 640, 560, 480, 400, 320, 256)
-_QUALITIES: Final = (80, 70, 60, 50, 40, 30)
-"""The widths to try if the quality is given, and the qualities to try if the width is given."""
-_OTHERS: Final = (1, 2, 2, 2, 4)
-"""For each step of a ladder, one of how many frames has a picture of the other cameras; the last is for the rest."""
-_LEAST_OTHER: Final = 256
-"""Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this."""
-_PROBED: Final = 12
-"""The number of pictures from which the size of all is estimated."""
-_QUALITY_RANGE: Final = (1, 95)
-_LEAST_WIDTH: Final = 32
-_CELL: Final = 0.4
-"""Metres: side of a square; of the points in it one is kept."""
-_MOST: Final = 1500
-_LEAST_HEIGHT: Final = 0.3
-"""Metres above the ground: lower points are on the road."""
-_GROUND: Final = 5.0
-"""Percentile of the points' heights that counts as the ground: the infrastructure's ego frame is not on the ground."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PictureSettings:
     """How pictures are written: those of the front cameras, and of the cameras while they follow the pair, are larger.
@@ -180,11 +182,7 @@ class _Image:
     large: bool
 
 
-CameraFiles = Mapping[tuple[str, str], Sequence[ReleasePath | None]]
-"""Agent and camera → one file for each frame; None where there is none."""
 _Images = dict[tuple[str, str], list[_Image | None]]
-Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
-"""Agent → camera → one picture for each frame; None where there is none. Cameras without any are left out."""
 
 
 def camera_files(recording: Recording) -> CameraFiles:

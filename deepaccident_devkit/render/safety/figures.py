@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 AVOIDABILITY_SIZE: Final = (10.7, 6.4)
 """Inches: the width of a page of A4 in landscape."""
 _LINES: Final = ("-", "--", ":", "-.")
@@ -53,6 +52,17 @@ _ROWS: Final[Mapping[str, Callable[[OutcomeShares], FloatArray]]] = {
     "mean speed between the\ntwo at the contact (m/s)": lambda shares: shares.relative_speed,
 }
 """Label of a row of panels → (L, K) values."""
+LEAD_TIME_SIZE: Final = (10.7, 5.6)
+"""Inches: the width of a page of A4 in landscape."""
+_DOT: Final = 5.5
+"""Points."""
+TWINS_SIZE: Final = (10.7, 8.6)
+"""Inches: the width of a page of A4 in landscape."""
+_DASHED: Final = (0, (3, 2))
+_LEAST, _MOST = 15.0, 60.0
+"""Metres that are shown to each side of the middle of the colliders' places, at least and at most."""
+_MARGIN: Final = 6.0
+"""Metres around them."""
 
 
 @in_own_settings
@@ -112,12 +122,6 @@ def _draw(ax: Axes, shares: OutcomeShares, values: FloatArray) -> None:
         )
     ax.set_xlim(0, float(np.max(shares.leads[enough], initial=0.1)))
     with_light_grid(ax, "both")
-
-
-LEAD_TIME_SIZE: Final = (10.7, 5.6)
-"""Inches: the width of a page of A4 in landscape."""
-_DOT: Final = 5.5
-"""Points."""
 
 
 @in_own_settings
@@ -191,15 +195,6 @@ def _draw_bars(ax: Axes, means: Sequence[MeanTime], colors: Sequence[str]) -> No
 
 def _share_text(value: float | None, total: float) -> str:
     return f"\n{100 * value / total:.0f} %" if value is not None and total > 0 else ""
-
-
-TWINS_SIZE: Final = (10.7, 8.6)
-"""Inches: the width of a page of A4 in landscape."""
-_DASHED: Final = (0, (3, 2))
-_LEAST, _MOST = 15.0, 60.0
-"""Metres that are shown to each side of the middle of the colliders' places, at least and at most."""
-_MARGIN: Final = 6.0
-"""Metres around them."""
 
 
 @in_own_settings
