@@ -130,33 +130,19 @@ def where_words(filters: Iterable[str]) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Count:
-    """A value that a reader can choose.
-
-    Attributes:
-        value: as a text.
-        count: of the scenarios that match all but the other values of this field.
-        chosen: whether it is.
-    """
-
-    value: str
-    count: int
-    chosen: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
     """The scenarios that choices come to.
 
     Attributes:
         rows: their rows, sorted.
-        counts: field → its values.
+        counts: field → its values: each `value`, the `count` of scenarios that match all but the other values of this
+            field, and whether it is `chosen`.
         faults: sentences on what is wrong in the query.
         waiting: sentences on what is not computed yet.
     """
 
     rows: IntArray
-    counts: Mapping[str, tuple[Count, ...]]
+    counts: Mapping[str, tuple[dict[str, Any], ...]]
     faults: tuple[str, ...]
     waiting: tuple[str, ...]
 
@@ -188,10 +174,10 @@ def _matching(facet: Facet, values: Sequence[str]) -> BoolArray:
     return np.isin(facet.codes, wanted)
 
 
-def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[Count, ...]:
+def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[dict[str, Any], ...]:
     counted = np.bincount(facet.codes[rows], minlength=len(facet.values)).tolist()
     return tuple(
-        Count(value=value, count=count, chosen=value in chosen)
+        {"value": value, "count": count, "chosen": value in chosen}
         for value, count in zip(facet.values, counted, strict=True)
     )
 

@@ -296,7 +296,9 @@ class _Pages:
             filters: by which the scenarios were found.
             **how: as of `export_pages`.
         """
-        items = [Work(token=token, folder=name, predictions=self._predictions(token)) for token, name in self._named]
+        items = [
+            Work(token=token, folder=name, predictions=self._predictions(token)) for token, name in self._names.items()
+        ]
         places = Places(reads=self._dataset.places, writes=(self._folder,))
         work = partial(tell, self._dataset, self._folder)
         told = run_batch(work, items, label="pages of scenarios", places=places, **how)
@@ -305,11 +307,6 @@ class _Pages:
         for place, each in enumerate(told):
             self._write_scenario(place, each)
         self._write_index(filters, told)
-
-    @property
-    def _named(self) -> list[tuple[str, str]]:
-        """Tokens and folders."""
-        return list(self._names.items())
 
     def _predictions(self, token: str) -> tuple[tuple[str, Results], ...]:
         """Those that a replay of the scenario can show."""
@@ -341,15 +338,16 @@ class _Pages:
         )
 
     def _write_scenario(self, place: int, told: Told) -> None:
-        token, name = self._named[place]
+        tokens = list(self._names)
+        token = tokens[place]
         twin = twin_of(self._dataset, token)
         self._write_page(
-            f"{name}/{INDEX}",
+            f"{self._names[token]}/{INDEX}",
             "written_scenario.html",
             "../../",
             token=token,
-            before=self._named[place - 1][0] if place else None,
-            after=self._named[place + 1][0] if place + 1 < len(self._names) else None,
+            before=tokens[place - 1] if place else None,
+            after=tokens[place + 1] if place + 1 < len(tokens) else None,
             twin=twin["token"] if twin is not None and twin["token"] in self._names else None,
             facts=told.facts,
             parts=PARTS,

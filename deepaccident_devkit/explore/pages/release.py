@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 from urllib.parse import urlencode
 
@@ -159,25 +158,6 @@ def _map(request: Request) -> Response:
     return picture(explorer.drawn(("map", town, found.looks, found.missing, found.damaged), draw), "png")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Kind:
-    """Findings of one kind.
-
-    Attributes:
-        code: such as `label-unreadable`.
-        severity: how bad they are.
-        known: how many of them the real release has too.
-        count: all of them.
-        meaning: of the code, a sentence; empty for a code of another version.
-    """
-
-    code: str
-    severity: str
-    known: int
-    count: int
-    meaning: str
-
-
 def _findings(request: Request) -> Response:
     """The files are read only for readers who open this page, since it takes minutes for a whole release."""
     explorer = explorer_of(request)
@@ -195,7 +175,7 @@ def _context(request: Request, explorer: Explorer, report: ValidationReport) -> 
     return {
         "report": report,
         "counts": {name: (count, _address(severity=name, code="")) for name, count in report.counts.items()},
-        "kinds": [(kind, _address(severity="", code=kind.code)) for kind in kinds_of(report.findings)],
+        "kinds": [(kind, _address(severity="", code=kind["code"])) for kind in kinds_of(report.findings)],
         "severity": severity,
         "code": code,
         "hidden": 0 if severity or code else report.counts["note"],
@@ -223,20 +203,23 @@ def chosen_findings(findings: Sequence[Finding], *, severity: str, code: str) ->
     return [each for each in findings if each.severity in wanted and code in ("", each.code)]
 
 
-def kinds_of(findings: Sequence[Finding]) -> list[Kind]:
-    """How many there are of each kind; the worst first, within them the most frequent."""
+def kinds_of(findings: Sequence[Finding]) -> list[dict[str, Any]]:
+    """How many there are of each kind; the worst first, within them the most frequent.
+
+    A kind has its `code`, `severity`, `count`, how many of them the real release has too (`known`), and its `meaning`.
+    """
     counts = Counter((each.severity, each.code) for each in findings)
     known = Counter((each.severity, each.code) for each in findings if each.known)
     rank: Mapping[str, int] = {severity: place for place, severity in enumerate(SEVERITIES)}
     ordered = sorted(counts.items(), key=lambda item: (rank[item[0][0]], -item[1], item[0][1]))
     return [
-        Kind(
-            code=code,
-            severity=severity,
-            known=known[severity, code],
-            count=count,
-            meaning=CODES[code].meaning if code in CODES else "",
-        )
+        {
+            "code": code,
+            "severity": severity,
+            "known": known[severity, code],
+            "count": count,
+            "meaning": CODES[code].meaning if code in CODES else "",
+        }
         for (severity, code), count in ordered
     ]
 

@@ -53,10 +53,10 @@ CASINGS: Final = {OUTCOME_COLORS["missed"]: "black"}
 """Edges around lines that are pale; others have white edges."""
 _SIZE: Final = (14.7, 7.1125)
 """Inches."""
-_RADIUS: Final = 1.0
-"""Metres: of the rings and crosses around places."""
-_CORNERS: Final = 32
-"""Of a ring."""
+_TURN: Final = np.linspace(0, 2 * np.pi, 33)
+_RING: Final = [np.column_stack([np.cos(_TURN), np.sin(_TURN)])]
+_CROSS: Final = [np.sqrt(0.5) * np.array(arm) for arm in ([[-1, -1], [1, 1]], [[-1, 1], [1, -1]])]
+"""The ring around a true place and the cross at a foreseen one, of a radius of 1 m."""
 _MISSING: Final = (-58.0, -48.0, 58.0, 0.0)
 """Points around the middle of a panel's upper edge, where words about a missing image are: left, low, right, high."""
 _FILL: Final = 0.3
@@ -182,7 +182,8 @@ def render_outcome_in_cameras(
         EvaluationError: the protocol cannot evaluate such a prediction.
     """
     verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
-    words = _frame_words(verdict, frame)
+    ahead = isinstance(verdict, MotionVerdict) and _checked_frame(verdict, frame) * verdict.outcome.true.step
+    words = f"instances in {ahead:.1f} s" if ahead else ""
     fig = figure_or_new(fig, _SIZE)
     axes = fig.subplot_mosaic([[*row] for row in CAMERA_GRID])
     for channel, ax in axes.items():
@@ -238,14 +239,6 @@ def _checked_frame(verdict: Verdict, frame: int | None) -> int:
     return frame
 
 
-def _frame_words(verdict: Verdict, frame: int | None) -> str:
-    """When the instances are where they are shown: `instances in 0.5 s`; nothing of the present. Raises ChoiceError."""
-    number = _checked_frame(verdict, frame)
-    if not isinstance(verdict, MotionVerdict) or number == 0:
-        return ""
-    return f"instances in {number * verdict.outcome.true.step:.1f} s"
-
-
 def _draw_detection(verdict: DetectionVerdict, dataset: Dataset, view: CameraView) -> None:
     """The true boxes that are found below the detections, of which the nearest are on top."""
     sample, channel, matches = view.sample, view.channel, verdict.matches
@@ -296,10 +289,10 @@ def _draw_accidents(verdict: AccidentVerdict, view: CameraView) -> None:
     """The true accident is below the foreseen ones, and its words find their place first."""
     true = verdict.compared.true
     if true is not None:
-        _draw_places(true.positions, _ring(), COLLIDER_COLOR, view)
+        _draw_places(true.positions, _RING, COLLIDER_COLOR, view)
         view.write(f"in {true.time:.1f} s", true.positions, COLLIDER_COLOR)
     for alarm in verdict.compared.predicted:
-        _draw_places(alarm.positions, _cross(), FORESEEN_COLOR, view)
+        _draw_places(alarm.positions, _CROSS, FORESEEN_COLOR, view)
         view.write(alarm_words(alarm), alarm.positions, FORESEEN_COLOR)
 
 
@@ -307,16 +300,6 @@ def _draw_places(places: FloatArray, mark: Sequence[FloatArray], color: str, vie
     """A mark and a post at each of two places (2, 2), and a thin line from one to the other."""
     view.draw_lines([*view.on_ground([places]), *view.posts(places)], color, width=1.2)
     view.draw_lines(view.on_ground([place + line for place in places for line in mark]), color, width=1.8)
-
-
-def _ring() -> list[FloatArray]:
-    turn = np.linspace(0, 2 * np.pi, _CORNERS + 1)
-    return [_RADIUS * np.column_stack([np.cos(turn), np.sin(turn)])]
-
-
-def _cross() -> list[FloatArray]:
-    arm = _RADIUS * np.sqrt(0.5)
-    return [arm * np.array([[-1, -1], [1, 1]]), arm * np.array([[-1, 1], [1, -1]])]
 
 
 def _handles(verdict: Verdict) -> list[Artist]:

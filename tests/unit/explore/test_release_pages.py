@@ -258,7 +258,7 @@ def test_findings_are_those_of_validate(of_damaged: Reader, report: ValidationRe
         assert row[2:] == [finding.code, finding.where, finding.what, finding.remedy]
         assert row[1].startswith(finding.severity)
     assert {row[0]: row[2] for row in page.table("kind")} == {
-        kind.code: str(kind.count) for kind in kinds_of(report.findings)
+        kind["code"]: str(kind["count"]) for kind in kinds_of(report.findings)
     }
     assert all(CODES[row[0]].meaning in row[3] for row in page.table("kind"))
     notes = report.counts["note"]
@@ -281,8 +281,8 @@ def test_findings_are_filtered(of_damaged: Reader, report: ValidationReport, sev
 def test_the_links_of_kinds_and_severities_filter(of_damaged: Reader, report: ValidationReport) -> None:
     page = of_damaged.ready("/release/findings")
     for kind in kinds_of(report.findings):
-        found = of_damaged.page(f"/release/findings{page.address_of(kind.code)}")
-        assert len(found.table("scenario")) == kind.count  # notes too
+        found = of_damaged.page(f"/release/findings{page.address_of(kind['code'])}")
+        assert len(found.table("scenario")) == kind["count"]  # notes too
     for severity, count in report.counts.items():
         if count:
             words = f"{count} {severity}{'' if count == 1 else 's'}"

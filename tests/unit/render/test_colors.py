@@ -18,7 +18,6 @@ from deepaccident_devkit.render.motion_maps import direction_colors
 PACKAGE = Path(deepaccident_devkit.__file__).parent
 PAINTED = ("synth", "testing")
 """These paint a world for cameras, not pictures for readers."""
-PLAIN = {"black", "white", "none"}
 HEX = re.compile(r"#(?:[0-9a-fA-F]{8}|[0-9a-fA-F]{6}|[0-9a-fA-F]{3,4})\b")
 EYES = ("normal", "protanopia", "deuteranopia", "tritanopia")
 
