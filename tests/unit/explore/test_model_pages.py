@@ -431,10 +431,10 @@ def test_the_command_makes_a_bundle(site: Site, tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("chosen", "expected"),
     [
-        ({"samples": "all", "scope": "all"}, ["--samples", "all"]),
-        ({"scope": "all"}, ["--scope", "all"]),
-        ({"agents": ("ego_vehicle",)}, ["--agents", "ego_vehicle"]),
-        ({}, []),
+        ({"samples": "all", "scope": "all"}, ["--samples", "all", "--horizon", "2"]),
+        ({"scope": "all"}, ["--samples", "evaluate", "--scope", "all"]),
+        ({"agents": ("ego_vehicle",)}, ["--samples", "evaluate", "--scope", "accident", "--agents", "ego_vehicle"]),
+        ({}, ["--samples", "evaluate", "--scope", "accident"]),
     ],
 )
 def test_the_command_asks_for_the_samples_that_the_results_have(
