@@ -182,7 +182,8 @@ def render_outcome_in_cameras(
         EvaluationError: the protocol cannot evaluate such a prediction.
     """
     verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
-    ahead = isinstance(verdict, MotionVerdict) and _checked_frame(verdict, frame) * verdict.outcome.true.step
+    number = _checked_frame(verdict, frame)
+    ahead = number * verdict.outcome.true.step if isinstance(verdict, MotionVerdict) else 0.0
     words = f"instances in {ahead:.1f} s" if ahead else ""
     fig = figure_or_new(fig, _SIZE)
     axes = fig.subplot_mosaic([[*row] for row in CAMERA_GRID])

@@ -9,6 +9,7 @@ from matplotlib.collections import LineCollection, PathCollection, PolyCollectio
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import render_pointcloud_in_image, render_sample_data
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
@@ -111,3 +112,8 @@ def test_by_agent_all_points_of_the_moment_have_their_agents_colours(da: DeepAcc
     assert len(ax.get_legend().get_texts()) == len(AGENTS)
     alone = render_pointcloud_in_image(da, f"{behind}/Camera_Front", behind, color_by="agent", ax=new_axes())
     assert [to_hex(one.get_facecolor()[0]) for one in alone.collections] == [AGENT_COLORS["ego_vehicle_behind"]]
+
+
+def test_points_are_rendered_in_images_alone(da: DeepAccident, behind: str) -> None:
+    with pytest.raises(ChoiceError, match="camera: expected one of Camera_Front"):
+        render_pointcloud_in_image(da, f"{behind}/lidar01", ax=new_axes())

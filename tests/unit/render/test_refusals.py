@@ -73,11 +73,6 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
         "color_by: expected one of depth, height, agent, found 'time'",
     ),
     (
-        lambda da, sample: da.render_pointcloud_in_image(f"{sample}/lidar01"),
-        ChoiceError,
-        "camera: expected one of Camera_Front",
-    ),
-    (
         lambda da, sample: da.render_motion_labels(sample, style="trail", at_present=False),
         ChoiceError,
         "trail: each frame is in its own ego frame; warp the labels",
