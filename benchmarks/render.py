@@ -6,7 +6,7 @@ from pathlib import Path
 
 from benchmarks.measure import Figure, best_of, one_core
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.video.views import Scene, views_of
+from deepaccident_devkit.render.video import Scene, views_of
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 FRAMES, SIZE = 40, (1280, 720)

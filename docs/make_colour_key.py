@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render import colors, detached_figure
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
-from deepaccident_devkit.render.motion_cells import direction_colors
+from deepaccident_devkit.render.motion_maps import direction_colors
 from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.taxonomy import AGENTS, short_name
 

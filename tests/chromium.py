@@ -66,6 +66,11 @@ class Browser:
         found: list[str] = self.script(OVERFLOWING)
         return found
 
+    def scheme(self) -> str:
+        """`dark` if the page has light letters, else `light`."""
+        ink = self.script("return getComputedStyle(document.body).color")
+        return "dark" if sum(map(int, ink[4:-1].split(","))) > 3 * 128 else "light"
+
     def screenshot(self, path: Path) -> Path:
         """A picture of the whole page, as long as it is."""
         shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True})

@@ -28,9 +28,9 @@ from deepaccident_devkit.files import place_in, remove_leftovers, write_bytes
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.pages import document
 from deepaccident_devkit.render import detached_figure, render_replay
+from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
 from deepaccident_devkit.render.pictures import save_picture
-from deepaccident_devkit.render.theme import page_style
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import columns_text

@@ -1,7 +1,7 @@
 """`deepaccident info`: what a release holds, its statistics, its index, and what scenarios can be found by."""
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 
@@ -96,14 +96,14 @@ def info(
 
 def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:
     from deepaccident_devkit.files import writable_folder
-    from deepaccident_devkit.render.statistics import PictureFormat, save_statistics  # it imports matplotlib
+    from deepaccident_devkit.render.statistics import save_statistics  # it imports matplotlib
     from deepaccident_devkit.statistics import dataset_statistics
 
     folder = None if out is None else writable_folder(out)
     found = dataset_statistics(dataset, chosen, **how)
     written: list[Path] = write_report(found, folder, "statistics.json")
     if folder:
-        written += save_statistics(found, folder, get_args(PictureFormat))
+        written += save_statistics(found, folder)
     say_report(found, written, folder, as_json=as_json)
 
 

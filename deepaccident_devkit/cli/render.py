@@ -23,22 +23,19 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.render.accident import COUNTDOWN, render_accident
-from deepaccident_devkit.render.annotation import render_annotation
+from deepaccident_devkit.render.actors import render_annotation, render_instance
+from deepaccident_devkit.render.axes import LAYERS, Layer
 from deepaccident_devkit.render.bev import render_bev
-from deepaccident_devkit.render.calibration import render_calibration
 from deepaccident_devkit.render.camera import ColorBy, render_pointcloud_in_image, render_sample_data
-from deepaccident_devkit.render.instance import render_instance
-from deepaccident_devkit.render.layers import LAYERS, Layer
+from deepaccident_devkit.render.legends import missing_words
 from deepaccident_devkit.render.link import render_link
-from deepaccident_devkit.render.missing import missing_words
-from deepaccident_devkit.render.moments import render_frame, render_sample
+from deepaccident_devkit.render.moments import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, figure_of_pixels, save_picture
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.render.styles import StyleName, style, style_dpi
-from deepaccident_devkit.render.video import SUFFIXES, VIEWS, render_scenario_video
-from deepaccident_devkit.render.video.writers import check_target
+from deepaccident_devkit.render.styles import StyleName, current_style, style
+from deepaccident_devkit.render.video import SUFFIXES, VIEWS, check_target, render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 from deepaccident_devkit.taxonomy import Frame
 from deepaccident_devkit.v2x import Link
@@ -328,7 +325,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         places = [cast(StyleName, word) for word in styles if word not in picture.styles]
         with style(places[-1]) if places else nullcontext():
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
-                drawn = picture.drawn(dataset, row, size, dpi or style_dpi(), choices)
+                drawn = picture.drawn(dataset, row, size, dpi or current_style().dpi, choices)
                 save_picture(drawn, path, dpi=dpi)
                 if words := missing_words(drawn):
                     _logger.warning("%s: %s", path, "; ".join(words))

@@ -21,10 +21,8 @@ from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.safety import render_lead_times, render_twins, save_safety_report
-from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, render_avoidability
-from deepaccident_devkit.render.safety.lead_time import LEAD_TIME_SIZE
+from deepaccident_devkit.render.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, TWINS_SIZE, render_avoidability
 from deepaccident_devkit.render.safety.report import REPLAYS
-from deepaccident_devkit.render.safety.twins import TWINS_SIZE
 from deepaccident_devkit.safety import (
     ObservationRule,
     Parting,

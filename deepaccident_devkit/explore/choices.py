@@ -130,33 +130,19 @@ def where_words(filters: Iterable[str]) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Count:
-    """A value that a reader can choose.
-
-    Attributes:
-        value: as a text.
-        count: of the scenarios that match all but the other values of this field.
-        chosen: whether it is.
-    """
-
-    value: str
-    count: int
-    chosen: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
     """The scenarios that choices come to.
 
     Attributes:
         rows: their rows, sorted.
-        counts: field → its values.
+        counts: field → its values: each `value`, the `count` of scenarios that match all but the other values of this
+            field, and whether it is `chosen`.
         faults: sentences on what is wrong in the query.
         waiting: sentences on what is not computed yet.
     """
 
     rows: IntArray
-    counts: Mapping[str, tuple[Count, ...]]
+    counts: Mapping[str, tuple[dict[str, Any], ...]]
     faults: tuple[str, ...]
     waiting: tuple[str, ...]
 
@@ -188,10 +174,10 @@ def _matching(facet: Facet, values: Sequence[str]) -> BoolArray:
     return np.isin(facet.codes, wanted)
 
 
-def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[Count, ...]:
+def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[dict[str, Any], ...]:
     counted = np.bincount(facet.codes[rows], minlength=len(facet.values)).tolist()
     return tuple(
-        Count(value=value, count=count, chosen=value in chosen)
+        {"value": value, "count": count, "chosen": value in chosen}
         for value, count in zip(facet.values, counted, strict=True)
     )
 
@@ -212,7 +198,8 @@ def _by_query(scenarios: Scenarios, choices: Choices, plain: Sequence[str]) -> t
                 waiting.append(_waiting_text(line, late))
                 continue
             values = scenarios.values(looked.name) or []
-            condition = condition_of(wanted, looked, _words(values) if looked.kind == "word" else ())
+            words = {word for value in values for word in (value if isinstance(value, tuple) else (value,))}
+            condition = condition_of(wanted, looked, words if looked.kind == "word" else ())
             matching &= np.array([condition.holds(value) for value in values], dtype=bool)
         except DeepAccidentError as error:
             faults.append(str(error))
@@ -223,10 +210,6 @@ def _waiting_text(what: str, job: Job) -> str:
     if job.state == "failed":
         return f"{what}: cannot be computed ({job.error})"
     return f"{what}: is being computed ({job.title}); it counts as soon as it is there"
-
-
-def _words(values: Sequence[Any]) -> set[Any]:
-    return {word for value in values for word in (value if isinstance(value, tuple) else (value,))}
 
 
 def _sorted(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import msgspec
 
 from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentsWithin
 from deepaccident_devkit.evaluation.metrics.breakdowns import ATTRIBUTES, EVERYTHING
 from deepaccident_devkit.evaluation.metrics.numbers import LIMITS, value_text
 from deepaccident_devkit.evaluation.runs import Bundle
@@ -18,11 +20,19 @@ from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.pages import scalar
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
+from deepaccident_devkit.render.outcomes.above import count_words
 
 _METHOD: Final = ("method", "name", "authors", "url", "date")
 """What results say of themselves, and is shown if they do."""
 Json = Mapping[str, Any]
 Ends = tuple[float, float]
+Row = Mapping[str, Any]
+_WHICH: Final = ("token", "scenario", "agent", "frame", "time_to_impact", "accident_visibility", "recording")
+"""Columns that say which sample it is."""
+_NUMBER: Final = r"[0-9]+(?:\.[0-9]+)?"
+_CASES: Final = ("tp", "fp", "fn")
+_ERRORS: Final = {"position_error": "places {:.1f} m off in sum", "time_error": "time {:.1f} s off"}
+"""Column → what is said of it."""
 
 
 class _Counted(msgspec.Struct):
@@ -69,46 +79,6 @@ class _Shown(msgspec.Struct):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeadlineRow:
-    """A headline number of all samples.
-
-    Attributes:
-        name: such as `apa`.
-        text: the value with its unit.
-        interval: `0.525 to 0.750`; empty if there is none.
-        better: `higher`, `lower`, or empty.
-    """
-
-    name: str
-    text: str
-    interval: str
-    better: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bar:
-    """The main number of the samples that have one value of an attribute.
-
-    Attributes:
-        value: of the attribute; `unknown` where it is not known.
-        samples: how many.
-        scenarios: that they are of.
-        text: the number with its unit.
-        interval: as in `HeadlineRow`.
-        width: of the bar in percent of the longest; None where there is no number.
-        ends: of the interval, likewise; None if there is none.
-    """
-
-    value: str
-    samples: int
-    scenarios: int
-    text: str
-    interval: str
-    width: float | None
-    ends: Ends | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class MainNumber:
     """The number by which samples are ranked.
 
@@ -132,21 +102,22 @@ class Evaluated:
     Attributes:
         facts: name → what was evaluated, and how.
         mark: that it is partial; empty if it is not.
-        headlines: of all samples.
+        headlines: of all samples: `name`, `text`, `interval` (empty if there is none), `better` (`higher`, `lower` or
+            empty).
         interval: heading of the intervals: `95 % interval`.
         notes: on the intervals.
         main: the number that the bars show; None if the result has none.
-        breakdowns: attribute → a bar for each of several values.
+        breakdowns: attribute → a bar for each of several values, as `_bar` describes it.
         same: attribute → the only value that the samples have.
     """
 
     facts: Mapping[str, str]
     mark: str
-    headlines: tuple[HeadlineRow, ...]
+    headlines: tuple[dict[str, str], ...]
     interval: str
     notes: tuple[str, ...]
     main: MainNumber | None
-    breakdowns: Mapping[str, tuple[Bar, ...]]
+    breakdowns: Mapping[str, tuple[dict[str, Any], ...]]
     same: Mapping[str, str]
 
 
@@ -173,7 +144,7 @@ def evaluated(bundle: Bundle) -> Evaluated:
         notes=() if group is None else tuple(group["notes"]),
         main=main,
         breakdowns={by: each for by, each in bars.items() if len(each) > 1},
-        same={by: each[0].value for by, each in bars.items() if len(each) == 1},
+        same={by: each[0]["value"] for by, each in bars.items() if len(each) == 1},
     )
 
 
@@ -206,26 +177,31 @@ def _main_number(summary: Json) -> MainNumber | None:
     return MainNumber(name=there[path]["name"], path=path, unit=unit, limit=LIMITS.get(unit, 1.0))
 
 
-def _headline_row(headline: Json, group: Json | None) -> HeadlineRow:
+def _headline_row(headline: Json, group: Json | None) -> dict[str, str]:
     higher, unit = headline.get("higher_is_better"), headline["unit"]
     better = "higher" if higher is True else "lower" if higher is False else ""
     interval = _interval_text(_ends(group, headline["path"]), unit)
-    return HeadlineRow(name=headline["name"], text=headline["text"], interval=interval, better=better)
+    return {"name": headline["name"], "text": headline["text"], "interval": interval, "better": better}
 
 
-def _bar(group: Json, main: MainNumber | None) -> Bar:
+def _bar(group: Json, main: MainNumber | None) -> dict[str, Any]:
+    """The main number of the samples that have one value of an attribute.
+
+    `value` is the attribute's, `samples` and `scenarios` count them, `text` and `interval` are for readers; `width` of
+    the bar and both `ends` of the interval are percents of the longest bar, None where there is no number.
+    """
     value = None if main is None else finite(group["headlines"].get(main.path))
     ends = None if main is None else _ends(group, main.path)
     shown = None if main is None or ends is None else _percents(ends, main.limit)
-    return Bar(
-        value=UNKNOWN if group["value"] is None else group["value"],
-        samples=group["samples"],
-        scenarios=group["scenarios"],
-        text="–" if main is None else value_text(value, main.unit),
-        interval="" if main is None else _interval_text(ends, main.unit),
-        width=None if main is None or value is None else _percents([value], main.limit)[0],
-        ends=None if shown is None else (shown[0], shown[1]),
-    )
+    return {
+        "value": UNKNOWN if group["value"] is None else group["value"],
+        "samples": group["samples"],
+        "scenarios": group["scenarios"],
+        "text": "–" if main is None else value_text(value, main.unit),
+        "interval": "" if main is None else _interval_text(ends, main.unit),
+        "width": None if main is None or value is None else _percents([value], main.limit)[0],
+        "ends": shown,
+    }
 
 
 def _percents(values: Iterable[float], limit: float) -> list[float]:
@@ -254,3 +230,82 @@ def finite(value: object) -> float | None:
     except OverflowError:
         return None
     return number if math.isfinite(number) else None
+
+
+def verdict(task: str, row: Row, *, whole: bool = False) -> str:
+    """A sample's verdict: `FN`, or `TP, places 1.2 m off in sum, time 0.1 s off`.
+
+    Args:
+        task: of the evaluation.
+        row: of the sample; its values may be anything.
+        whole: whether at all distances, ranges and thresholds; if not, at the widest, and at the middle threshold.
+    """
+    return _WORDS[task](row, whole=whole)
+
+
+def other_values(row: Row) -> dict[str, str]:
+    """What the row has except which sample it is: name → text."""
+    return {name.replace("_", " "): scalar(value) for name, value in row.items() if name not in _WHICH}
+
+
+def _accident(row: Row, *, whole: bool) -> str:
+    distances = _named(row, rf"tp_({_NUMBER})m")
+    words = [f"{each} m: {_cases(row, each)}" for each in distances] if whole else []
+    words = words or [_cases(row, each) for each in distances[-1:]]
+    for name, said in _ERRORS.items():
+        value = finite(row.get(name))
+        words += [] if value is None else [said.format(value)]
+    return ", ".join([*words, *["names others"] * bool(finite(row.get("id_error")))])
+
+
+def _cases(row: Row, distance: str) -> str:
+    tp, fp, fn = (_count(row, f"{case}_{distance}m") for case in _CASES)
+    unknown: dict[str, Any] = {"id_error": None, "position_error": None, "time_error": None}
+    within = AccidentsWithin(distance=float(distance), tp=tp, fp=fp, fn=fn, accuracy=math.nan, **unknown)
+    return count_words(within)
+
+
+def _motion(row: Row, *, whole: bool) -> str:
+    ranges = _named(row, rf"pq_({_NUMBER}x{_NUMBER})")
+    return "; ".join(_instances(row, each) for each in (ranges if whole else ranges[-1:]))
+
+
+def _instances(row: Row, around: str) -> str:
+    shares = [f"{name} {_percent(row.get(f'{name.lower()}_{around}'))}" for name in ("PQ", "IoU")]
+    counts = [f"{_count(row, f'{case}_{around}')} {case.upper()}" for case in _CASES]
+    return f"{around} m: {', '.join([*shares, *counts])}"
+
+
+def _detection(row: Row, *, whole: bool) -> str:
+    thresholds = _named(row, rf"tp_({_NUMBER})")
+    shown = thresholds if whole else thresholds[len(thresholds) // 2 :][:1]
+    found = [f"{_count(row, f'tp_{each}')} TP at {each}" for each in shown]
+    return ", ".join([f"{_count(row, 'truths')} true boxes", f"{_count(row, 'detections')} detections", *found])
+
+
+def _warning(row: Row, **_: bool) -> str:
+    return ", ".join(f"{name} {text}" for name, text in other_values(row).items())
+
+
+_WORDS: Final[Mapping[str, Callable[..., str]]] = {
+    "accident": _accident,
+    "motion": _motion,
+    "detection": _detection,
+    "warning": _warning,
+}
+
+
+def _named(row: Row, pattern: str) -> list[str]:
+    """The parts of columns' names that a pattern finds, from the smallest number on."""
+    found = [match[1] for name in row if (match := re.fullmatch(pattern, name))]
+    return sorted(found, key=lambda text: float(text.partition("x")[0]))
+
+
+def _count(row: Row, name: str) -> int:
+    value = finite(row.get(name))
+    return 0 if value is None else int(value)
+
+
+def _percent(value: object) -> str:
+    known = finite(value)
+    return "–" if known is None else f"{known:.1f} %"

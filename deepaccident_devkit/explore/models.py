@@ -89,9 +89,7 @@ class Model:
     @cached_property
     def rows(self) -> Mapping[str, Mapping[str, Any]]:
         """Token → the row of `samples.parquet`; empty without a bundle."""
-        if self.bundle is None:
-            return {}
-        return self.bundle.rows()
+        return {} if self.bundle is None else self.bundle.rows()
 
     @property
     def tokens(self) -> Iterable[str]:
@@ -115,10 +113,7 @@ class Model:
     @property
     def scores(self) -> Scores | None:
         """The scores; None until they are computed, and without a bundle."""
-        if self.bundle is None:
-            return None
-        found: Scores | None = self.job.result
-        return found
+        return None if self.bundle is None else self.job.result
 
     def numbers(self, scenarios: Scenarios) -> FloatArray | None:
         """(N,) the score of each scenario, NaN where there is none; None until they are computed."""

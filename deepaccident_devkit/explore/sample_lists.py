@@ -115,7 +115,8 @@ def listed(explorer: Explorer, model: Model, choices: SampleChoices) -> Listed:
         tokens = [token for token in tokens if values.get(token) == choices.value]
     if choices.scenario:
         tokens = [token for token in tokens if scenario_of(token) == choices.scenario]
-    ranked = ranks is not None and _is_ranked(ranks)
+    # warnings are judged over recordings: single samples have no numbers
+    ranked = ranks is not None and (ranks.result is None or any(each is not None for each in ranks.result.values()))
     order: Order = choices.order or "worst" if ranked else "time"
     return Listed(
         tokens=tuple(_ordered(tokens, order, ranks.result or {} if ranks is not None else {})),
@@ -126,11 +127,6 @@ def listed(explorer: Explorer, model: Model, choices: SampleChoices) -> Listed:
         waits=tuple(job.title for job in waiting if job is known or order != "time"),
         faults=tuple(f"{job.title}: {job.error}" for job in jobs if job.state == "failed"),
     )
-
-
-def _is_ranked(job: Job) -> bool:
-    """Whether single samples of a model have numbers, or may have some: warnings are judged over recordings."""
-    return job.result is None or any(value is not None for value in job.result.values())
 
 
 def _ordered(tokens: Iterable[str], order: Order, standings: Mapping[str, float | None]) -> list[str]:
@@ -144,13 +140,12 @@ def _ordered(tokens: Iterable[str], order: Order, standings: Mapping[str, float 
 
 def attributes_job(explorer: Explorer, model: Model) -> Job:
     """The work that gives the attributes of a model's samples, as far as they are in the release."""
-
-    def work() -> dict[str, SampleAttributes]:
-        return sample_attributes(
-            explorer.dataset, [token for token in model.tokens if is_sample(explorer.dataset, token)]
-        )
-
-    return explorer.jobs.ask(f"attributes {model.name}", f"attributes of the samples of {model.name}", work)
+    dataset = explorer.dataset
+    return explorer.jobs.ask(
+        f"attributes {model.name}",
+        f"attributes of the samples of {model.name}",
+        lambda: sample_attributes(dataset, [token for token in model.tokens if is_sample(dataset, token)]),
+    )
 
 
 def is_sample(dataset: Dataset, token: str) -> bool:

@@ -17,8 +17,7 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Final
 
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
-from deepaccident_devkit.explore.access import Access, App, Gate
-from deepaccident_devkit.explore.addresses import HostPort, RootPath
+from deepaccident_devkit.explore.access import Access, App, Gate, HostPort, RootPath
 
 LOOPBACK: Final = "127.0.0.1"
 _NEEDED: Final = ("starlette", "uvicorn")

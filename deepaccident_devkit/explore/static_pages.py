@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -16,23 +19,42 @@ from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.explore.background import Jobs
 from deepaccident_devkit.explore.choices import SCORE, find_call, where_words
+from deepaccident_devkit.explore.evaluations import verdict
+from deepaccident_devkit.explore.explorer import thumbnail
 from deepaccident_devkit.explore.models import Model, open_models
 from deepaccident_devkit.explore.pages.answers import assets
-from deepaccident_devkit.explore.pages.scenario import PARTS
+from deepaccident_devkit.explore.pages.scenario import PARTS, part_context
 from deepaccident_devkit.explore.pages.scenarios import SLOW, Cell, cell, entry, score_cell, sort_key
-from deepaccident_devkit.explore.static_folder import MARK, exported, target_folder
-from deepaccident_devkit.explore.static_work import REPLAY, THUMBNAIL, Told, Work, tell
-from deepaccident_devkit.explore.verdicts import verdict
-from deepaccident_devkit.files import plain_names, write_bytes
+from deepaccident_devkit.explore.scenarios import accident_columns
+from deepaccident_devkit.files import (
+    path_of,
+    plain_names,
+    replacing_folder,
+    temporary_path,
+    writable_folder,
+    write_bytes,
+)
+from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.pages import rendered, result_text
-from deepaccident_devkit.parallel import Places, run_batch
+from deepaccident_devkit.parallel import Engine, Places, run_batch
+from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.render.replay import recording_of, tried_replay
+from deepaccident_devkit.render.replay.replay import facts
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.selection import find
+from deepaccident_devkit.selection.fields import measures_of_moving_pairs
 from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from deepaccident_devkit.tables.records import ScenarioRecord
 
+MARK: Final = ".deepaccident_pages"
+"""The file by which an export knows the folder of an earlier one: it names all files that were written."""
+_HEAD: Final = "DeepAccident pages"
+REPLAY: Final = "replay.html"
+THUMBNAIL: Final = "thumbnail.jpg"
 MOST: Final = 50
 """Scenarios of an export: a replay takes some seconds and up to 15 MB."""
 INDEX: Final = "index.html"
@@ -51,6 +73,127 @@ _SAME: Final = ("token", "scenario")
 """Columns that are the same for all samples of a scenario, or stand in others."""
 
 
+def target_folder(folder: str | os.PathLike[str]) -> Path:
+    """The real path of a folder for an export.
+
+    Raises:
+        ConfigError: it cannot be written to, is a file, or holds files that no export wrote.
+    """
+    target = path_of(folder, "expected a folder to write to").resolve()
+    writable_folder(target.parent)
+    if target.exists() and not target.is_dir():
+        raise ConfigError(f"{target}: is a file; name a folder that does not exist yet")
+    others = sorted(set(_files(target)) - set(_earlier(target)))
+    if others:
+        raise ConfigError(
+            f"{target}: holds {others[0]}, which no export wrote; name a folder that is empty, or does not exist yet"
+        )
+    return target
+
+
+@contextmanager
+def exported(target: Path) -> Iterator[Path]:
+    """Yield a new folder; if the block succeeds it takes the place of the target, and of an earlier export there."""
+    aside = temporary_path(target)
+    try:
+        with replacing_folder(target) as made:
+            yield made
+            write_bytes(made / MARK, "".join(f"{line}\n" for line in (_HEAD, *sorted(_files(made)))).encode())
+            if target.is_dir() and any(target.iterdir()):
+                target.rename(aside)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _files(folder: Path) -> Iterator[str]:
+    """All files and links below a folder, relative to it."""
+    for path, folders, files in os.walk(folder):
+        links = [name for name in folders if Path(path, name).is_symlink()]
+        yield from (Path(path, name).relative_to(folder).as_posix() for name in (*links, *files))
+
+
+def _earlier(folder: Path) -> list[str]:
+    """The files that an earlier export wrote into a folder; none if there was none."""
+    mark = folder / MARK
+    if not mark.is_file() or mark.is_symlink():
+        return []
+    head, *names = read_bytes(mark, "index").decode(errors="replace").splitlines()
+    return [*names, MARK] if head == _HEAD else []
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Work:
+    """A scenario of an export.
+
+    Attributes:
+        token: of the scenario.
+        folder: its own, relative to that of the export.
+        predictions: names and results of the models that tell of it.
+    """
+
+    token: str
+    folder: str
+    predictions: tuple[tuple[str, Results], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What a scenario's page says; its thumbnail and replay are files.
+
+    Attributes:
+        facts: names and values.
+        parts: of `PARTS`, as HTML.
+        measures: of `SLOW`.
+        model: whose predictions the replay shows; empty for none.
+        reason: why there is no replay; empty if there is one.
+    """
+
+    facts: Sequence[Sequence[str]]
+    parts: Mapping[str, str]
+    measures: Mapping[str, Any]
+    model: str
+    reason: str
+
+
+def tell(dataset: Dataset, folder: Path, work: Work) -> Told:
+    """Write a scenario's files below the folder of the export, and find what its page says."""
+    record = dataset.scenario.get(work.token)
+    own = folder / work.folder
+    write_bytes(own / THUMBNAIL, thumbnail(dataset, record))
+    measures = accident_columns(dataset, record) | measures_of_moving_pairs(interactions(dataset, record))
+    model, reason = _make_replay(dataset, work, own / REPLAY)
+    return Told(
+        facts=facts(recording_of(dataset, work.token, None)),
+        parts={name: _part(dataset, work.token, name) for name in PARTS},
+        measures={name: measures[name] for name in SLOW},
+        model=model,
+        reason=_without_place(dataset, reason),
+    )
+
+
+def _make_replay(dataset: Dataset, work: Work, path: Path) -> tuple[str, str]:
+    """Write a replay with the first predictions that can be shown; whose they are, and why there is no replay."""
+    for name, prediction in work.predictions:
+        if tried_replay(dataset, work.token, path, prediction=prediction) is None:
+            return name, ""
+    return "", tried_replay(dataset, work.token, path) or ""
+
+
+def _part(dataset: Dataset, token: str, name: str) -> str:
+    context = part_context(dataset, token, name)
+    if "findings" in context:
+        context["findings"] = [
+            replace(each, where=_without_place(dataset, each.where), what=_without_place(dataset, each.what))
+            for each in context["findings"]
+        ]
+    return rendered(f"parts/{name}.html", root="", static=True, frame_number=str, **context)
+
+
+def _without_place(dataset: Dataset, text: str) -> str:
+    """A text in which paths of the release's files begin in its folder: pages for others do not tell where it lies."""
+    return text.replace(f"{dataset.dataroot}/", "")
+
+
 def export_pages(
     dataset: Dataset,
     folder: str | os.PathLike[str],
@@ -59,8 +202,7 @@ def export_pages(
     bundles: Iterable[Path] = (),
     results: Iterable[Path] = (),
     scenarios: Iterable[RowArgument] | None = None,
-    workers: int | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> Path:
     """Write pages of some scenarios as files: a list, and for each a replay, its story, pairs, lead times and findings.
 
@@ -75,8 +217,7 @@ def export_pages(
         results: files or folders of results; those of a bundle join it. A replay shows the predictions of the first
             ones that tell of the scenario.
         scenarios: tokens or records, of which those that match are written, in this order; None for all.
-        workers: processes; None chooses by the number of scenarios.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Returns:
         The first page, `index.html`.
@@ -86,7 +227,7 @@ def export_pages(
         NotAvailableError: no scenario matches.
         FieldError, ChoiceError, TokenError: there is no such filter or scenario.
         ResultsError: bundles or results cannot be read.
-        WorkerError: a worker was killed, or cannot do the work.
+        WorkerError: as `parallel.Engine` says.
 
     Examples:
         >>> export_pages(da, "night", where=["time_of_day=Night", "collision=true"])  # doctest: +SKIP
@@ -97,7 +238,7 @@ def export_pages(
     models = _scored_models(bundles, results)
     filters = [*where, *([] if given is None else [f"token={','.join(given)}"])]
     with exported(target) as made:
-        _Pages(dataset, made, records, models).write(filters, workers=workers, progress=progress)
+        _Pages(dataset, made, records, models).write(filters, **how)
     return target / INDEX
 
 
@@ -148,14 +289,16 @@ class _Pages:
         self._dataset, self._folder, self._records, self._models = dataset, folder, records, models
         self._names = _folders(records)
 
-    def write(self, filters: Sequence[str], **how: Any) -> None:
+    def write(self, filters: Sequence[str], **how: Unpack[Engine]) -> None:
         """Write all pages, and what they show.
 
         Args:
             filters: by which the scenarios were found.
-            **how: of `run_batch`.
+            **how: as of `export_pages`.
         """
-        items = [Work(token=token, folder=name, predictions=self._predictions(token)) for token, name in self._named]
+        items = [
+            Work(token=token, folder=name, predictions=self._predictions(token)) for token, name in self._names.items()
+        ]
         places = Places(reads=self._dataset.places, writes=(self._folder,))
         work = partial(tell, self._dataset, self._folder)
         told = run_batch(work, items, label="pages of scenarios", places=places, **how)
@@ -164,11 +307,6 @@ class _Pages:
         for place, each in enumerate(told):
             self._write_scenario(place, each)
         self._write_index(filters, told)
-
-    @property
-    def _named(self) -> list[tuple[str, str]]:
-        """Tokens and folders."""
-        return list(self._names.items())
 
     def _predictions(self, token: str) -> tuple[tuple[str, Results], ...]:
         """Those that a replay of the scenario can show."""
@@ -200,15 +338,16 @@ class _Pages:
         )
 
     def _write_scenario(self, place: int, told: Told) -> None:
-        token, name = self._named[place]
+        tokens = list(self._names)
+        token = tokens[place]
         twin = twin_of(self._dataset, token)
         self._write_page(
-            f"{name}/{INDEX}",
+            f"{self._names[token]}/{INDEX}",
             "written_scenario.html",
             "../../",
             token=token,
-            before=self._named[place - 1][0] if place else None,
-            after=self._named[place + 1][0] if place + 1 < len(self._names) else None,
+            before=tokens[place - 1] if place else None,
+            after=tokens[place + 1] if place + 1 < len(tokens) else None,
             twin=twin["token"] if twin is not None and twin["token"] in self._names else None,
             facts=told.facts,
             parts=PARTS,

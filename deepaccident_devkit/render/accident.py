@@ -9,10 +9,9 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.render.axes import figure_or_new, settled, with_light_grid
+from deepaccident_devkit.render.axes import Layer, figure_or_new, layers_of, settled, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, COLLIDER_COLOR, GRID_COLOR
-from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.pair import PAIR_LAYERS, Pair, draw_pair_from_above, draw_pair_in_camera, number_words
 from deepaccident_devkit.render.roles import in_drawing_order
 from deepaccident_devkit.render.styles import in_own_settings
@@ -110,7 +109,7 @@ def render_accident(
 
 
 def draw_countdown(
-    dataset: Dataset, frame: str, agents: Sequence[str], layers: Collection[Layer] | None, fig: Figure
+    dataset: Dataset, frame: str, *, agents: Sequence[str], layers: Collection[Layer] | None, fig: Figure
 ) -> None:
     """Render a moment of an accident: five cameras, the place of contact from above, the speeds of the pair.
 

@@ -14,7 +14,7 @@ from deepaccident_devkit.geometry import Boxes, PinholeCamera
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.boxes import bounds_in_image
-from deepaccident_devkit.render.missing import is_there
+from deepaccident_devkit.render.legends import is_there
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.projection import camera_of
 

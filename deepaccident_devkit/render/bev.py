@@ -8,32 +8,34 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray, FloatArray
+from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
+from deepaccident_devkit.geometry import Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import concatenate
-from deepaccident_devkit.release import BevImage
-from deepaccident_devkit.release.npz import TAGS
-from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range
-from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
+from deepaccident_devkit.render.axes import Layer, axes_or_new, axis_words, check_view_range, layers_of
+from deepaccident_devkit.render.boxes import draw_actors_from_above, draw_trails, write_beside
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.colors import (
     AGENT_COLORS,
-    BEV_COLORS,
     CASING_COLOR,
     COLLIDER_COLOR,
     GRID_COLOR,
     OWN_COLOR,
     POINT_COLOR,
 )
-from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.legends import draw_legend, handles_from_above
-from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
+from deepaccident_devkit.render.ground import draw_town_map, draw_underlay, map_beneath
+from deepaccident_devkit.render.legends import (
+    absence_text,
+    draw_legend,
+    handles_from_above,
+    has_cloud,
+    is_there,
+    missing_clouds_text,
+    write_missing,
+)
 from deepaccident_devkit.render.roles import at_once, collider_ids, label_ids, recorder_ids, role_colors
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
-from deepaccident_devkit.render.town_map import draw_town_map, map_beneath
-from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame, short_name
 from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x import (
@@ -63,6 +65,8 @@ BEV_LAYERS: Final[tuple[Layer, ...]] = (
     "grid",
 )
 BEV_DEFAULT: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "grid")
+Shown = tuple[frozenset[str], tuple[AgentName, ...]]
+"""What a view from above shows: the colours of its boxes and, of several agents, those whose points it has."""
 _OF_BOXES: Final = frozenset(("boxes", "ids", "velocities", "trajectories"))
 _BEYOND: Final = 5.0
 """Metres outside the picture up to which a box may still reach into it."""
@@ -70,8 +74,6 @@ _MARK: Final = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
 """An arrow head, metres of an agent's ego frame."""
 _PALE: Final = 0.55
 """How opaque agents' points are."""
-_MOST_PIXELS: Final = 400
-"""Pixels along a side, about: panels of a video have fewer, and more take time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,19 +102,6 @@ class BevView:
         """Check the frame and the range; raises ChoiceError."""
         check_view_range(self.view_range)
         settle_choices(self, {"frame": get_args(Frame)})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnBev:
-    """What a view from above shows, for its legend.
-
-    Attributes:
-        colors: of its boxes.
-        clouds: the agents whose points it has.
-    """
-
-    colors: frozenset[str]
-    clouds: tuple[AgentName, ...]
 
 
 @in_own_settings
@@ -167,18 +156,19 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     view = BevView(view_range=view_range, frame=frame, agents=agents, link=link, sweeps=sweeps, seconds=seconds)
     names = cooperating_agents(dataset, sample, agents)
     ax = axes_or_new(ax, (6, 6.6))
-    drawn = draw_bev(dataset, sample, view, chosen, ax)
+    colors, clouds = draw_bev(dataset, sample, view, chosen, ax)
     made = [f"{sweeps} sweeps"] if sweeps > 1 else []
     if link is not None and link != Link(seed=link.seed) and len(names) > 1:
         made.insert(0, link_words(link))
     set_scene_title(ax, dataset, dataset.get("sample", sample)["token"], below=", ".join(made))
-    handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
-    draw_legend(ax, handles, columns=5, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5)
+    draw_legend(
+        ax, handles_from_above(colors, clouds), columns=5, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5
+    )
     return ax
 
 
-def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes) -> DrawnBev:
-    """Render a panel of `render_bev`, with its arguments and errors."""
+def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes) -> Shown:
+    """Render a panel of `render_bev`, with its arguments and errors; returns what a legend explains."""
     record = dataset.sample[dataset.getind("sample", sample)]
     names = cooperating_agents(dataset, record, view.agents)
     target_from_world = dataset.world_from(record, view.frame).inverse()
@@ -219,9 +209,13 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     shown = tuple(agent for agent, cloud in clouds.items() if cloud is not None and len(cloud))
     absent += _absent_ground(dataset, ground, layers, seen=has_ground or town is not None, other=bool(shown))
     _draw_marks(dataset, record, view.frame, names, ax)
-    _finish(view.frame, grid="grid" in layers, ax=ax)
+    x_words, y_words = axis_words(view.frame)
+    ax.set(xlabel=x_words, ylabel=y_words)
+    ax.set_axisbelow(True)
+    if "grid" in layers:
+        ax.grid(color=GRID_COLOR, linewidth=0.4)
     write_missing(ax, "; ".join(filter(None, absent)))
-    return DrawnBev(colors=colored, clouds=shown)
+    return colored, shown if len(names) > 1 else ()
 
 
 def _absent_ground(dataset: Dataset, ground: str, layers: frozenset[Layer], *, seen: bool, other: bool) -> list[str]:
@@ -303,14 +297,6 @@ def _name_pair(dataset: Dataset, record: SampleRecord, boxes: Boxes, ax: Axes, *
             write_beside(ax, boxes.category_names[row] if agent is None else short_name(agent), (x, y), COLLIDER_COLOR)
 
 
-def _finish(frame: str, *, grid: bool, ax: Axes) -> None:
-    words = axis_words(frame)
-    ax.set(xlabel=words[0], ylabel=words[1])
-    ax.set_axisbelow(True)
-    if grid:
-        ax.grid(color=GRID_COLOR, linewidth=0.4)
-
-
 def link_words(link: Link) -> str:
     """A link in words: `latency 0.2 s, poses off by 0.3 m (σ 0.02 m), 10 % of messages lost`."""
     words = [f"latency {link.latency:g} s"]
@@ -342,44 +328,3 @@ def draw_points_from_above(
         rasterized=True,
         zorder=1,
     )
-
-
-def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range: float) -> None:
-    """Render a BEV camera's tags at their places in the frame of the axes, metres, up to `view_range` to each side.
-
-    Args:
-        image: of an agent.
-        ax: axes to render on; its limits stay as they are.
-        target_from_ego: from the agent's ego frame into the frame of the axes; its tilt is left out.
-        view_range: metres around the agent; of a turned picture a larger square is taken, so that it fills the corners.
-    """
-    from matplotlib.transforms import Affine2D
-
-    yaw = float(np.arctan2(target_from_ego.rotation[1, 0], target_from_ego.rotation[0, 0]))
-    place = Affine2D().rotate(yaw).translate(*target_from_ego.translation[:2])
-    size = len(image.semantic)
-    half = min(size // 2, int(np.ceil(view_range * (abs(np.cos(yaw)) + abs(np.sin(yaw))) / image.resolution)))
-    shown = slice(size // 2 - half, size // 2 + half)
-    tags = image.semantic[::-1, ::-1].T[shown, shown]
-    step = max(1, len(tags) // _MOST_PIXELS)
-    reach = half * image.resolution
-    limits = ax.get_xlim(), ax.get_ylim()
-    ax.imshow(
-        _colored(tags[step // 2 :: step, step // 2 :: step]),
-        origin="lower",
-        extent=(-reach, reach, -reach, reach),
-        transform=place + ax.transData,
-        interpolation="nearest",
-        zorder=0,
-    )
-    ax.set(xlim=limits[0], ylim=limits[1])
-
-
-def _colored(tags: ByteArray) -> ByteArray:
-    """CARLA's tags (H, W) as RGB (H, W, 3), white where a tag has no colour."""
-    from matplotlib.colors import to_rgb
-
-    table = np.full((256, 3), 255, dtype=np.uint8)
-    for name, color in BEV_COLORS.items():
-        table[TAGS[name]] = np.rint(np.array(to_rgb(color)) * 255)
-    return table[tags]

@@ -11,7 +11,7 @@ from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import axes_or_new
+from deepaccident_devkit.render.axes import Layer, axes_or_new, layers_of
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import (
     draw_boxes_in_image,
@@ -19,9 +19,10 @@ from deepaccident_devkit.render.boxes import (
     draw_velocities_in_image,
 )
 from deepaccident_devkit.render.colors import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP
-from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
-from deepaccident_devkit.render.missing import (
+from deepaccident_devkit.render.legends import (
+    agent_handles,
+    box_handles,
+    draw_legend,
     draw_missing_image,
     has_cloud,
     is_there,
@@ -89,20 +90,14 @@ def render_sample_data(
         ax = axes_or_new(ax, (8, 5.4))
         colors, below = draw_camera(dataset, record, chosen, ax), 0.5
     else:
+        lidar = record["channel"] == LIDAR
+        chosen = layers_of(layers, ("points" if lidar else "bev", "boxes", "grid"), BEV_LAYERS)
         ax = axes_or_new(ax, (6, 7.2))
-        colors, below = _draw_from_above(dataset, record, layers, ax), 4.5
+        view = BevView(frame="lidar" if lidar else "ego")
+        colors, below = draw_bev(dataset, record["sample_token"], view, chosen, ax)[0], 4.5
     set_scene_title(ax, dataset, record["token"], record["channel"])
-    handles = box_handles(colors)
-    draw_legend(ax, handles, columns=len(handles), loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=below)
+    draw_legend(ax, box_handles(colors), loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=below)
     return ax
-
-
-def _draw_from_above(dataset: Dataset, record: Any, layers: Iterable[Layer] | None, ax: Axes) -> frozenset[str]:
-    """A LiDAR's or a BEV camera's record of `render_sample_data`; returns the colours of its boxes."""
-    lidar = record["channel"] == LIDAR
-    default: tuple[Layer, ...] = ("points" if lidar else "bev", "boxes", "grid")
-    chosen = layers_of(layers, default, BEV_LAYERS)
-    return draw_bev(dataset, record["sample_token"], BevView(frame="lidar" if lidar else "ego"), chosen, ax).colors
 
 
 def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Axes) -> frozenset[str]:
@@ -228,7 +223,7 @@ def render_pointcloud_in_image(
         for source in sources:
             _draw_agent(dataset, source, record, ax)
         handles = agent_handles([source["agent"] for source in sources])
-        draw_legend(ax, handles, columns=len(handles), loc="upper center", bbox_to_anchor=(0.5, 0))
+        draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0))
     elif sources:
         _draw_metres(dataset, sources[0], record, color_by, ax)
     set_scene_title(ax, dataset, record["token"], record["channel"], below=f"LiDAR: {whose}")

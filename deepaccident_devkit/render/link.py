@@ -12,12 +12,11 @@ from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import check_view_range, figure_or_new, settled, with_light_grid
+from deepaccident_devkit.render.axes import Layer, check_view_range, figure_or_new, layers_of, settled, with_light_grid
 from deepaccident_devkit.render.bev import BevView, draw_bev, link_words
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.colors import AGENT_COLORS, MUTED_COLOR, OWN_COLOR, TRUE_PLACE_COLOR
-from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
@@ -124,7 +123,7 @@ def render_link(
         if "boxes" in shown:
             truth = cooperative_boxes(dataset, sample, agents=agents, frame="ego")
             draw_boxes_from_above(truth, ax, [OWN_COLOR] * len(truth), fill=0.0, linewidths=0.7)
-    draw_legend(fig, _handles(), columns=4, loc="outside lower center")
+    draw_legend(fig, _handles(), columns=4)
     token = dataset.get("sample", sample)["token"]
     set_scene_title(fig, dataset, token, below=link_words(link), fontsize=11)
     return settled(fig)

@@ -1,4 +1,4 @@
-"""Several panels of one moment."""
+"""Several panels of one moment: of all sensors, of all agents, and such that prove the transforms."""
 
 from __future__ import annotations
 
@@ -8,16 +8,33 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.render.axes import figure_or_new
+from deepaccident_devkit.errors import TokenError
+from deepaccident_devkit.geometry import Boxes, LidarPointCloud
+from deepaccident_devkit.render.axes import LAYERS, Layer, figure_or_new, layers_of
 from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, draw_bev
-from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
-from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
-from deepaccident_devkit.render.legends import box_handles, draw_legend, handles_from_above
+from deepaccident_devkit.render.camera import (
+    CAMERA_DEFAULT,
+    CAMERA_LAYERS,
+    draw_camera,
+    draw_camera_boxes,
+    draw_image,
+    draw_points_in_image,
+)
+from deepaccident_devkit.render.colors import AGENT_COLORS
+from deepaccident_devkit.render.legends import (
+    agent_handles,
+    box_handles,
+    draw_legend,
+    handles_from_above,
+    has_cloud,
+    missing_clouds_text,
+    write_missing,
+)
 from deepaccident_devkit.render.roles import at_once, in_drawing_order
 from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.titles import set_scene_title, set_title
 from deepaccident_devkit.taxonomy import CAMERAS, short_name
-from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
+from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes, project_to_image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,6 +63,11 @@ _MOST_CAMERAS: Final = 0.66
 _BESIDE, _ABOUT = 0.9, 1.6
 """Inches of room for words beside panels, and above and below them."""
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
+CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
+_DEFAULT: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
+_FARTHEST: Final = 60.0
+"""Metres from the camera up to which boxes are rendered: farther ones are as small as the errors to be found."""
+_COLUMNS: Final = 3
 
 
 @in_own_settings
@@ -87,9 +109,8 @@ def render_sample(
     axes = fig.subplot_mosaic([[*row, "bev"] for row in grid], width_ratios=ratios)
     for channel in CAMERAS:
         draw_camera(dataset, dataset.get("sample_data", f"{record['token']}/{channel}"), in_cameras, axes[channel])
-    drawn = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
-    handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
-    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    shown = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
+    draw_legend(fig, handles_from_above(*shown))
     set_scene_title(fig, dataset, record["token"])
     return fig
 
@@ -139,30 +160,27 @@ def render_frame(
         draw_camera(dataset, dataset.get("sample_data", f"{sample}/Camera_Front"), in_cameras, axes[0, column])
         axes[0, column].set_title(agent)
         above = axes[1, column]
-        drawn |= draw_bev(dataset, sample, view, from_above, above).colors
+        drawn |= draw_bev(dataset, sample, view, from_above, above)[0]
         above.set_xlim(-_VIEW_RANGE, _VIEW_RANGE)
-        _plain(above, labelled=column == 0)
+        if column:
+            above.set_ylabel("")
+            above.tick_params(labelleft=False)
     if fig.figure is fig:  # a part of a figure is laid out with it
         fig.set_layout_engine("compressed")
-    handles = box_handles(drawn)
-    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    draw_legend(fig, box_handles(drawn))
     set_scene_title(fig, dataset, record["token"])
     return fig
 
 
 def draw_shared_moment(
-    dataset: Dataset,
-    frame: RowArgument,
-    names: Sequence[str],
-    layers: Iterable[Layer] | None,
-    fig: Figure,
+    dataset: Dataset, frame: RowArgument, *, agents: Sequence[str], layers: Iterable[Layer] | None, fig: Figure
 ) -> None:
     """Render the front views of agents beside one view from above that they share, in world, as wide as they need.
 
     Args:
         dataset: the release.
         frame: token or record.
-        names: the agents; boxes and points from above are all of theirs.
+        agents: names; boxes and points from above are all of theirs.
         layers: as in `render_frame`.
         fig: an empty figure to render on; about 16 to 9, or wider.
 
@@ -171,6 +189,7 @@ def draw_shared_moment(
     """
     in_cameras, from_above = panel_layers(layers)
     record = dataset.get("frame", frame)
+    names = in_drawing_order(agents)
     moments = [at_once(dataset.samples_of(record)[0], agent) for agent in names]
     width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi
     rows = min(2 if width > _WIDE * height else 3, len(names))
@@ -188,10 +207,9 @@ def draw_shared_moment(
     x, y = ((low + high) / 2).tolist()
     view = BevView(view_range=reach, frame="world", agents=tuple(names), center=(x, y))
     above = fig.add_subplot(grid[:, 0])
-    drawn = draw_bev(dataset, moments[0], view, from_above, above)
+    shown = draw_bev(dataset, moments[0], view, from_above, above)
     above.set_anchor("C")
-    handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
-    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    draw_legend(fig, handles_from_above(*shown))
     set_scene_title(fig, dataset, record["token"])
 
 
@@ -210,8 +228,91 @@ def _tallness(fig: Figure, columns: int) -> float:
     return min(max(height / width - 9 / 16, 1.0), _TALLEST)
 
 
-def _plain(ax: Axes, *, labelled: bool) -> None:
-    """Unless a panel is `labelled`, remove the labels of its y axis."""
-    if not labelled:
-        ax.set_ylabel("")
-        ax.tick_params(labelleft=False)
+@in_own_settings
+def render_calibration(
+    dataset: Dataset,
+    frame_or_sample: RowArgument,
+    *,
+    agents: Agents = None,
+    layers: Iterable[Layer] | None = None,
+    fig: Figure | None = None,
+) -> Figure:
+    """Render the LiDAR points of all agents and all agents' boxes in camera images, to prove the calibration.
+
+    Each agent's points have its colour. If the transforms are right, they lie on the kerbs, walls and cars of the
+    image. If an agent's pose or a sensor's place is wrong, all points of its colour are in wrong places. Points and
+    boxes are rendered even if other things hide them.
+
+    Args:
+        dataset: the release.
+        frame_or_sample: token or record: a sample shows its six cameras, a frame the front cameras of the agents.
+        agents: whose points and boxes (and, for a frame, whose cameras); None for all that are there.
+        layers: some of `image`, `points`, `boxes` (up to 60 m) and `ids`; by default all except ids.
+        fig: an empty figure to render on; a new one if None.
+
+    Returns:
+        The figure, three panels in a row. An image that was not downloaded is a grey panel; words in the first panel
+        name the agents whose points were not.
+
+    Raises:
+        TokenError: no such sample or frame.
+        ChoiceError: no such layer, agent or configuration.
+        NotAvailableError: an agent is not in this (partial) release.
+    """
+    chosen = layers_of(layers, _DEFAULT, CALIBRATION_LAYERS)
+    sample, is_frame = _present(dataset, frame_or_sample)
+    names = in_drawing_order(cooperating_agents(dataset, sample, agents))
+    record = dataset.get("sample", sample)
+    cameras = [f"{sample}/{channel}" for row in CAMERA_GRID for channel in row]
+    if is_frame:
+        cameras = [f"{at_once(record, agent)}/Camera_Front" for agent in names]
+    lookers = names if "points" in chosen else []
+    clouds = {
+        agent: dataset.load_point_cloud(at_once(record, agent))
+        for agent in lookers
+        if has_cloud(dataset, at_once(record, agent))
+    }
+    boxes = cooperative_boxes(dataset, sample, agents=names)
+    rows = -(-len(cameras) // _COLUMNS)
+    fig = figure_or_new(fig, (15, 3.1 * rows + 0.8))
+    axes = fig.subplots(rows, min(_COLUMNS, len(cameras)), squeeze=False)
+    for ax in axes.flat[len(cameras) :]:
+        ax.set_axis_off()
+    for camera, ax in zip(cameras, axes.flat, strict=False):
+        _draw_panel(dataset, camera, clouds, boxes, chosen, ax)
+        if is_frame:
+            set_title(ax, f"{camera.rsplit('/', 3)[1]}, Camera_Front")
+    draw_legend(fig, agent_handles(clouds))
+    whose = "each agent" if len(names) > 1 else names[0]
+    where = record["frame_token"] if is_frame else record["token"]
+    set_scene_title(fig, dataset, where, f"LiDAR of {whose}")
+    write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
+    return fig
+
+
+def _present(dataset: Dataset, row: RowArgument) -> tuple[str, bool]:
+    """The token of a sample (of a frame's first one), and whether the row is a frame."""
+    try:
+        return dataset.get("sample", row)["token"], False
+    except TokenError:
+        return dataset.samples_of(row)[0]["token"], True
+
+
+def _draw_panel(
+    dataset: Dataset,
+    camera: str,
+    clouds: dict[str, LidarPointCloud],
+    boxes: Boxes,
+    layers: frozenset[Layer],
+    ax: Axes,
+) -> None:
+    record = dataset.get("sample_data", camera)
+    sample = dataset.get("sample", record["sample_token"])
+    draw_image(dataset, record, ax, image="image" in layers)
+    for agent, cloud in clouds.items():
+        points = project_to_image(dataset, cloud, sample, record, colors=False)
+        draw_points_in_image(points.pixels[points.mask], ax, size=1.2, color=AGENT_COLORS[agent])
+    own = dataset.get("agent", sample["agent_token"])["actor_id"]
+    optical = boxes.transform(dataset.world_from(sample, record["channel"]).inverse(), record["channel"])
+    near = np.linalg.norm(optical.center, axis=1) < _FARTHEST
+    draw_camera_boxes(dataset, record, optical.select(near & (optical.actor_id != own)), layers, ax)

@@ -9,10 +9,17 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, PostProcessing, motion_labels
-from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, settled
-from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.motion_cells import draw_key, draw_map_of, draw_trail_of
-from deepaccident_devkit.render.motion_maps import MAPS, DrawnMap, MotionMaps, maps_of_labels, maps_of_output
+from deepaccident_devkit.render.axes import Layer, axes_or_new, figure_or_new, layers_of, settled
+from deepaccident_devkit.render.motion_maps import (
+    MAPS,
+    DrawnMap,
+    MotionMaps,
+    draw_key,
+    draw_map_of,
+    draw_trail_of,
+    maps_of_labels,
+    maps_of_output,
+)
 from deepaccident_devkit.render.roles import collider_ids, recorder_ids
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title

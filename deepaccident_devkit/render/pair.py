@@ -11,20 +11,20 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.render.axes import Layer
 from deepaccident_devkit.render.best_view import BestView, best_view, crop_about
-from deepaccident_devkit.render.bev import draw_underlay
 from deepaccident_devkit.render.boxes import (
     bounds_in_image,
     draw_actors_from_above,
     draw_boxes_in_image,
+    draw_trails,
 )
 from deepaccident_devkit.render.camera import CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
 from deepaccident_devkit.render.colors import CASING_COLOR, COLLIDER_COLOR, GRID_COLOR
-from deepaccident_devkit.render.layers import Layer
-from deepaccident_devkit.render.missing import is_there
+from deepaccident_devkit.render.ground import draw_underlay
+from deepaccident_devkit.render.legends import is_there
 from deepaccident_devkit.render.roles import actor_tags, camera_name, role_colors
-from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, FRAME_PERIOD
 from deepaccident_devkit.v2x import Contact

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.render.axes import detached_figure, settled
-from deepaccident_devkit.render.styles import style_dpi
+from deepaccident_devkit.render.styles import current_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,7 +56,7 @@ def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: flo
     path = check_picture_path(path)
     figure: Any = drawn.figure
     try:
-        return write_figure(figure, path, dpi=dpi or style_dpi())
+        return write_figure(figure, path, dpi=dpi or current_style().dpi)
     finally:
         plt.close(figure)
 

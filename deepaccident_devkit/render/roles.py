@@ -30,14 +30,19 @@ def collider_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
 def recorder_ids(dataset: Dataset, sample: RowArgument) -> dict[int, AgentName]:
     """The label ids, in this sample, of the recording vehicles → their agents: −100 is the sample's own."""
     record = dataset.get("sample", sample)
-    actors = agent_actors(dataset, record["scenario_token"])
-    return {OWN_ACTOR_ID if agent == record["agent"] else actor: agent for agent, actor in actors.items()}
+    recorders = recorders_of(dataset, record["scenario_token"])
+    return {OWN_ACTOR_ID if agent == record["agent"] else actor: agent for actor, agent in recorders.items()}
 
 
-def agent_actors(dataset: Dataset, scenario: str) -> dict[AgentName, int]:
-    """The recording vehicles of a scenario (a token) → their actor ids, if meta names them."""
+def recorders_of(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
+    """The actor ids of a scenario's (a token's) recording vehicles, as far as meta names them → their agents."""
     actors = {agent: dataset.agent.get(f"{scenario}/{agent}")["actor_id"] for agent in agents_of(dataset, scenario)}
-    return {agent: actor for agent, actor in actors.items() if actor is not None}
+    return {actor: agent for agent, actor in actors.items() if actor is not None}
+
+
+def agent_letters(agent: str) -> str:
+    """An agent in one or two letters: E, EB, O, OB or I."""
+    return "".join(word[0] for word in short_name(agent).split()).upper()
 
 
 def actor_color(category: str, agent: str | None = None, *, collides: bool = False) -> str:
@@ -60,17 +65,14 @@ def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str
 def label_ids(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[int]:
     """The label ids, in this sample, of boxes that may have CARLA's: the agent itself is −100."""
     own = dataset.get("agent", dataset.get("sample", sample)["agent_token"])["actor_id"]
-    ids: list[int] = np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist()
-    return ids
+    return list(np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist())
 
 
 def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:
     """Short names of the two that collide: the initials of agents, such as `E` and `OB`, else the category."""
-    agents = {actor: agent for agent, actor in agent_actors(dataset, contact.frame.rsplit("/", 1)[0]).items()}
+    agents = recorders_of(dataset, contact.frame.rsplit("/", 1)[0])
     return {
-        actor: "".join(word[0].upper() for word in short_name(agents[actor]).split())
-        if actor in agents
-        else dataset.instance.get(instance)["category"]
+        actor: agent_letters(agents[actor]) if actor in agents else dataset.instance.get(instance)["category"]
         for actor, instance in zip(contact.actor_ids, contact.instances, strict=True)
     }
 

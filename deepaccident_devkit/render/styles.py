@@ -39,15 +39,13 @@ class _Style:
 
 
 _TEXT: Final = {"font.size": 9, "axes.titlesize": 9, "figure.titlesize": 10, "pdf.fonttype": 42, "ps.fonttype": 42}
-_NOTEBOOK: Final = _Style(dpi=100, rc={})
 _STYLES: Final[Mapping[str, _Style]] = {
     "paper": _Style(dpi=300, panel=3.5, figure=7.2, tokens=False, rc=_TEXT),
     # letters of 9 points are large on a slide that is 8 inches wide
     "slide": _Style(dpi=240, panel=8.0, figure=8.0, ratio=16 / 9, tokens=False, rc=_TEXT),
 }
+_NOTEBOOK: Final = _Style(dpi=100, rc={})
 _current: ContextVar[_Style] = ContextVar("style", default=_NOTEBOOK)
-
-
 _applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
 _ONE_AT_A_TIME: Final = RLock()  # matplotlib has its settings once for all threads
 
@@ -110,16 +108,6 @@ def style(name: StyleName) -> Iterator[None]:
 def current_style() -> _Style:
     """The style of pictures that are made now."""
     return _current.get()
-
-
-def has_tokens() -> bool:
-    """Whether titles of the current style have tokens."""
-    return _current.get().tokens
-
-
-def style_dpi() -> float:
-    """Pixels an inch of the current style."""
-    return _current.get().dpi
 
 
 def size_in_style(size: tuple[float, float], *, panels: Literal["one", "several"]) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import MUTED_COLOR
-from deepaccident_devkit.render.styles import has_tokens
+from deepaccident_devkit.render.styles import current_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,7 +96,9 @@ def set_title(
     font = FontProperties(size=fontsize or rcParams["axes.titlesize" if panel else "figure.titlesize"])
     room = 72 * room_of(where)
     text, size = _fitted(words, font, room, SMALLEST_TEXT)
-    small, small_size = _fitted(token if has_tokens() else "", FontProperties(size=_TOKEN_TEXT), room, _TOKEN_TEXT)
+    small, small_size = _fitted(
+        token if current_style().tokens else "", FontProperties(size=_TOKEN_TEXT), room, _TOKEN_TEXT
+    )
     # blank lines keep the room for the token, so that the layout need not know of it
     blank = math.ceil(small_size * (small.count("\n") + 1) / size) if small else 0
     text += "\n " * blank

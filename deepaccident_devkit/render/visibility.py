@@ -1,37 +1,44 @@
-"""Who sees whom: the actors of a moment from above with the agents that see them, and as a table."""
+"""Who sees whom, computed once and rendered from above or as a table."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, cast, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, settled, with_light_grid
-from deepaccident_devkit.render.bev import draw_points_from_above
-from deepaccident_devkit.render.boxes import (
-    draw_boxes_from_above,
-    draw_ids_from_above,
-    draw_velocities_from_above,
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.render.axes import (
+    Layer,
+    axes_or_new,
+    axis_words,
+    check_view_range,
+    layers_of,
+    settled,
+    with_light_grid,
 )
+from deepaccident_devkit.render.bev import draw_points_from_above
+from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, draw_velocities_from_above
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
-from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.legends import agent_handles, draw_legend
-from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
+from deepaccident_devkit.render.legends import agent_handles, draw_legend, has_cloud, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors
-from deepaccident_devkit.render.sights import Sights, sights
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
-from deepaccident_devkit.taxonomy import Frame, short_name
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID, Frame, short_name
 from deepaccident_devkit.text import choice
-from deepaccident_devkit.v2x import Agents, aggregate_point_cloud
+from deepaccident_devkit.v2x import Agents, aggregate_point_cloud, cooperating_agents, cooperative_boxes
+from deepaccident_devkit.v2x.cooperation import visible_actors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_FRAME_SLASHES: Final = 2
+"""The slashes of a frame's token, `<scenario_type>/<name>/<NNN>`; a sample's token has one more, for the agent."""
 VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "velocities", "visibility", "grid")
 _SHOWN: Final[tuple[Layer, ...]] = ("boxes", "visibility", "grid")
 _MARGIN: Final = 10.0
@@ -51,6 +58,116 @@ _MIDDLE: Final = 0.36
 _MOST_ROWS: Final = 24
 _BRIGHT: Final = 0.3
 """Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sights(FrozenArrays):
+    """N tracked actors of a moment and the A agents that may see them; arrays are read-only.
+
+    Attributes:
+        sample: token of the sample whose agent is the ego.
+        agents: the agents that look, the ego first if it is one of them.
+        boxes: the actors in one frame, by ascending id; an agent's own has the agent's actor id.
+        place: (A, 2) x and y of the agents in that frame, metres.
+        actor: (A,) int64 the agents' own actor ids; −1 for the infrastructure, and if meta does not give it.
+        seen: (N, A) bool: whether the agent counts as seeing the actor.
+        annotated: (N, A) bool: whether its label has the actor at all.
+        points: (N, A) int64: LiDAR points of the agent in the box that its label has.
+        pair: actor ids of the two that collide; empty if nobody does.
+    """
+
+    sample: str
+    agents: tuple[str, ...]
+    boxes: Boxes
+    place: FloatArray
+    actor: IntArray
+    seen: BoolArray
+    annotated: BoolArray
+    points: IntArray
+    pair: frozenset[int]
+
+    @property
+    def ego(self) -> str:
+        """The name of the sample's agent."""
+        return self.sample.rsplit("/", 2)[1]
+
+    @property
+    def own(self) -> BoolArray:
+        """(N, A) whether the actor is the agent itself."""
+        return np.asarray(self.boxes.actor_id[:, None] == self.actor)
+
+    @property
+    def collides(self) -> BoolArray:
+        """(N,) whether the actor is one of the colliding pair."""
+        return np.isin(self.boxes.actor_id, [*self.pair])
+
+    @property
+    def records(self) -> BoolArray:
+        """(N,) whether the actor is one of the agents."""
+        return np.isin(self.boxes.actor_id, self.actor[self.actor >= 0])
+
+    def hidden_from(self, agent: str) -> BoolArray:
+        """(N,) which actors of the accident (the pair and the agents, without itself) an agent does not see.
+
+        All are False if the agent is not one of those that look, or if nobody collides.
+        """
+        if agent not in self.agents or not self.pair:
+            return np.zeros(len(self.boxes), dtype=bool)
+        column = self.agents.index(agent)
+        return np.asarray((self.collides | self.records) & ~self.seen[:, column] & ~self.own[:, column])
+
+
+def sights(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: str = "ego") -> Sights:
+    """Which of some agents see which of the actors that any agent annotated.
+
+    Args:
+        dataset: the release.
+        moment: token or record of a sample, or of a frame: then its first agent's sample is taken.
+        agents: the agents that look, as `visible_instances` takes them; None for all that are there.
+        frame: coordinate frame of the result, of the sample.
+
+    Raises:
+        TokenError: no such sample or frame.
+        ChoiceError: no such agent, configuration or frame.
+        NotAvailableError: an agent is not in this (partial) release.
+    """
+    sample = sample_at(dataset, moment)
+    scenario, _, number = sample.rsplit("/", 2)
+    looking = cooperating_agents(dataset, sample, agents)
+    there = cooperative_boxes(dataset, sample, frame=frame)
+    boxes = there.select(there.actor_id != UNTRACKED_ID)
+    frame_from_world = dataset.world_from(sample, frame).inverse()
+    shape = len(boxes), len(looking)
+    seen, annotated = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    points, place = np.zeros(shape, dtype=np.int64), np.zeros((len(looking), 2))
+    for column, agent in enumerate(looking):
+        own = sample_token(scenario, agent, int(number))
+        seen[:, column] = np.isin(boxes.actor_id, visible_actors(dataset, own, agents=[agent]))
+        label, ids = dataset.boxes(own, "lidar"), dataset.actor_ids(own)
+        ids = np.where(label.actor_id == OWN_ACTOR_ID, UNTRACKED_ID, ids)
+        _, row, label_row = np.intersect1d(boxes.actor_id, ids, return_indices=True)
+        annotated[row, column], points[row, column] = True, label.num_lidar_pts[label_row]
+        place[column] = (frame_from_world @ dataset.world_from(own, "ego")).translation[:2]
+    collision = dataset.get("scenario", scenario)["collision"]
+    actors = (dataset.agent.get(f"{scenario}/{agent}")["actor_id"] for agent in looking)
+    return Sights(
+        sample=sample,
+        agents=tuple(looking),
+        boxes=boxes,
+        place=place,
+        actor=np.array([UNTRACKED_ID if actor is None else actor for actor in actors], dtype=np.int64),
+        seen=seen,
+        annotated=annotated,
+        points=points,
+        pair=frozenset() if collision is None else frozenset(collision["ids"]),
+    )
+
+
+def sample_at(dataset: Dataset, moment: RowArgument) -> str:
+    """Token of a sample, or of a frame's first sample; raises TokenError if `moment` is neither."""
+    token = str(moment["token"]) if isinstance(moment, Mapping) else moment
+    is_frame = token.count("/") == _FRAME_SLASHES
+    return str((dataset.samples_of(token)[0] if is_frame else dataset.get("sample", token))["token"])
 
 
 @in_own_settings
@@ -254,8 +371,7 @@ def _write_hidden(known: Sights, hidden: BoolArray, ax: Axes) -> None:
 
 
 def _draw_agents(known: Sights, ax: Axes) -> None:
-    for agent, place in zip(known.agents, known.place.tolist(), strict=True):
-        x, y = place
+    for agent, (x, y) in zip(known.agents, known.place.tolist(), strict=True):
         ax.plot(x, y, "*", color=AGENT_COLORS[agent], markeredgecolor="white", markersize=10, zorder=5)
     if known.ego in known.agents:
         x, y = known.place[known.agents.index(known.ego)].tolist()

@@ -34,3 +34,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     driver = Chrome(options=options, service=Service(shutil.which("chromedriver")))
     yield Browser(driver)
     driver.quit()
+
+
+@pytest.fixture(params=["light", "dark"])
+def scheme(request: pytest.FixtureRequest, browser: Browser) -> Iterator[str]:
+    """What the browser says of its reader's system: light or dark."""
+    features = [{"name": "prefers-color-scheme", "value": request.param}]
+    browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    yield request.param
+    browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})

@@ -133,13 +133,6 @@ def test_it_plays_to_the_impact(opened: Browser) -> None:
     assert opened.complaints() == []
 
 
-def test_it_plays_in_real_time(opened: Browser) -> None:
-    begin = time.monotonic()
-    click(opened, "play")
-    wait_until(lambda: frame(opened) >= 10)
-    assert 0.9 < time.monotonic() - begin < 5  # ten frames are a second; slow machines drop frames
-
-
 def test_scrubbing_moves_everybody(opened: Browser) -> None:
     before = drawn(opened)
     scrub(opened, 17)
@@ -193,22 +186,10 @@ def test_the_impact_is_marked_where_the_pair_meets(opened: Browser, da_motion: D
         wanted = mixed(COLLIDER_COLOR, 0.75)
         return sum(np.abs(np.array(each[:3]) - wanted).max() < 12 for each in pixels_at(opened, around, origin))
 
-    def ray(pixels: float) -> int:
-        """How many of the eight rays of the mark there are at a distance from its middle."""
-        scale = float(opened.script("return document.getElementById('ground').dataset.view").split()[2])
-        turns, aside = np.meshgrid(np.arange(8) * np.pi / 4, [-1, 0, 1], indexing="ij")  # the line lies between pixels
-        along, across = np.array([np.cos(turns), np.sin(turns)]), np.array([-np.sin(turns), np.cos(turns)])
-        places = contact.point[:2] + (pixels * along + aside * across).reshape(2, -1).T / scale
-        colors = np.array(pixels_at(opened, places, origin))[:, :3]
-        off = np.abs(colors - mixed(COLLIDER_COLOR, 1)).max(axis=1).reshape(turns.shape)
-        return int((off.min(axis=1) < 100).sum())
-
     assert red() == 0
-    assert (ray(7), ray(23)) == (8, 0)
     assert opened.script("return document.body.classList.contains('impact')") is False
     scrub(opened, FRAMES - 1)
     assert red() > 3
-    assert ray(23) == 8
     assert opened.script("return document.body.classList.contains('impact')") is True
     assert opened.script("return getComputedStyle(document.getElementById('ground')).animationName") == "flash"
 
@@ -384,12 +365,6 @@ def test_the_road_lies_beneath(browser: Browser, recorded: Path) -> None:
     with_it = drawn(browser)
     click(browser, "layer-road")
     assert drawn(browser) != with_it
-
-
-def test_it_loads_soon(browser: Browser, recorded: Path) -> None:
-    browser.open(recorded, 1280)
-    times = "const [times] = performance.getEntriesByType('navigation'); return times.loadEventEnd"
-    assert 0 < browser.script(times) < 3000
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,12 @@ Styles and scripts have addresses that change with their content, so that browse
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any, Final
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 from markupsafe import Markup
 from starlette.exceptions import HTTPException
@@ -20,12 +22,15 @@ from starlette.routing import Route
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.pages import part, path_in_address
 from deepaccident_devkit.pages import rendered as filled
+from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.replay import replay_script, replay_style
-from deepaccident_devkit.render.theme import page_style
 
 KEPT: Final = "private, max-age=600"
 """A browser may keep pictures for some minutes: files of a release seldom change."""
 _FOREVER: Final = "private, max-age=31536000, immutable"
+LISTED: Final = 100
+"""Entries of a long list on one page."""
+_LAST_PAGE: Final = 1_000_000
 _KINDS: Final = {"css": "text/css", "js": "text/javascript"}
 
 
@@ -119,3 +124,45 @@ async def _answer(request: Request) -> Response:
         raise HTTPException(404)
     kind = _KINDS[name.rpartition(".")[2]]
     return Response(assets()[name], media_type=kind, headers={"Cache-Control": _FOREVER})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A page of a long list.
+
+    Attributes:
+        entries: of this page.
+        count: of all pages.
+        here: number of this page, from 1.
+        pages: number of the last page.
+        before: parameters of the address of the page before; empty if this is the first one.
+        after: of the page after.
+    """
+
+    entries: Sequence[Any]
+    count: int
+    here: int
+    pages: int
+    before: str
+    after: str
+
+
+def part_of(request: Request, items: Sequence[Any], size: int = LISTED) -> Part:
+    """The page of a list that the address names by `page`, with so many entries."""
+    given = request.query_params.get("page", "")
+    pages = max(1, -(-len(items) // size))
+    asked = int(given) if given.isascii() and given.isdigit() and len(given) < len(str(_LAST_PAGE)) else 1
+    here = min(max(asked, 1), pages)
+
+    def address(number: int) -> str:
+        others = [(name, value) for name, value in request.query_params.multi_items() if name != "page"]
+        return f"?{urlencode([*others, ('page', str(number))])}" if 1 <= number <= pages else ""
+
+    return Part(
+        entries=items[(here - 1) * size : here * size],
+        count=len(items),
+        here=here,
+        pages=pages,
+        before=address(here - 1),
+        after=address(here + 1),
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from starlette.exceptions import HTTPException
@@ -13,7 +14,6 @@ from starlette.routing import Route
 
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.pages.answers import KEPT, explorer_of, picture
-from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render import detached_figure, render_motion_labels, render_sample
 from deepaccident_devkit.render.replay import cloud_text
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
@@ -22,8 +22,11 @@ SCENARIO: Final = "/scenario/{type}/{name}"
 _WIDTHS: Final = (160, 320, 640, 960, 1600)
 """Pixels that an image may be asked for: few, so that they are kept."""
 _QUALITY: Final = 80
-_SAMPLE_SIZE: Final = (15.5, 5.4)
-_LABELS_SIZE: Final = (12.5, 9.4)
+_VIEWS: Final[Mapping[str, tuple[Callable[..., Any], tuple[float, float]]]] = {
+    "sample": (render_sample, (15.5, 5.4)),
+    "labels": (render_motion_labels, (12.5, 9.4)),
+}
+"""What is rendered of a moment → by what, and how large in inches."""
 
 
 def routes() -> list[Route]:
@@ -32,8 +35,7 @@ def routes() -> list[Route]:
         Route("/thumbnail/{type}/{name}.jpg", _thumbnail),
         Route(f"{SCENARIO}/images/{{agent}}/{{channel}}/{{frame:int}}", _image),
         Route(f"{SCENARIO}/points/{{agent}}/{{frame:int}}", _points),
-        Route(f"{SCENARIO}/moment/{{agent}}/{{frame:int}}/sample.png", _sample),
-        Route(f"{SCENARIO}/moment/{{agent}}/{{frame:int}}/labels.png", _labels),
+        Route(f"{SCENARIO}/moment/{{agent}}/{{frame:int}}/{{view}}.png", _view),
     ]
 
 
@@ -91,20 +93,10 @@ def _points(request: Request) -> Response:
     return PlainTextResponse(coded, headers={"Cache-Control": KEPT})
 
 
-def _sample(request: Request) -> Response:
-    sample, explorer = sample_of(request), explorer_of(request)
-
-    def draw() -> Any:
-        return render_sample(explorer.dataset, sample, fig=detached_figure(_SAMPLE_SIZE))
-
-    return picture(explorer.drawn(("sample", sample), draw), "png")
-
-
-def _labels(request: Request) -> Response:
-    sample, explorer = sample_of(request), explorer_of(request)
-
-    def draw() -> Any:
-        config = MotionLabelConfig()
-        return render_motion_labels(explorer.dataset, sample, config=config, fig=detached_figure(_LABELS_SIZE))
-
-    return picture(explorer.drawn(("labels", sample), draw), "png")
+def _view(request: Request) -> Response:
+    explorer, sample, name = explorer_of(request), sample_of(request), request.path_params["view"]
+    if name not in _VIEWS:
+        raise HTTPException(404)
+    draw, size = _VIEWS[name]
+    made = explorer.drawn((name, sample), lambda: draw(explorer.dataset, sample, fig=detached_figure(size)))
+    return picture(made, "png")

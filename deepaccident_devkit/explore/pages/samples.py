@@ -2,33 +2,179 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, Final
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from deepaccident_devkit.errors import EvaluationError, NotAvailableError, TokenError
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
-from deepaccident_devkit.explore.evaluations import finite
+from deepaccident_devkit.evaluation.runs.setups import SampleLoader
+from deepaccident_devkit.explore.background import Job
+from deepaccident_devkit.explore.evaluations import finite, other_values, verdict
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.models import Model
-from deepaccident_devkit.explore.pages.answers import explorer_of, page, picture
-from deepaccident_devkit.explore.pages.model_addresses import (
-    SAMPLE,
-    beside_in_time,
-    known_sample,
-    model_of,
-    sample_path,
-)
-from deepaccident_devkit.explore.pages.release_tabs import part_of
-from deepaccident_devkit.explore.predicted import Shown, frames_ahead, picture_of, rules_words, why_not
+from deepaccident_devkit.explore.pages.answers import explorer_of, page, part_of, picture
+from deepaccident_devkit.explore.pages.pictures import sample_of
 from deepaccident_devkit.explore.sample_lists import ORDERS, SampleChoices, is_sample, listed
-from deepaccident_devkit.explore.verdicts import other_values, verdict
+from deepaccident_devkit.pages import path_in_address
+from deepaccident_devkit.render.axes import detached_figure
+from deepaccident_devkit.render.outcomes import render_evaluation, render_outcome_in_cameras
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+if TYPE_CHECKING:
+    from deepaccident_devkit.explore.explorer import Explorer
+    from deepaccident_devkit.explore.models import Model
+
+Kind = Literal["above", "cameras"]
+Size = Literal["whole", "half"]
+_SIZES: Final[Mapping[tuple[Kind, Size], tuple[float, float]]] = {
+    ("above", "whole"): (12.4, 6.9),
+    ("above", "half"): (7.7, 4.6),
+    ("cameras", "whole"): (15.2, 7.4),
+    ("cameras", "half"): (7.7, 4.7),
+}
+"""Inches; half is for two side by side."""
+_OTHER_HORIZON: Final = 2.0
+"""Seconds that the pictures of explicit accidents look ahead."""
+SAMPLE = "{type}/{name}/{agent}/{frame:int}"
 PAGE: Final = 60
 """Samples on a page of the list."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """Which picture.
+
+    Attributes:
+        kind: from above or in the cameras.
+        size: of the picture.
+        ahead: of motion in cameras: frames ahead, 0 for the present.
+    """
+
+    kind: Kind
+    size: Size = "whole"
+    ahead: int = 0
+
+
+def why_not(explorer: Explorer, model: Model, token: str) -> str:
+    """Why there is no picture of a sample, in a sentence; empty if there is one."""
+    if not is_sample(explorer.dataset, token):
+        return "This sample is not in this release."
+    if model.results is None:
+        return f"The predictions of {model.name} were not given."
+    if not model.has(token):
+        return f"{model.name} predicts nothing for this sample."
+    try:
+        SampleLoader(explorer.dataset, model.results, model.setup)
+    except EvaluationError as error:
+        return str(error)
+    return _why_no_truth(explorer, token, needs_meta=_task(model) == "accident")
+
+
+def _why_no_truth(explorer: Explorer, token: str, *, needs_meta: bool) -> str:
+    if not explorer.dataset.get("sample", token)["labelled"]:
+        return "This sample has no label, so that there is no truth to compare with."
+    if needs_meta and explorer.dataset.get("scenario", scenario_of(token))["weather"] is None:
+        return "This scenario has no meta file, which names the colliding pair."
+    return ""
+
+
+def rules_words(model: Model) -> str:
+    """How far the pictures are not made by the bundle's own rules; empty if they are."""
+    if model.setup.task == "warning":
+        return "Warnings are judged over whole recordings; these pictures judge single accidents."
+    if _task(model) == "accident" and model.results is not None:
+        form = model.results.form
+        ahead = _OTHER_HORIZON if form is None else (form.frames - 1) * form.step
+        if abs(ahead - model.setup.horizon) > FRAME_PERIOD / 2:
+            return f"These pictures look {ahead:g} s ahead, the evaluation {model.setup.horizon:g} s."
+    return ""
+
+
+def picture_of(explorer: Explorer, model: Model, token: str, shown: Shown) -> bytes:
+    """A picture as PNG; raises NotAvailableError with the words of `why_not`, or ChoiceError: no such frame."""
+    reason = why_not(explorer, model, token)
+    if reason:
+        raise NotAvailableError(f"{token}: {reason}")
+    return explorer.drawn(("predicted", model.name, token, shown), lambda: _figure(explorer, model, token, shown))
+
+
+def frames_ahead(explorer: Explorer, model: Model, token: str) -> list[float]:
+    """Seconds ahead of the frames that motion is evaluated at and that are recorded; none of other tasks."""
+    form = None if model.results is None else model.results.form
+    if model.setup.task != "motion" or form is None or not is_sample(explorer.dataset, token):
+        return []
+    left = float(explorer.dataset.get("sample", token)["time_to_end"])
+    last = min(model.setup.horizon, left)
+    return [number * form.step for number in range(int((last + FRAME_PERIOD / 2) / form.step) + 1)]
+
+
+def _task(model: Model) -> str:
+    return "accident" if model.setup.task == "warning" else model.setup.task
+
+
+def _figure(explorer: Explorer, model: Model, token: str, shown: Shown) -> Any:
+    results = model.results
+    if results is None:
+        raise NotAvailableError(f"{model.name}: its predictions were not given")
+    loader = SampleLoader(explorer.dataset, results, model.setup)
+    prediction, rules = results.prediction(token), model.setup.rules
+    how: dict[str, Any] = {"task": _task(model), "protocol": None if model.setup.task == "warning" else rules}
+    if isinstance(prediction, DetectedBoxes):
+        prediction = loader.detected(token, prediction, rules.frame)
+    else:
+        how["label"] = loader.label(token)
+    figure = detached_figure(_SIZES[shown.kind, shown.size])
+    if shown.kind == "above":
+        return render_evaluation(explorer.dataset, token, prediction, **how, fig=figure)
+    frame = shown.ahead if model.setup.task == "motion" else None
+    return render_outcome_in_cameras(explorer.dataset, token, prediction, **how, frame=frame, fig=figure)
+
+
+def model_of(request: Request, name: str = "model") -> Model:
+    """The model that a part of an address names; raises NotAvailableError."""
+    given, models = request.path_params[name], explorer_of(request).models
+    if given not in models:
+        raise NotAvailableError(f"there is no model {given!r}; those that were given: {', '.join(models) or 'none'}")
+    return models[given]
+
+
+def sample_path(token: str) -> str:
+    """A sample in an address: `type/scenario/agent/12`."""
+    scenario, _, frame = token.rpartition("/")
+    return path_in_address(f"{scenario}/{int(frame)}" if frame.isdecimal() and frame.isascii() else token)
+
+
+def known_sample(request: Request, *models: Model) -> str:
+    """The sample that an address names; raises TokenError if neither the release nor a model has it."""
+    token = sample_of(request)
+    if not is_sample(explorer_of(request).dataset, token) and not any(token in model.tokens for model in models):
+        raise TokenError(f"neither the release nor {', '.join(each.name for each in models)} has the sample {token!r}")
+    return token
+
+
+def beside_in_time(tokens: Iterable[str], token: str) -> tuple[str | None, str | None]:
+    """The samples before and after one, of those of the same agent."""
+    recording = token.rpartition("/")[0] + "/"
+    same = sorted(each for each in tokens if each.startswith(recording))
+    before, after = [each for each in same if each < token], [each for each in same if each > token]
+    return before[-1] if before else None, after[0] if after else None
+
+
+def titles(jobs: Iterable[Job]) -> list[str]:
+    """What is waited for, of the jobs that are not done."""
+    return [job.title for job in jobs if not job.is_done]
+
+
+def models_of_task(explorer: Explorer, task: str) -> list[Model]:
+    """The evaluated models of a task."""
+    return [each for each in explorer.models.values() if each.bundle is not None and each.setup.task == task]
 
 
 def routes() -> list[Route]:
@@ -36,8 +182,7 @@ def routes() -> list[Route]:
     return [
         Route("/model/{model}/samples", _samples),
         Route(f"/model/{{model}}/sample/{SAMPLE}", _sample),
-        Route(f"/model/{{model}}/sample/{SAMPLE}/above.png", _above),
-        Route(f"/model/{{model}}/sample/{SAMPLE}/cameras.png", _cameras),
+        Route(f"/model/{{model}}/sample/{SAMPLE}/{{kind}}.png", _picture),
     ]
 
 
@@ -128,10 +273,7 @@ def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, An
 
 def _remedy(model: Model) -> str:
     """Where the results were of a bundle that has none to show; empty if there are results."""
-    if model.results is not None or model.bundle is None:
-        return ""
-    path: str = model.bundle.summary["results"]["path"]
-    return path
+    return "" if model.results is not None or model.bundle is None else str(model.bundle.summary["results"]["path"])
 
 
 def place_in(tokens: Sequence[str], token: str) -> dict[str, Any] | None:
@@ -148,21 +290,13 @@ def place_in(tokens: Sequence[str], token: str) -> dict[str, Any] | None:
     }
 
 
-def _above(request: Request) -> Response:
-    return _picture(request, Shown(kind="above", size=_size(request)))
-
-
-def _cameras(request: Request) -> Response:
-    return _picture(request, Shown(kind="cameras", size=_size(request), ahead=asked_ahead(request)))
-
-
-def _picture(request: Request, shown: Shown) -> Response:
-    explorer, model = explorer_of(request), model_of(request)
+def _picture(request: Request) -> Response:
+    explorer, model, kind = explorer_of(request), model_of(request), request.path_params["kind"]
+    if kind not in get_args(Kind):
+        raise HTTPException(404)
+    size: Size = "half" if request.query_params.get("size") == "half" else "whole"
+    shown = Shown(kind=kind, size=size, ahead=asked_ahead(request) if kind == "cameras" else 0)
     return picture(picture_of(explorer, model, known_sample(request, model), shown), "png")
-
-
-def _size(request: Request) -> Any:
-    return "half" if request.query_params.get("size") == "half" else "whole"
 
 
 def asked_ahead(request: Request) -> int:

@@ -18,7 +18,7 @@ from deepaccident_devkit.explore.pages.answers import explorer_of, page, rendere
 from deepaccident_devkit.explore.pages.pictures import SCENARIO, sample_of, token_of
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.render.replay import script_json
-from deepaccident_devkit.render.roles import agent_actors
+from deepaccident_devkit.render.roles import recorders_of
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, describe, lead_times, twin_diff, twin_of
 from deepaccident_devkit.taxonomy import short_name
 from deepaccident_devkit.validation import findings
@@ -124,14 +124,6 @@ def part_context(dataset: Dataset, token: str, name: str) -> dict[str, Any]:
     return {"token": token, "missing": None, **context}
 
 
-def _story(dataset: Dataset, token: str) -> dict[str, Any]:
-    return {"text": describe(dataset, token).text}
-
-
-def _findings(dataset: Dataset, token: str) -> dict[str, Any]:
-    return {"findings": findings(dataset, token)}
-
-
 def _pairs(dataset: Dataset, token: str) -> dict[str, Any]:
     """Pairs that come near each other, the soonest collision first."""
     pairs = interactions(dataset, token).pairs
@@ -151,7 +143,7 @@ def _pairs(dataset: Dataset, token: str) -> dict[str, Any]:
 
 
 def _actor_names(dataset: Dataset, token: str) -> Callable[[int], str]:
-    agents = {actor: short_name(agent) for agent, actor in agent_actors(dataset, token).items()}
+    agents = {actor: short_name(agent) for actor, agent in recorders_of(dataset, token).items()}
 
     def name(actor: int) -> str:
         kind = dataset.get("instance", f"{token}/actor/{actor}")["category"]
@@ -193,11 +185,11 @@ PARTS: Final[Mapping[str, str]] = {
 }
 """Part → its heading."""
 _CONTEXTS: Final[Mapping[str, Callable[[Dataset, str], dict[str, Any]]]] = {
-    "story": _story,
+    "story": lambda dataset, token: {"text": describe(dataset, token).text},
     "pairs": _pairs,
     "ledger": _ledger,
     "twins": _twins,
-    "findings": _findings,
+    "findings": lambda dataset, token: {"findings": findings(dataset, token)},
 }
 
 

@@ -130,15 +130,11 @@ def entry(
         "type": record["scenario_type"],
         "record": record,
         "ending": ending(record),
-        "weather": _setting(record),
+        "weather": ", ".join(filter(None, (record["weather"], record["time_of_day"]))),
         "cells": [*measures.values(), *scores.values()],
         "scores": scores,
         "sorted": named[sort].text if sort in named else "",
     }
-
-
-def _setting(record: ScenarioRecord) -> str:
-    return ", ".join(filter(None, (record["weather"], record["time_of_day"])))
 
 
 def cell(value: float | str | None) -> Cell:

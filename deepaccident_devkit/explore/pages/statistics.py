@@ -15,7 +15,7 @@ from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.choices import Choices, Found, found_by
 from deepaccident_devkit.explore.explorer import DPI, Explorer
 from deepaccident_devkit.explore.pages.answers import explorer_of, picture
-from deepaccident_devkit.explore.pages.release_tabs import release_page
+from deepaccident_devkit.explore.pages.release import release_page
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.statistics import STATISTICS_FIGURES, render_statistics
 from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics

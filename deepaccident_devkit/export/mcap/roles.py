@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.render.roles import agent_actors
+from deepaccident_devkit.render.roles import recorders_of
 
 
 class Roles:
@@ -15,7 +15,7 @@ class Roles:
         """Read the roles of a scenario from its meta."""
         collision = dataset.get("scenario", scenario)["collision"]
         self.pair: frozenset[int] = frozenset() if collision is None else frozenset(collision["ids"])
-        self.agents: Mapping[int, str] = {actor: agent for agent, actor in agent_actors(dataset, scenario).items()}
+        self.agents: Mapping[int, str] = recorders_of(dataset, scenario)
 
     def role(self, actor: int) -> str:
         """The role of an actor, such as `ego_vehicle, collides`; empty for most actors."""

@@ -6,14 +6,12 @@ from deepaccident_devkit.render.evaluation.accident import (
     render_errors,
     render_outcomes,
 )
-from deepaccident_devkit.render.evaluation.breakdowns import render_breakdown
-from deepaccident_devkit.render.evaluation.comparison import render_comparison
 from deepaccident_devkit.render.evaluation.detection import render_average_precisions, render_precision_recall
+from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
 from deepaccident_devkit.render.evaluation.motion import render_quality_by_time, render_ranges
-from deepaccident_devkit.render.evaluation.prevention import render_prevention
+from deepaccident_devkit.render.evaluation.panels import render_breakdown, render_comparison
 from deepaccident_devkit.render.evaluation.report import save_report
-from deepaccident_devkit.render.evaluation.samples import draw_motion_outcome
-from deepaccident_devkit.render.evaluation.warning import render_predictors
+from deepaccident_devkit.render.evaluation.warning import render_predictors, render_prevention
 
 __all__ = [
     "draw_motion_outcome",

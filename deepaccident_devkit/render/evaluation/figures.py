@@ -1,4 +1,4 @@
-"""The figures of a run, and their files."""
+"""The figures of a run, its worst and best samples among them, and their files."""
 
 from __future__ import annotations
 
@@ -7,26 +7,36 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.arrays import BoolArray
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.evaluation.metrics.accident import compared_accidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.breakdowns import EVERYTHING, WITHIN_RECORDINGS, Breakdown
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
 from deepaccident_devkit.evaluation.metrics.motion.evaluator import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.numbers import Headline, headlines
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult
+from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.render.axes import detached_figure
-from deepaccident_devkit.render.colors import MUTED_COLOR, WARNING_COLOR
-from deepaccident_devkit.render.evaluation import accident, detection, motion, prevention, warning
-from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN, render_breakdown
-from deepaccident_devkit.render.evaluation.panels import PANEL
+from deepaccident_devkit.evaluation.runs.setups import SampleLoader
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.render.axes import axes_or_new, detached_figure, titled_from_above
+from deepaccident_devkit.render.colors import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR
+from deepaccident_devkit.render.evaluation import accident, detection, motion, warning
+from deepaccident_devkit.render.evaluation.panels import PANEL, UNKNOWN, render_breakdown
+from deepaccident_devkit.render.legends import draw_legend_of_fills
+from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_title
+from deepaccident_devkit.render.titles import set_scene_title, set_title
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,13 +58,10 @@ MAIN_NUMBERS: Final = {
 """Task → paths of the headline numbers that figures show by attribute. The first one is shown by all attributes, and
 samples are ranked by it; the others are shown only by time to impact."""
 _BY_TIME: Final = "time_to_impact"
-
-
-class Draw(Protocol):
-    """Renders on axes, and returns them."""
-
-    def __call__(self, *, ax: Axes) -> Axes:
-        """Draw."""
+_EACH: Final = 3
+"""How many of the worst, and of the best, samples are shown."""
+_HEIGHT: Final = 5.6
+"""Inches of a view from above with its title."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,14 +72,14 @@ class RunFigure:
         name: of its file, without the ending.
         caption: what the figure shows, for the reader of the report.
         alt: the same in words and numbers, for readers who cannot see it.
-        draw: renders it on axes.
+        draw: renders it on `ax=`, axes.
         height: in inches.
     """
 
     name: str
     caption: str
     alt: str
-    draw: Draw
+    draw: Callable[..., Axes]
     height: float = PANEL[1]
 
 
@@ -218,13 +225,7 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
             alt="Chance that an accident's score is above another recording's at the same moment, by predictor.",
             draw=partial(warning.render_predictors, result),
         )
-        yield from _prevention(run)
-
-
-def _prevention(run: EvaluationRun) -> Iterator[RunFigure]:
-    if run.prevented is None:
-        return
-    for group in run.prevented.groups:
+    for group in () if run.prevented is None else run.prevented.groups:
         result = group.result
         for name in result.groups:
             yield RunFigure(
@@ -232,7 +233,7 @@ def _prevention(run: EvaluationRun) -> Iterator[RunFigure]:
                 caption=f"Share of the accidents that braking after the alarm avoids, against the braking for false "
                 f"alarms, as the threshold falls: {name}. The upright line is at one braking second a minute.",
                 alt=f"Share avoided over braking seconds a minute; {_listed([('avoided', result.avoided(name))])}.",
-                draw=partial(prevention.render_prevention, result, name),
+                draw=partial(warning.render_prevention, result, name),
             )
 
 
@@ -270,3 +271,100 @@ def _headline(task: str, result: object, path: str) -> Headline | None:
 def _listed(values: Iterable[tuple[str, float | None]]) -> str:
     known = [(name, None if value is None or math.isnan(value) else value) for name, value in values]
     return ", ".join(f"{name} {'–' if value is None else f'{value:.3g}'}" for name, value in known)
+
+
+def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tuple[RunFigure, ...]:
+    """The worst and the best samples of a run by its task's main number, the worst first.
+
+    Samples with nothing to count are left out. The task `warning` has none, because it is about whole recordings.
+
+    Args:
+        run: of `evaluate_results`.
+        dataset: the release.
+        results: the predictions that were evaluated.
+    """
+    if run.setup.task == "warning":
+        return ()
+    ranked = _ranked(run)
+    worst = ranked[: min(_EACH, len(ranked) // 2)]
+    best = ranked[max(len(ranked) - _EACH, len(worst)) :]
+    load = SampleLoader(dataset, results, run.setup)
+    return tuple(
+        RunFigure(
+            name=f"sample_{kind}_{number}",
+            caption=f"One of the {kind} samples: {token}, {text}.",
+            alt=f"Seen from above: the prediction for sample {token} over the truth; {text}.",
+            draw=partial(_draw, load, token, text),
+            height=_HEIGHT,
+        )
+        for kind, chosen in (("worst", worst), ("best", best[::-1]))
+        for number, (token, text) in enumerate(chosen, 1)
+    )
+
+
+@in_own_settings
+def draw_motion_outcome(
+    prediction: MotionOutput, label: MotionLabels, *, frame: int | None = None, ax: Axes | None = None
+) -> Axes:
+    """Render a frame's cells: actors that are predicted, predicted falsely, and missed.
+
+    Args:
+        prediction: of a model; the last of several predictions is rendered.
+        label: the truth, on the same grid; frames in their own ego frames are warped to the present.
+        frame: which one, 0 for the present; None for the last that is recorded.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes, in metres of the present ego frame: forward to the right, left up.
+
+    Raises:
+        EvaluationError: the present is not recorded.
+    """
+    from matplotlib.colors import to_rgb
+
+    ax, truth, grid = axes_or_new(ax, PANEL), labels_at_present(label), label.config.grid
+    frame = frames_there(label) - 1 if frame is None else frame
+    there = prediction.grid.reorient(_actors(prediction, frame), "devkit")
+    true = grid.reorient(truth.segmentation[frame] == 1, "devkit")
+    picture = np.ones((*true.shape, 3))
+    for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
+        picture[cells] = to_rgb(OUTCOME_COLORS[kind])
+    ax.imshow(picture, origin="lower", extent=(*grid.x[:2], *grid.y[:2]), interpolation="nearest")
+    draw_legend_of_fills(ax, OUTCOME_COLORS)
+    seconds = frame * label.config.step * FRAME_PERIOD
+    return titled_from_above(ax, f"actors {seconds:g} s ahead" if frame else "actors now", grid=True)
+
+
+def _draw(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:
+    prediction, truth, *more = load(token)
+    if isinstance(prediction, MotionOutput):
+        draw_motion_outcome(prediction, truth, ax=ax)
+    elif isinstance(prediction, DetectedBoxes):
+        draw_detection_outcome(prediction, truth, load.setup.rules, ax=ax)
+    else:
+        compared = compared_accidents(prediction, truth, more[0], load.setup.rules)
+        draw_accident_outcome(compared, more[0].truth, ax=ax)
+    set_scene_title(ax, load.dataset, token, below=f"{text}: {ax.get_title()}")
+    return ax
+
+
+def _ranked(run: EvaluationRun) -> list[tuple[str, str]]:
+    """Tokens with their main number in words, the worst first."""
+    found: list[tuple[float, str, str]] = []
+    path = MAIN_NUMBERS[run.setup.task][0]
+    for token in sorted(run.evaluator.tokens):
+        shown = headlines(run.setup.task, run.evaluator.compute([token]))
+        found += [
+            (each.value, token, f"{each.name} {each.text()}")
+            for each in shown
+            if each.path == path and each.value is not None
+        ]
+    return [(token, text) for _, token, text in sorted(found)]
+
+
+def _actors(prediction: MotionOutput, frame: int) -> BoolArray:
+    """(H, W) which cells have an actor by the last prediction, in its own orientation."""
+    if prediction.instances is not None:
+        return np.asarray(prediction.instances[-1, frame] > 0)
+    background, actor = (prediction.heads or ())[-1].segmentation[frame]
+    return np.asarray(actor > background)

@@ -1,11 +1,14 @@
 """A sample's prediction beside or over its label: what is right, false and missed."""
 
-from deepaccident_devkit.render.outcomes.accident import draw_accident_outcome
+from deepaccident_devkit.render.outcomes.above import (
+    MotionOutcome,
+    draw_accident_outcome,
+    draw_detection_outcome,
+    draw_motion_side,
+    motion_outcome,
+)
 from deepaccident_devkit.render.outcomes.cameras import draw_outcome_in_camera, render_outcome_in_cameras
-from deepaccident_devkit.render.outcomes.detection import draw_detection_outcome
-from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
-from deepaccident_devkit.render.outcomes.motion import MotionOutcome, draw_motion_side, motion_outcome
-from deepaccident_devkit.render.outcomes.verdicts import Verdict, sample_verdict
+from deepaccident_devkit.render.outcomes.evaluation import Verdict, render_evaluation, sample_verdict
 
 __all__ = [
     "MotionOutcome",

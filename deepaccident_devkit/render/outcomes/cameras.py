@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -12,22 +13,19 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
-from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry import SE3, Boxes, PinholeCamera
 from deepaccident_devkit.maps.polygons import outlines
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, settled
-from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image
+from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image, write_beside
 from deepaccident_devkit.render.camera import draw_image
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, OUTCOME_COLORS
-from deepaccident_devkit.render.legends import draw_legend
-from deepaccident_devkit.render.missing import is_there
+from deepaccident_devkit.render.colors import CASING_COLOR, COLLIDER_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.legends import draw_legend, is_there
 from deepaccident_devkit.render.moments import CAMERA_GRID
 from deepaccident_devkit.render.motion_maps import MotionMaps
-from deepaccident_devkit.render.outcomes.accident import FORESEEN_COLOR, alarm_words
-from deepaccident_devkit.render.outcomes.camera_view import CASINGS, CameraView, view_of
-from deepaccident_devkit.render.outcomes.detection import DASHED
-from deepaccident_devkit.render.outcomes.verdicts import (
+from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR, alarm_words
+from deepaccident_devkit.render.outcomes.evaluation import (
     AccidentVerdict,
     DetectionVerdict,
     MotionVerdict,
@@ -36,31 +34,113 @@ from deepaccident_devkit.render.outcomes.verdicts import (
 )
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
-from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, OWN_ACTOR_ID, POLE_HEIGHT
 from deepaccident_devkit.text import choice
+from deepaccident_devkit.v2x.projection import camera_of
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLUMNS: Final = 3
-_WIDTH, _WIDER = 8.0, 3.35
-"""Inches: the width of a figure of one column, and what each other column adds."""
-_PANEL_WORDS, _WORDS = 0.3, 1.0
-"""Inches of height for the words of a panel, and for those of the figure."""
-_RADIUS: Final = 1.0
-"""Metres: of the rings and crosses around places."""
-_CORNERS: Final = 32
-"""Of a ring."""
+_POST: Final = 1.5
+"""Metres: the height of the posts at places, since rings far away are flat."""
+_MARK: Final = (-6.0, -6.0, 6.0, 6.0)
+"""Points around a post that no words cover: left, low, right and high."""
+_CASING: Final = 1.4
+"""Points by which the casing of a line is wider."""
+CASINGS: Final = {OUTCOME_COLORS["missed"]: "black"}
+"""Edges around lines that are pale; others have white edges."""
+_SIZE: Final = (14.7, 7.1125)
+"""Inches."""
+_TURN: Final = np.linspace(0, 2 * np.pi, 33)
+_RING: Final = [np.column_stack([np.cos(_TURN), np.sin(_TURN)])]
+_CROSS: Final = [np.sqrt(0.5) * np.array(arm) for arm in ([[-1, -1], [1, 1]], [[-1, 1], [1, -1]])]
+"""The ring around a true place and the cross at a foreseen one, of a radius of 1 m."""
 _MISSING: Final = (-58.0, -48.0, 58.0, 0.0)
 """Points around the middle of a panel's upper edge, where words about a missing image are: left, low, right, high."""
 _FILL: Final = 0.3
 """How opaque the ground of instances is."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraView:
+    """A camera's panel, and what lies on the ground in it.
+
+    The ground is flat: z = 0 in a vehicle's ego frame, `POLE_HEIGHT` below the infrastructure's.
+
+    Attributes:
+        channel: the camera's.
+        sample: token.
+        lens: its intrinsics.
+        optical_from_ego: of the sample.
+        ground: z of the ground in the ego frame, metres.
+        ax: in pixels.
+    """
+
+    channel: str
+    sample: str
+    lens: PinholeCamera
+    optical_from_ego: SE3
+    ground: float
+    ax: Axes
+
+    def optical(self, places: FloatArray, height: float = 0.0) -> FloatArray:
+        """Points (N, 3) of the optical frame, so many metres above places (N, 2) of the ego frame."""
+        return self.optical_from_ego.apply(np.column_stack([places, np.full(len(places), self.ground + height)]))
+
+    def on_ground(self, lines: Sequence[FloatArray]) -> list[FloatArray]:
+        """Lines (P, 2) on the ground, metres of the ego frame, as pixels (V, 2) of their parts in front of the camera.
+
+        The ends of a cut are far below the image, and so is the line between two of them.
+        """
+        if not lines:
+            return []
+        points, owner = self.optical(np.concatenate(lines)), np.repeat(np.arange(len(lines)), [*map(len, lines)])
+        within = owner[1:] == owner[:-1]
+        pixels, drawn = segments_in_image(np.stack([points[:-1], points[1:]], axis=1)[within], self.lens)
+        rows, starts = np.unique(owner[1:][within][drawn], return_index=True)
+        return np.split(pixels.reshape(-1, 2), 2 * starts[1:]) if len(rows) else []
+
+    def draw_lines(self, lines: Sequence[FloatArray], color: str, *, width: float, dashed: bool = False) -> None:
+        """Render lines (V, 2) in pixels, on wider ones that set them off from the image."""
+        from matplotlib.collections import LineCollection
+
+        casing = CASINGS.get(color, CASING_COLOR)
+        below = LineCollection(lines, colors=casing, linewidths=width + _CASING, alpha=0.7)
+        above = LineCollection(lines, colors=color, linewidths=width, linestyles=DASHED if dashed else "solid")
+        self.ax.add_collection(below, autolim=False)  # the image has set the limits
+        self.ax.add_collection(above, autolim=False)
+
+    def posts(self, places: FloatArray) -> FloatArray:
+        """Feet and tops (V, 2, 2), pixels, of posts at places (N, 2) of the ego frame; of those in front alone."""
+        pixels, _ = segments_in_image(np.stack([self.optical(places), self.optical(places, _POST)], axis=1), self.lens)
+        return pixels
+
+    def write(self, words: str, places: FloatArray, color: str) -> None:
+        """Write words beside places (N, 2) of the ego frame: between the feet of the posts that the image shows."""
+        posts = self.posts(places)
+        seen = posts[self.lens.in_image(posts[:, 0])]
+        if len(seen):
+            u, v = seen[:, 0].mean(axis=0).tolist()
+            keep_free(self.ax, seen, margin=_MARK)
+            write_beside(self.ax, words, (u, v), color)
+
+
+def view_of(dataset: Dataset, sample: str, channel: str, ax: Axes) -> CameraView:
+    """The panel of a camera of a sample (a token), to be rendered on axes."""
+    return CameraView(
+        channel=channel,
+        sample=sample,
+        lens=camera_of(dataset, f"{sample}/{channel}"),
+        optical_from_ego=dataset.world_from(sample, channel).inverse() @ dataset.world_from(sample, "ego"),
+        ground=-POLE_HEIGHT if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE else 0.0,
+        ax=ax,
+    )
+
+
 @in_own_settings
-def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, and which cameras and frame
+def render_outcome_in_cameras(
     dataset: Dataset,
     sample: RowArgument,
     prediction: Prediction | DetectedBoxes,
@@ -68,7 +148,6 @@ def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, an
     task: str | None = None,
     protocol: Any = None,
     label: MotionLabels | None = None,
-    cameras: Iterable[str] = CAMERAS,
     frame: int | None = None,
     fig: Figure | None = None,
 ) -> Figure:
@@ -90,32 +169,27 @@ def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, an
         task: as in `render_evaluation`.
         protocol: as in `render_evaluation`.
         label: as in `render_evaluation`.
-        cameras: channels, in any order: the panels are always in that of all pictures.
         frame: of motion: 0 or None for the present; later frames show where instances will be, in the image of now.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure, up to three panels in a row, the verdict above. An image that was not downloaded is a grey panel.
+        The figure, three panels in a row, the verdict above. An image that was not downloaded is a grey panel.
 
     Raises:
         TokenError: no such sample.
         NotAvailableError: the sample has no label, or its scenario no meta that an accident needs.
-        ChoiceError: no such task, protocol, camera or frame, or the prediction is not of this task.
+        ChoiceError: no such task, protocol or frame, or the prediction is not of this task.
         EvaluationError: the protocol cannot evaluate such a prediction.
     """
-    channels = _in_order(cameras)
     verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
-    words = _frame_words(verdict, frame)
-    rows, columns = -(-len(channels) // _COLUMNS), min(_COLUMNS, len(channels))
-    width = _WIDTH + _WIDER * (columns - 1)
-    fig = figure_or_new(fig, (width, rows * (width / columns * 9 / 16 + _PANEL_WORDS) + _WORDS))
-    axes = fig.subplots(rows, columns, squeeze=False)
-    for ax in axes.flat[len(channels) :]:
-        ax.set_axis_off()
-    for channel, ax in zip(channels, axes.flat, strict=False):
+    number = _checked_frame(verdict, frame)
+    ahead = number * verdict.outcome.true.step if isinstance(verdict, MotionVerdict) else 0.0
+    words = f"instances in {ahead:.1f} s" if ahead else ""
+    fig = figure_or_new(fig, _SIZE)
+    axes = fig.subplot_mosaic([[*row] for row in CAMERA_GRID])
+    for channel, ax in axes.items():
         draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
-    handles = _handles(verdict)
-    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    draw_legend(fig, _handles(verdict))
     set_scene_title(fig, dataset, verdict.sample, words, below=verdict.words)
     return settled(fig)
 
@@ -154,14 +228,6 @@ def draw_outcome_in_camera(
     return ax
 
 
-def _in_order(cameras: Iterable[str]) -> list[str]:
-    given = [cameras] if isinstance(cameras, str) else [*cameras]
-    chosen = {choice("cameras", each, CAMERAS) for each in given}
-    if not chosen:
-        raise ChoiceError(f"cameras: expected some of {', '.join(CAMERAS)}, found none")
-    return [channel for row in CAMERA_GRID for channel in row if channel in chosen]
-
-
 def _checked_frame(verdict: Verdict, frame: int | None) -> int:
     """The number of a frame of motion, 0 for None; raises ChoiceError."""
     if frame is None:
@@ -172,14 +238,6 @@ def _checked_frame(verdict: Verdict, frame: int | None) -> int:
     if frame not in range(count):
         raise ChoiceError(f"frame: expected a recorded one, from 0 to {count - 1}, found {frame!r}")
     return frame
-
-
-def _frame_words(verdict: Verdict, frame: int | None) -> str:
-    """When the instances are where they are shown: `instances in 0.5 s`; nothing of the present. Raises ChoiceError."""
-    number = _checked_frame(verdict, frame)
-    if not isinstance(verdict, MotionVerdict) or number == 0:
-        return ""
-    return f"instances in {number * verdict.outcome.true.step:.1f} s"
 
 
 def _draw_detection(verdict: DetectionVerdict, dataset: Dataset, view: CameraView) -> None:
@@ -232,10 +290,10 @@ def _draw_accidents(verdict: AccidentVerdict, view: CameraView) -> None:
     """The true accident is below the foreseen ones, and its words find their place first."""
     true = verdict.compared.true
     if true is not None:
-        _draw_places(true.positions, _ring(), COLLIDER_COLOR, view)
+        _draw_places(true.positions, _RING, COLLIDER_COLOR, view)
         view.write(f"in {true.time:.1f} s", true.positions, COLLIDER_COLOR)
     for alarm in verdict.compared.predicted:
-        _draw_places(alarm.positions, _cross(), FORESEEN_COLOR, view)
+        _draw_places(alarm.positions, _CROSS, FORESEEN_COLOR, view)
         view.write(alarm_words(alarm), alarm.positions, FORESEEN_COLOR)
 
 
@@ -243,16 +301,6 @@ def _draw_places(places: FloatArray, mark: Sequence[FloatArray], color: str, vie
     """A mark and a post at each of two places (2, 2), and a thin line from one to the other."""
     view.draw_lines([*view.on_ground([places]), *view.posts(places)], color, width=1.2)
     view.draw_lines(view.on_ground([place + line for place in places for line in mark]), color, width=1.8)
-
-
-def _ring() -> list[FloatArray]:
-    turn = np.linspace(0, 2 * np.pi, _CORNERS + 1)
-    return [_RADIUS * np.column_stack([np.cos(turn), np.sin(turn)])]
-
-
-def _cross() -> list[FloatArray]:
-    arm = _RADIUS * np.sqrt(0.5)
-    return [arm * np.array([[-1, -1], [1, 1]]), arm * np.array([[-1, 1], [1, -1]])]
 
 
 def _handles(verdict: Verdict) -> list[Artist]:

@@ -1,4 +1,4 @@
-"""`render_replay`: a scenario as one HTML file."""
+"""`render_replay`: a scenario as one HTML file, with the facts about it in words."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,27 +17,34 @@ from deepaccident_devkit.pages import document, part, source_hash
 from deepaccident_devkit.render.colors import (
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
+    COLORS,
     GRID_COLOR,
     OUTCOME_COLORS,
     POINT_COLOR,
 )
-from deepaccident_devkit.render.missing import is_there
-from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries, camera_entries, camera_title
-from deepaccident_devkit.render.replay.facts import facts, notes, served_notes
-from deepaccident_devkit.render.replay.follow import Followed, follow_pair
-from deepaccident_devkit.render.replay.recording import Recording, recording_of
+from deepaccident_devkit.render.legends import is_there
+from deepaccident_devkit.render.replay.recording import (
+    Recording,
+    actor_entries,
+    agent_entries,
+    camera_entries,
+    camera_title,
+    recording_of,
+)
 from deepaccident_devkit.render.replay.road import road_picture
 from deepaccident_devkit.render.replay.sensors import (
     CameraFiles,
-    CameraPictures,
+    Followed,
+    Jpegs,
+    PictureSettings,
     camera_files,
     camera_pictures,
     check_picture_settings,
+    follow_pair,
     lidar_points,
 )
 from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
-from deepaccident_devkit.render.theme import COLORS
-from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
 from deepaccident_devkit.v2x import Agents
 
 SIZE_LIMIT: Final = 15_000_000
@@ -45,6 +52,113 @@ SIZE_LIMIT: Final = 15_000_000
 _BASE64: Final = 4 / 3
 _BESIDE: Final = 8
 """Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
+
+
+def facts(recording: Recording) -> list[list[str]]:
+    """Names and values of the facts about a scenario and its end; unknown values are left out."""
+    return [[name, value] for name, value in (*_setting(recording), *_ending(recording)) if value]
+
+
+def notes(recording: Recording, files: CameraFiles, settings: PictureSettings | None, *, points: bool) -> list[str]:
+    """Sentences on what is missing in the release or was left out.
+
+    Args:
+        recording: the scenario and the agents.
+        files: of all cameras.
+        settings: how their pictures are written; None if there is none.
+        points: whether there are LiDAR points.
+    """
+    title = short_name(recording.agents[0])
+    absent = f"No LiDAR points: no file of {title} is here; unpack the archive of lidar01."
+    return [*_labels(recording), *_missing_pictures(files), *_pictures(files, settings), *[absent] * (not points)]
+
+
+def served_notes(recording: Recording, files: CameraFiles) -> list[str]:
+    """Sentences on what is missing in the release, for a page that has no pictures itself.
+
+    Args:
+        recording: the scenario and the agents.
+        files: of all cameras.
+    """
+    return [*_labels(recording), *_missing_pictures(files)]
+
+
+def _setting(recording: Recording) -> Iterator[tuple[str, str]]:
+    scenario = recording.scenario
+    lights = "with traffic lights" if scenario["signalized"] else "without traffic lights"
+    yield "Town", scenario["town"]
+    yield "Weather", ", ".join(filter(None, (scenario["weather"], scenario["time_of_day"])))
+    yield "Road", ", ".join(filter(None, (scenario["road_type"], lights)))
+    yield "Type", scenario["scenario_type"]
+    yield "Ego goes", scenario["ego_direction"] or ""
+    side = f"comes from {scenario['spawn_side']}" if scenario["spawn_side"] else ""
+    yield "Other goes", ", ".join(filter(None, (scenario["other_direction"], side)))
+    yield "Recorded", f"{len(recording.frames)} frames, {len(recording.frames) * FRAME_PERIOD:.1f} s at 10 Hz"
+    yield "Split", scenario["split"] or ""
+
+
+def _ending(recording: Recording) -> Iterator[tuple[str, str]]:
+    told, contact = recording.scenario["collision"], recording.contact
+    if told is None:
+        yield "Ends", "without a collision" if recording.scenario["weather"] else ""
+        return
+    names = [f"{kind} {actor}" for kind, actor in zip(told["classes"], told["ids"], strict=True)]
+    agents = told["agents"] or [None, None]
+    who = [f"{name} ({short_name(agent)})" if agent else name for name, agent in zip(names, agents, strict=True)]
+    kind = recording.scenario["accident_type"]
+    yield "Ends", f"{who[0]} and {who[1]} collide"
+    yield "Accident type", "" if kind is None else f"{kind} of the paper's 12"
+    if contact is not None:
+        yield "Speeds", ", ".join(f"{name} {_speed(speed)}" for name, speed in zip(names, contact.speeds, strict=True))
+        yield "Closing speed", _speed(contact.closing_speed)
+        yield "Angle between", f"{math.degrees(contact.impact_angle):.0f}°"
+        yield "Sides", ", ".join(f"{name} {side}" for name, side in zip(names, contact.sides, strict=True))
+
+
+def _speed(speed: float) -> str:
+    return "unknown" if math.isnan(speed) else f"{speed:.1f} m/s ({speed * 3.6:.0f} km/h)"
+
+
+def _labels(recording: Recording) -> Iterator[str]:
+    absent = [short_name(agent) for agent in AGENTS if agent not in recording.agents]
+    if absent:
+        yield f"Agents not shown: {', '.join(absent)}."
+    samples = [recording.sample(agent, frame) for agent in recording.agents for frame in recording.frames]
+    unlabelled = sum(not recording.dataset.sample.get(sample)["labelled"] for sample in samples)
+    if unlabelled == len(samples):
+        yield "The release has no labels of this scenario: the page has no boxes and does not show who sees whom."
+    elif unlabelled:
+        yield f"{unlabelled} of {len(samples)} samples have no label: what the agents see there is not known."
+    if recording.unknown:
+        yield f"How the accident happened is not known: {recording.unknown}."
+    elif recording.contact is not None and recording.contact.disagreements:
+        yield f"Meta and the recording disagree: {'; '.join(recording.contact.disagreements)}."
+
+
+def _pictures(files: CameraFiles, settings: PictureSettings | None) -> Iterator[str]:
+    if settings is None:
+        yield from ["No pictures: the file would be too large with them."] * any(map(any, files.values()))
+        return
+    yield f"Pictures are up to {settings.width} pixels wide, of JPEG quality {settings.quality}."
+    if settings.every > 1:
+        yield f"One of every {settings.every} frames has pictures, to keep the file small."
+    if not settings.others:
+        yield "To keep the file small, only the front cameras and those that follow the pair have pictures."
+    elif settings.other_width < settings.width or settings.others > 1:
+        each = "every frame" if settings.others == 1 else f"one of every {settings.others} frames"
+        yield (
+            "To keep the file small, cameras other than the front ones and those that follow the pair have smaller "
+            f"pictures, up to {settings.other_width} pixels wide, of {each}."
+        )
+
+
+def _missing_pictures(files: CameraFiles) -> Iterator[str]:
+    paths = [path for each in files.values() for path in each]
+    found, wanted = sum(path is not None for path in paths), len(paths)
+    if not found:
+        yield f"No pictures: none of the {wanted} camera files is here; unpack the cameras' archives."
+    elif found < wanted:
+        yield f"{wanted - found} of {wanted} camera files are missing in the release; unpack the cameras' archives."
 
 
 def render_replay(
@@ -100,7 +214,7 @@ def render_replay(
     data["points"] = lidar_points(recording, recording.agents[0])
     free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
     free -= _BESIDE * len(recording.frames) * len(files)
-    pictures = camera_pictures(
+    settings, jpegs = camera_pictures(
         files,
         followed,
         math.inf if image_width and quality else free,
@@ -108,8 +222,8 @@ def render_replay(
         quality=quality,
         progress=progress,
     )
-    said = notes(recording, pictures, points=data["points"] is not None)
-    data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], pictures)}
+    said = notes(recording, files, settings, points=data["points"] is not None)
+    data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], jpegs)}
     title = f"Accident replay: {recording.scenario['name']}"
     write_bytes(target, replay_page(title, data).encode())
     return target
@@ -167,7 +281,10 @@ def served_replay(
 
 
 def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles) -> tuple[dict[str, Any], Followed]:
-    """The page's data, except pictures and points, and the cameras that follow the pair."""
+    """The page's data, except pictures and points, and the cameras that follow the pair.
+
+    `automatic` has for each frame the number of the agent that shows the pair best, and for each agent its camera.
+    """
     contact = recording.contact
     moments = [
         recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}") for frame in recording.frames
@@ -194,30 +311,22 @@ def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles)
     seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
     there = {key: [path is not None for path in paths] for key, paths in files.items()}
     followed = follow_pair(recording, seen, there)
-    return data | {"automatic": _automatic(recording, followed)}, followed
-
-
-def _automatic(recording: Recording, followed: Followed) -> dict[str, Any]:
-    """For each frame the number of the agent that shows the pair best, and for each agent its camera."""
-    return {
+    data["automatic"] = {
         "agents": [recording.agents.index(agent) for agent in followed.agents],
         "cameras": [[camera_title(channel) for channel in followed.channels[agent]] for agent in recording.agents],
     }
+    return data, followed
 
 
 def _with_pictures(
-    recording: Recording, cameras: list[list[dict[str, Any]]], pictures: CameraPictures
+    recording: Recording, cameras: list[list[dict[str, Any]]], jpegs: Jpegs
 ) -> list[list[dict[str, Any]]]:
     """For each agent its cameras that have pictures, with one for each frame in base64; null where there is none."""
     shown = []
     for agent, entries in zip(recording.agents, cameras, strict=True):
-        jpegs = {camera_title(channel): each for channel, each in pictures.jpegs.get(agent, {}).items()}
+        own = {camera_title(channel): each for channel, each in jpegs.get(agent, {}).items()}
         shown.append(
-            [
-                {**entry, "pictures": [*map(_coded, jpegs[entry["title"]])]}
-                for entry in entries
-                if entry["title"] in jpegs
-            ]
+            [{**entry, "pictures": [*map(_coded, own[entry["title"]])]} for entry in entries if entry["title"] in own]
         )
     return shown
 

@@ -15,9 +15,9 @@ from deepaccident_devkit.maps import GROUND_CLASSES, TownMap
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.colors import BEV_COLORS
-from deepaccident_devkit.render.missing import is_there
+from deepaccident_devkit.render.ground import map_beneath
+from deepaccident_devkit.render.legends import is_there
 from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.render.town_map import map_beneath
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE
 
 _GROUND: Final = ("sidewalk", "road", "road_line")

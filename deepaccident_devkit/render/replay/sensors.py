@@ -1,4 +1,4 @@
-"""What the sensors recorded, made small enough for the page: the cameras' pictures, and one agent's LiDAR points."""
+"""What the sensors recorded, made small enough for the page, and the cameras that show the colliding pair best."""
 
 from __future__ import annotations
 
@@ -7,19 +7,31 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray
+from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray, as_floats
 from deepaccident_devkit.errors import ConfigError, MissingFileError
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.parallel import own_threads, run_batch
 from deepaccident_devkit.release import read_image
 from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.render.replay.follow import Followed
 from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.taxonomy import CAMERAS, AgentName
+from deepaccident_devkit.v2x.tracks import scenario_tracks
 
+_SWITCH: Final = 1.0
+"""What a change of the camera costs: as much as the pair's whole loss from a picture for about ten frames."""
+_END: Final = 5.0
+"""How many moments the last one counts for: it is the impact."""
+_HIDDEN: Final = 0.2
+"""What an actor counts for that the agent does not see: something stands before it."""
+_LARGE: Final = 0.1
+"""Share of the image's width from which on the size of an actor matters less."""
+_LAYERS: Final = as_floats([1, 2, 3]) / 3
+"""Sizes of the nested boxes at whose corners an actor is looked for; 1 is the actor's own."""
 FRONT: Final = CAMERAS[0]
 _LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
 """Width in pixels and JPEG quality; the first pair that fits is taken."""
@@ -41,6 +53,90 @@ _LEAST_HEIGHT: Final = 0.3
 """Metres above the ground: lower points are on the road."""
 _GROUND: Final = 5.0
 """Percentile of the points' heights that counts as the ground: the infrastructure's ego frame is not on the ground."""
+CameraFiles = Mapping[tuple[str, str], Sequence[ReleasePath | None]]
+"""Agent and camera → one file for each frame; None where there is none."""
+Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
+"""Agent → camera → one picture for each frame; None where there is none. Cameras without any are left out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Followed:
+    """What is shown of the colliding pair; if nobody collides, the front cameras and the first agent.
+
+    Attributes:
+        channels: agent → the camera that shows the pair best, for each frame.
+        agents: the agent whose camera shows the pair best, for each frame.
+    """
+
+    channels: Mapping[str, tuple[str, ...]]
+    agents: tuple[AgentName, ...]
+
+
+def follow_pair(
+    recording: Recording, seen: Mapping[int, Sequence[int]], there: Mapping[tuple[str, str], Sequence[bool]]
+) -> Followed:
+    """Choose cameras so that most of the pair is in the picture, large and not hidden, and changes are few.
+
+    Args:
+        recording: the scenario and the agents.
+        seen: actor id → for each frame a bit mask over the recording's agents: who sees it.
+        there: agent and camera → for each frame whether there is a picture.
+    """
+    scores = {agent: _scores(recording, bit, seen, there) for bit, agent in enumerate(recording.agents)}
+    chosen = {agent: _steady(each) for agent, each in scores.items()}
+    best = [each[np.arange(len(each)), chosen[agent]] for agent, each in scores.items()]
+    return Followed(
+        channels={agent: tuple(CAMERAS[channel] for channel in channels) for agent, channels in chosen.items()},
+        agents=tuple(recording.agents[number] for number in _steady(np.stack(best, axis=1))),
+    )
+
+
+def _scores(
+    recording: Recording, bit: int, seen: Mapping[int, Sequence[int]], there: Mapping[tuple[str, str], Sequence[bool]]
+) -> FloatArray:
+    """(frames, cameras) how well an agent's cameras show the pair, without itself; −1 where there is no picture."""
+    agent = recording.agents[bit]
+    tracks = scenario_tracks(recording.dataset, recording.scenario)
+    others = set(recording.pair) - {recording.actor_of(agent)}
+    scores = np.zeros((len(recording.frames), len(CAMERAS)))
+    for row, frame in enumerate(recording.frames):
+        boxes = tracks.at(frame)
+        boxes = boxes.select(np.isin(boxes.actor_id, [*others]))
+        weight = [1.0 if seen[actor][row] >> bit & 1 else _HIDDEN for actor in boxes.actor_id.tolist()]
+        for column, channel in enumerate(CAMERAS):
+            if not there[agent, channel][row]:
+                scores[row, column] = -1.0
+            elif weight:
+                shown = _shown(recording, recording.sample(agent, frame), channel, boxes)
+                scores[row, column] = float(shown @ weight)
+    scores[-1] *= _END
+    return scores
+
+
+def _shown(recording: Recording, sample: str, channel: str, boxes: Boxes) -> FloatArray:
+    """(N,) from 0 to 1: the share of boxes, in world, that a camera's picture has, less if they are small."""
+    lens = recording.dataset.camera(sample, channel)
+    optical = boxes.transform(recording.dataset.world_from(sample, channel).inverse(), channel)
+    corners, center = optical.corners(), optical.center[:, None]
+    places = (center[:, None] + _LAYERS[:, None, None] * (corners - center)[:, None]).reshape(-1, 3)
+    inside = lens.in_image(*lens.project(places), min_depth=IN_FRONT_DEPTH).reshape(len(boxes), -1).mean(axis=1)
+    away = np.linalg.norm(optical.center, axis=1).clip(1.0)
+    size = lens.intrinsic[0, 0] / lens.width * optical.size[:, 0] / away
+    return as_floats(inside * size / (size + _LARGE))
+
+
+def _steady(scores: AnyArray) -> list[int]:
+    """The choice of columns, one for each row, with the largest sum of scores less the cost of changes."""
+    total, before = scores[0], []
+    for each in scores[1:]:
+        best = int(total.argmax())
+        stays = total >= total[best] - _SWITCH
+        before.append(np.where(stays, np.arange(len(total)), best))
+        total = np.where(stays, total, total[best] - _SWITCH) + each
+    path = [int(total.argmax())]
+    for columns in reversed(before):
+        path.append(int(columns[path[-1]]))
+    return path[::-1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,23 +161,6 @@ class PictureSettings:
         return min(self.width, max(self.width // 2, _LEAST_OTHER))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraPictures:
-    """The pictures of a scenario.
-
-    Attributes:
-        jpegs: agent → camera → one picture for each frame; None where there is none. Cameras without any are left out.
-        settings: how they are written; None if there is no picture.
-        found: how many of the wanted files exist.
-        wanted: how many files the pictures need.
-    """
-
-    jpegs: Mapping[str, Mapping[str, tuple[bytes | None, ...]]]
-    settings: PictureSettings | None
-    found: int
-    wanted: int
-
-
 def check_picture_settings(width: int | None, quality: int | None) -> None:
     """Raise ConfigError if pictures cannot have a width or quality; None stands for a value that fits."""
     if width is not None and width < _LEAST_WIDTH:
@@ -103,16 +182,13 @@ class _Image:
     large: bool
 
 
-CameraFiles = Mapping[tuple[str, str], Sequence[ReleasePath | None]]
-"""Agent and camera → one file for each frame; None where there is none."""
 _Images = dict[tuple[str, str], list[_Image | None]]
-_Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
 
 
 def camera_files(recording: Recording) -> CameraFiles:
     """The image files of all cameras of the agents."""
     return {
-        (agent, channel): [_file(recording, agent, frame, channel) for frame in recording.frames]
+        (agent, channel): [path if path.exists() else None for path in _paths(recording, agent, channel)]
         for agent in recording.agents
         for channel in CAMERAS
     }
@@ -126,8 +202,8 @@ def camera_pictures(
     width: int | None = None,
     quality: int | None = None,
     progress: bool = False,
-) -> CameraPictures:
-    """The pictures of the agents' cameras.
+) -> tuple[PictureSettings | None, Jpegs]:
+    """The pictures of the agents' cameras, and how they are written; None if there is no picture.
 
     Args:
         files: of all cameras.
@@ -148,16 +224,13 @@ def camera_pictures(
         ]
         for (agent, channel), paths in files.items()
     }
-    wanted = sum(len(paths) for paths in files.values())
-    found = sum(path is not None for paths in files.values() for path in paths)
     frames = max(map(len, files.values()))
-    settings, jpegs = _fitting(images, limit, _ladder(width, quality, frames), progress=progress)
-    return CameraPictures(jpegs=jpegs, settings=settings, found=found, wanted=wanted)
+    return _fitting(images, limit, _ladder(width, quality, frames), progress=progress)
 
 
-def _file(recording: Recording, agent: str, frame: int, channel: str) -> ReleasePath | None:
-    path = recording.dataset.sensor_path(f"{recording.sample(agent, frame)}/{channel}")
-    return path if path.exists() else None
+def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePath]:
+    samples = (recording.sample(agent, frame) for frame in recording.frames)
+    return (recording.dataset.sensor_path(f"{sample}/{channel}") for sample in samples)
 
 
 def _ladder(width: int | None, quality: int | None, frames: int) -> Iterator[PictureSettings]:
@@ -177,7 +250,7 @@ def _ladder(width: int | None, quality: int | None, frames: int) -> Iterator[Pic
 
 def _fitting(
     images: _Images, limit: float, ladder: Iterator[PictureSettings], *, progress: bool
-) -> tuple[PictureSettings | None, _Jpegs]:
+) -> tuple[PictureSettings | None, Jpegs]:
     probes = _probes(images)
     for settings in ladder if probes else ():
         kept = _kept(images, settings)
@@ -213,9 +286,9 @@ def _encoded(images: Sequence[_Image], settings: PictureSettings, *, progress: b
         return run_batch(work, images, executor=threads, label="pictures", progress=progress)
 
 
-def _by_agent(kept: _Images, encoded: Sequence[bytes]) -> _Jpegs:
+def _by_agent(kept: _Images, encoded: Sequence[bytes]) -> Jpegs:
     following = iter(encoded)
-    jpegs: _Jpegs = {}
+    jpegs: Jpegs = {}
     for (agent, channel), images in kept.items():
         pictures = tuple(None if image is None else next(following) for image in images)
         if any(pictures):
@@ -267,8 +340,5 @@ def cloud_text(recording: Recording, agent: str, frame: int) -> str | None:
     cells = np.floor(world / _CELL).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     kept = world[first[:: max(1, -(-len(first) // _MOST))]]
-    return _coded(np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1))
-
-
-def _coded(decimetres: Any) -> str:
+    decimetres = np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1)
     return base64.b64encode(decimetres.astype("<i2").tobytes()).decode("ascii")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Accident, AccidentContext, BoxAccidents, MotionOutput, accident_context
 from deepaccident_devkit.evaluation.metrics.accident import Prediction
@@ -16,7 +15,7 @@ from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.outcomes.accident import count_words
+from deepaccident_devkit.render.outcomes.above import count_words
 from deepaccident_devkit.render.replay.recording import Recording
 from deepaccident_devkit.taxonomy import short_name
 
@@ -117,7 +116,7 @@ def _alarm(
         names = " and ".join("an unknown actor" if each is None else str(each) for each in ids)
         text += f"; names {names}{', who collide' if right_two else ''}"
     return {
-        "places": recording.places(_on_ground(world_from_ego, accident.positions)),
+        "places": recording.places(world_from_ego.apply([[x, y, 0.0] for x, y in accident.positions.tolist()])[:, :2]),
         "right": right,
         "time": round(accident.time, 1),
         "text": text,
@@ -130,8 +129,3 @@ def _truth_text(context: AccidentContext) -> str:
     if truth is None or truth.accident is None:
         return "no accident comes within the horizon"
     return f"an accident comes in {truth.accident.time:.1f} s"
-
-
-def _on_ground(world_from_ego: SE3, positions: FloatArray) -> FloatArray:
-    """Positions (2, 2) in the ego frame, in world."""
-    return world_from_ego.apply([[x, y, 0.0] for x, y in positions.tolist()])[:, :2]

@@ -15,14 +15,18 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import place_in, plain_names, writable_folder, write_bytes
 from deepaccident_devkit.pages import document, part
-from deepaccident_devkit.parallel import Places, run_batch
+from deepaccident_devkit.parallel import Engine, Places, run_batch
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.axes import detached_figure
+from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.replay import tried_replay
-from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, render_avoidability
-from deepaccident_devkit.render.safety.lead_time import LEAD_TIME_SIZE, render_lead_times
-from deepaccident_devkit.render.theme import page_style
+from deepaccident_devkit.render.safety.figures import (
+    AVOIDABILITY_SIZE,
+    LEAD_TIME_SIZE,
+    render_avoidability,
+    render_lead_times,
+)
 from deepaccident_devkit.safety import COALITIONS, OUTCOMES, PARTNERS, AccidentRow, OutcomeShares, SafetyReport
 from deepaccident_devkit.safety.avoidability import GROUPS
 from deepaccident_devkit.safety.lead_times import CAVEAT
@@ -31,9 +35,8 @@ from deepaccident_devkit.taxonomy import AGENTS, short_name
 from deepaccident_devkit.text import number_text
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     from matplotlib.figure import Figure
+    from typing_extensions import Unpack
 
 REPORT_FILE: Final = "report.html"
 REPLAYS: Final = 10
@@ -67,9 +70,7 @@ def save_safety_report(
     *,
     dataset: Dataset | None = None,
     replays: int | None = REPLAYS,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> list[Path]:
     """Write the page `report.html` into a folder, beside it tables, figures and replay pages.
 
@@ -83,9 +84,8 @@ def save_safety_report(
         dataset: the release, for replay pages; None for none.
         replays: how many accidents have a replay page, those with the largest delta-v; None for all. A page takes some
             seconds and up to 15 MB if there are images.
-        workers: processes that make replay pages; None chooses by the amount of work.
-        executor: any executor of `concurrent.futures` to make them on, in place of own workers; it must see the folder.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress` of the replay pages, as `parallel.Engine` says; an executor must see
+            the folder.
 
     Returns:
         The files written, the page last.
@@ -93,8 +93,8 @@ def save_safety_report(
     Raises:
         ConfigError: `folder` cannot be written to, or is not one.
         OutputFolderError: its `figures` or `replays` is a link.
-        ChoiceError: `replays` is negative, or `workers` is less than 1.
-        WorkerError: a worker was killed, or cannot do the work.
+        ChoiceError: `replays` is negative.
+        ChoiceError, WorkerError: as `parallel.Engine` says.
     """
     if replays is not None and replays < 0:
         raise ChoiceError(f"replays: expected 0 or more, or None for all, found {replays}")
@@ -104,8 +104,7 @@ def save_safety_report(
     write_bytes(written[-1], report.to_json().encode())
     drawn, pictures = list(_figures(report)), place_in(folder, "figures", opened=True)
     figures = [(each, write_figure(each.draw(), pictures / f"{each.name}.png", dpi=_DPI)) for each in drawn]
-    names = {} if dataset is None else replay_names(_hardest(report, replays))
-    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
+    names = {} if dataset is None else replay_names([row.scenario for row in by_severity(report.rows)][:replays])
     failed = {} if dataset is None else _make_replays(dataset, folder.absolute(), names, **how)
     pages = {scenario: name for scenario, name in names.items() if scenario not in failed}
     write_bytes(folder / REPORT_FILE, report_html(report, figures, pages, sorted(failed.items())).encode())
@@ -126,6 +125,7 @@ def report_html(
         pages: scenario → path of its replay page, relative to the report.
         failed: scenarios of which no replay page could be made, and why.
     """
+    largest = sorted(report.avoidability.margins.items(), key=lambda each: -each[1])[:_LISTED]
     return document(
         "safety_report.html",
         style=page_style(),
@@ -145,7 +145,7 @@ def report_html(
             for members, mean in zip(COALITIONS, report.ledger.mean_leads, strict=True)
         ],
         gaps=[[name, f"{count:,}"] for name, count in report.avoidability.margin_counts.items()],
-        largest=[[name, number_text(gap, 3)] for name, gap in _largest(report.avoidability.margins)],
+        largest=[[name, number_text(gap, 3)] for name, gap in largest],
         nearest=list(_nearest(report))[:_LISTED],
         torn_twins=[
             [each.scenarios[0], each.splits[0], each.scenarios[1], each.splits[1]] for each in report.twins.torn
@@ -204,10 +204,6 @@ def _share(shares: OutcomeShares, at: int, column: int) -> tuple[str, str]:
     return f"{100 * share:.0f} %", f"{100 * later:.0f} % later" if later else ""
 
 
-def _largest(margins: Mapping[str, float]) -> list[tuple[str, float]]:
-    return sorted(margins.items(), key=lambda each: -each[1])[:_LISTED]
-
-
 def _nearest(report: SafetyReport) -> Iterator[list[str]]:
     """The normal recordings in which two come near a collision, the nearest first."""
     for story in report.normal:
@@ -221,11 +217,7 @@ def replay_names(scenarios: Iterable[str]) -> dict[str, str]:
     return {scenario: f"replays/{name}.html" for scenario, name in plain_names(scenarios).items()}
 
 
-def _hardest(report: SafetyReport, count: int | None) -> list[str]:
-    return [row.scenario for row in by_severity(report.rows)][:count]
-
-
-def _make_replays(dataset: Dataset, folder: Path, names: Mapping[str, str], **how: Any) -> dict[str, str]:
+def _make_replays(dataset: Dataset, folder: Path, names: Mapping[str, str], **how: Unpack[Engine]) -> dict[str, str]:
     """Write the replay pages; scenario → why it has none, of those where a file cannot be read."""
     places = Places(reads=dataset.places, writes=(folder,))
     work = partial(_make_replay, dataset, folder)

@@ -12,13 +12,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.explore.access import HEADERS, Access, App, Gate, Message
-from deepaccident_devkit.explore.addresses import HostPort, RootPath
+from deepaccident_devkit.explore.access import HEADERS, Access, App, Gate, HostPort, Message, RootPath
 from deepaccident_devkit.explore.serving import Served, serving
 
 ROOT = "/user/me/proxy/8000"
 URL = f"https://hub.example.org{ROOT}"
-CROSS = ("Sec-Fetch-Site", "cross-site")
 NAVIGATE, DOCUMENT = ("Sec-Fetch-Mode", "navigate"), ("Sec-Fetch-Dest", "document")
 ANYWHERE = "0.0.0.0"  # noqa: S104
 START = Callable[..., Served]
@@ -268,11 +266,6 @@ def test_other_sites_may_only_link_to_a_page(served: Served, site: str) -> None:
 def test_the_pages_may_ask_for_all(served: Served, site: str) -> None:
     image = (("Sec-Fetch-Mode", "no-cors"), ("Sec-Fetch-Dest", "image"))
     assert asked(served, "/", ("Sec-Fetch-Site", site), *image).status == 200
-
-
-def test_a_link_with_the_token_may_come_from_a_mail(served: Served) -> None:
-    assert ask(served.port, f"/?token={served.token}", CROSS, NAVIGATE, DOCUMENT).status == 303
-    assert ask(served.port, f"/?token={served.token}", CROSS).status == 403
 
 
 @pytest.mark.parametrize(

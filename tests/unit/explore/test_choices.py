@@ -73,9 +73,9 @@ def test_facets_find_what_the_devkit_finds(da: DeepAccident, scenarios: Scenario
     assert [scenarios.tokens[row] for row in found.rows] == [each["token"] for each in da.find(*choices.filters)]
     for name, counts in found.counts.items():
         for each in counts:
-            alone = Choices(facets={**chosen, name: (each.value,)})
-            assert each.count == len(da.find(*alone.filters))
-            assert each.chosen == (each.value in chosen.get(name, ()))
+            alone = Choices(facets={**chosen, name: (each["value"],)})
+            assert each["count"] == len(da.find(*alone.filters))
+            assert each["chosen"] == (each["value"] in chosen.get(name, ()))
 
 
 @given(

@@ -35,9 +35,9 @@ from deepaccident_devkit.evaluation.runs import (
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.explore import Explorer, make_app
 from deepaccident_devkit.explore.background import Jobs
-from deepaccident_devkit.explore.pages.model_addresses import sample_path
-from deepaccident_devkit.explore.verdicts import verdict
-from deepaccident_devkit.render.outcomes.accident import count_words
+from deepaccident_devkit.explore.evaluations import verdict
+from deepaccident_devkit.explore.pages.samples import sample_path
+from deepaccident_devkit.render.outcomes.above import count_words
 
 pytestmark = pytest.mark.slow
 
@@ -414,17 +414,6 @@ def command_of(site: Site, name: str) -> list[str]:
     return shlex.split(html.unescape(re.findall(r'<pre class="wide" id="command">(.*?)</pre>', page)[0]))
 
 
-def test_the_command_is_understood(site: Site) -> None:
-    words = command_of(site, "alone")
-    assert words[:3] == ["deepaccident", "evaluate", "accident"]
-    context = deepaccident.make_context("deepaccident", words[1:], resilient_parsing=False)
-    assert context is not None
-    assert words[words.index("--out") + 1] == "alone_bundle"
-    assert words[words.index("--split") + 1] == "train"
-    assert words[words.index("--protocol") + 1] == "boxes"
-    assert "--allow-partial" not in words
-
-
 def test_the_command_makes_a_bundle(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(
@@ -442,10 +431,10 @@ def test_the_command_makes_a_bundle(site: Site, tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("chosen", "expected"),
     [
-        ({"samples": "all", "scope": "all"}, ["--samples", "all"]),
-        ({"scope": "all"}, ["--scope", "all"]),
-        ({"agents": ("ego_vehicle",)}, ["--agents", "ego_vehicle"]),
-        ({}, []),
+        ({"samples": "all", "scope": "all"}, ["--samples", "all", "--horizon", "2"]),
+        ({"scope": "all"}, ["--samples", "evaluate", "--scope", "all"]),
+        ({"agents": ("ego_vehicle",)}, ["--samples", "evaluate", "--scope", "accident", "--agents", "ego_vehicle"]),
+        ({}, ["--samples", "evaluate", "--scope", "accident"]),
     ],
 )
 def test_the_command_asks_for_the_samples_that_the_results_have(

@@ -21,14 +21,12 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.explore import Explorer, make_app
-from deepaccident_devkit.explore.pages import findings, maps, release
-from deepaccident_devkit.explore.pages.findings import ANY, chosen_findings, kinds_of
-from deepaccident_devkit.explore.pages.release_tabs import TABS, part_of
+from deepaccident_devkit.explore.pages import release
+from deepaccident_devkit.explore.pages.answers import part_of
+from deepaccident_devkit.explore.pages.release import ANY, TABS, kinds_of
 from deepaccident_devkit.maps import kept_town_map, town_map, towns_of
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.statistics import dataset_statistics
-from deepaccident_devkit.tables import SEVERITIES, Finding
-from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.validation import CODES, ValidationReport, release_completeness, validate_release
 
 pytestmark = pytest.mark.slow
@@ -260,7 +258,7 @@ def test_findings_are_those_of_validate(of_damaged: Reader, report: ValidationRe
         assert row[2:] == [finding.code, finding.where, finding.what, finding.remedy]
         assert row[1].startswith(finding.severity)
     assert {row[0]: row[2] for row in page.table("kind")} == {
-        kind.code: str(kind.count) for kind in kinds_of(report.findings)
+        kind["code"]: str(kind["count"]) for kind in kinds_of(report.findings)
     }
     assert all(CODES[row[0]].meaning in row[3] for row in page.table("kind"))
     notes = report.counts["note"]
@@ -283,8 +281,8 @@ def test_findings_are_filtered(of_damaged: Reader, report: ValidationReport, sev
 def test_the_links_of_kinds_and_severities_filter(of_damaged: Reader, report: ValidationReport) -> None:
     page = of_damaged.ready("/release/findings")
     for kind in kinds_of(report.findings):
-        found = of_damaged.page(f"/release/findings{page.address_of(kind.code)}")
-        assert len(found.table("scenario")) == kind.count  # notes too
+        found = of_damaged.page(f"/release/findings{page.address_of(kind['code'])}")
+        assert len(found.table("scenario")) == kind["count"]  # notes too
     for severity, count in report.counts.items():
         if count:
             words = f"{count} {severity}{'' if count == 1 else 's'}"
@@ -294,7 +292,7 @@ def test_the_links_of_kinds_and_severities_filter(of_damaged: Reader, report: Va
 
 
 def test_long_lists_have_pages(of_damaged: Reader, report: ValidationReport, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(findings, "part_of", partial(part_of, size=1))
+    monkeypatch.setattr(release, "part_of", partial(part_of, size=1))
     page, whats = of_damaged.ready(f"/release/findings?severity={ANY}"), []
     for number in range(1, len(report.findings) + 1):
         whats += [row[4] for row in page.table("scenario")]
@@ -311,27 +309,6 @@ def test_long_lists_have_pages(of_damaged: Reader, report: ValidationReport, mon
 
 def test_a_release_without_findings_says_so(da: DeepAccident) -> None:
     assert "None: the files are all there, and agree." in Reader(da).ready("/release/findings").text
-
-
-def test_notes_are_hidden_unless_asked_for() -> None:
-    found = [
-        Finding(code=code, severity=severity, scenario=None, where="", what=code, remedy="")
-        for severity in SEVERITIES
-        for code in (f"{severity}-1", f"{severity}-2")
-    ]
-    codes = {
-        (severity, code): [each.code for each in chosen_findings(found, severity=severity, code=code)]
-        for severity in ("", "note", ANY)
-        for code in ("", "note-1")
-    }
-    assert codes == {
-        ("", ""): ["error-1", "error-2", "warning-1", "warning-2"],
-        ("", "note-1"): ["note-1"],
-        ("note", ""): ["note-1", "note-2"],
-        ("note", "note-1"): ["note-1"],
-        (ANY, ""): [each.code for each in found],
-        (ANY, "note-1"): ["note-1"],
-    }
 
 
 # statistics
@@ -439,7 +416,7 @@ def test_a_map_is_made_for_who_asks_for_it(mapped: Reader) -> None:
 
 
 def test_a_map_that_cannot_be_kept_is_shown(mapped: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(maps, "kept_town_map", lambda *_: None)
+    monkeypatch.setattr(release, "kept_town_map", lambda *_: None)
     town = towns_of(mapped.explorer.dataset)[0]
     get(mapped.app, f"/release/maps?make={town}")
     assert mapped.explorer.jobs.wait(60)
@@ -455,7 +432,7 @@ def test_no_picture_makes_a_map_anew(mapped: Reader, monkeypatch: pytest.MonkeyP
     path.rename(path.with_suffix(".later"))
     town_map(dataset, town)
     path.with_suffix(".later").rename(path)
-    monkeypatch.setattr(maps, "town_map", lambda *_, **__: pytest.fail("made"))
+    monkeypatch.setattr(release, "town_map", lambda *_, **__: pytest.fail("made"))
     assert get(mapped.app, f"/release/map/{town}.png").status == 200
 
 
@@ -479,9 +456,3 @@ def test_conventions_name_what_is_there(reader: Reader) -> None:
     assert [name for name in names if not hasattr(DeepAccident, name)] == []
     assert [row[0] for row in page.table("orientation")] == ["devkit", "released", "fiery"]
     assert {"world", "ego", "lidar"} < {row[0] for row in page.table("name")}
-
-
-def test_agents_are_named_in_order(da_partial: DeepAccident) -> None:
-    page = Reader(da_partial).ready("/release/files")
-    (heading,) = [table[0] for table in page.tables if table[0][0] == "kind"]
-    assert heading[1:6] == [agent.replace("_vehicle", "").replace("_", " ") for agent in AGENTS]

@@ -1,12 +1,10 @@
-import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
 import webbrowser
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from http.client import HTTPConnection
 from importlib import import_module
 from ipaddress import ip_address
@@ -24,21 +22,12 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
 from deepaccident_devkit.explore import serving as module
-from deepaccident_devkit.explore.access import Access, Receive, Scope, Send
-from deepaccident_devkit.explore.addresses import RootPath
+from deepaccident_devkit.explore.access import Access, Receive, RootPath, Scope, Send
 from deepaccident_devkit.explore.serving import Served, need_extra, serve, serving
 
 ANYWHERE = "0.0.0.0"  # noqa: S104
 STOPPED = 1.0
 """Seconds that a server may need to end; tests allow twice as much, on a machine that does other things too."""
-INTERRUPTED = "interrupted; no file is half-written, and the same command can be run again"
-COMMAND = """
-import sys
-from asking import TinyApp
-from deepaccident_devkit.cli.interruption import run_interruptibly
-from deepaccident_devkit.explore.serving import serve
-run_interruptibly(lambda: serve(TinyApp(), port=0, open_browser=False, say=lambda line: print(line, flush=True)))
-"""
 
 
 class StopError(Exception):
@@ -230,42 +219,6 @@ def test_a_server_that_fails_later_is_an_error(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(served._running._server, "on_tick", Mock(side_effect=MemoryError))
         with pytest.raises(RuntimeError, match="the explorer's server failed"):
             served.wait()
-
-
-@contextmanager
-def started() -> Iterator[tuple[subprocess.Popen[str], int, str]]:
-    """A process that serves, its port, and the cookie of a reader."""
-    with subprocess.Popen(
-        [sys.executable, "-c", COMMAND],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={"PYTHONPATH": ":".join(sys.path)},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # noqa: PLW1509 - as in a terminal
-    ) as process:
-        try:
-            assert process.stdout is not None
-            origin, _, token = process.stdout.readline().split()[-1].partition("/?token=")
-            port = int(origin.rpartition(":")[2])
-            yield process, port, ask(port, f"/?token={token}").cookie
-        finally:
-            process.kill()
-
-
-def test_a_signal_ends_the_process_with_its_status() -> None:
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    with started() as first, started() as second, ExitStack() as readers:
-        for (process, port, cookie), number in zip((first, second), numbers, strict=True):
-            reader = readers.enter_context(closing(HTTPConnection("127.0.0.1", port, timeout=10)))
-            reader.request("GET", "/slow", headers={"Cookie": cookie})
-            assert ask(port, "/page", ("Cookie", cookie)).status == 200
-            process.send_signal(number)
-        begin = time.monotonic()
-        for (process, _, _), number in zip((first, second), numbers, strict=True):
-            _, errors = process.communicate(timeout=20)
-            assert process.returncode == 128 + number
-            assert {*errors.splitlines()} == {INTERRUPTED}
-        assert time.monotonic() - begin < 4 * STOPPED
 
 
 def lines_of(*, host: str = "127.0.0.1", bound: str = "127.0.0.1", root: str = "") -> list[str]:

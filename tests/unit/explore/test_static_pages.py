@@ -19,9 +19,9 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableErr
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import read_rows, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.explore import Explorer, export_pages, static_pages, static_work
+from deepaccident_devkit.explore import Explorer, export_pages, static_pages
+from deepaccident_devkit.explore.evaluations import verdict
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_html
-from deepaccident_devkit.explore.verdicts import verdict
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.taxonomy import short_name
 
@@ -186,10 +186,10 @@ def test_the_next_model_is_shown_where_one_cannot_be(
         asked.append(prediction)
         return None if prediction == "second" else "no"
 
-    monkeypatch.setattr(static_work, "tried_replay", tried)
+    monkeypatch.setattr(static_pages, "tried_replay", tried)
     names: Mapping[str, Any] = {name: name for name in ("first", "second", "third")}
-    work = static_work.Work(token=accident(da_motion), folder="a/b", predictions=tuple(names.items()))
-    told = static_work.tell(da_motion, tmp_path, work)
+    work = static_pages.Work(token=accident(da_motion), folder="a/b", predictions=tuple(names.items()))
+    told = static_pages.tell(da_motion, tmp_path, work)
     assert (told.model, told.reason, asked) == ("second", "", ["first", "second"])
 
 
@@ -229,7 +229,7 @@ def test_the_same_call_gives_the_same_bytes(made: Made, da_motion: DeepAccident,
 
 @pytest.fixture
 def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(static_work, "tried_replay", lambda *_, **__: "not in this test")
+    monkeypatch.setattr(static_pages, "tried_replay", lambda *_, **__: "not in this test")
 
 
 def listed(index: Path) -> list[str]:
@@ -255,19 +255,27 @@ def test_scenarios_are_chosen_by_filters_and_by_name(da_b: DeepAccident, tmp_pat
     assert "There is no replay: not in this test" in shown(tmp_path / "c" / wanted[0] / "index.html").text
 
 
-def test_what_cannot_be_exported(da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "out"
+@pytest.mark.parametrize(
+    ("chosen", "error", "sentence"),
+    [
+        ({}, ConfigError, "6 scenarios match, and at most 3 are exported; narrow --where"),
+        ({"where": ["length>=1000"]}, NotAvailableError, "no scenario matches"),
+        ({"scenarios": []}, NotAvailableError, "no scenario matches"),
+        ({"scenarios": ["no such"]}, TokenError, "no such"),
+        ({"where": ["collision=true"], "workers": 0}, ChoiceError, "workers"),
+    ],
+)
+def test_what_cannot_be_exported(
+    da_b: DeepAccident,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    chosen: dict[str, Any],
+    error: type[Exception],
+    sentence: str,
+) -> None:
     monkeypatch.setattr(static_pages, "MOST", 3)
-    with pytest.raises(ConfigError, match="6 scenarios match, and at most 3 are exported; narrow --where"):
-        export_pages(da_b, out)
-    with pytest.raises(NotAvailableError, match="no scenario matches"):
-        export_pages(da_b, out, where=["length>=1000"])
-    with pytest.raises(NotAvailableError, match="no scenario matches"):
-        export_pages(da_b, out, scenarios=[])
-    with pytest.raises(TokenError, match="no such"):
-        export_pages(da_b, out, scenarios=["no such"])
-    with pytest.raises(ChoiceError, match="workers"):
-        export_pages(da_b, out, where=["collision=true"], workers=0)
+    with pytest.raises(error, match=sentence):
+        export_pages(da_b, tmp_path / "out", **chosen)
     assert [*tmp_path.iterdir()] == []
 
 
@@ -330,7 +338,7 @@ def test_images_that_cannot_be_read_are_told(da: DeepAccident, tmp_path: Path) -
 @pytest.fixture
 def one(da_b: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Arguments for an export of a scenario without a replay."""
-    monkeypatch.setattr(static_work, "tried_replay", lambda *_, **__: "not in this test")
+    monkeypatch.setattr(static_pages, "tried_replay", lambda *_, **__: "not in this test")
     return {"dataset": da_b, "scenarios": [da_b.scenario[0]], "workers": 1}
 
 

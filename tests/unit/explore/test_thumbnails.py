@@ -9,8 +9,7 @@ from PIL import Image, ImageColor
 from replay_page import accident, normal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.explore.explorer import Explorer
-from deepaccident_devkit.explore.thumbnails import SIZE, thumbnail
+from deepaccident_devkit.explore.explorer import SIZE, Explorer, thumbnail
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, MISSING_COLOR
 
 

@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex, to_rgba
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.accident import accident_words, draw_countdown, render_accident
@@ -135,19 +135,9 @@ def test_the_words_say_who_hits_whom(da_motion: DeepAccident) -> None:
     assert f"{np.degrees(contact.impact_angle):.0f}°" in words
 
 
-def test_what_cannot_be_counted_down_to_is_named(da_motion: DeepAccident) -> None:
-    normal = next(scenario for scenario in da_motion.scenario if not scenario["collision"])
-    with pytest.raises(NotAvailableError, match="nobody collides in it, so there is nothing to count down to"):
-        drawn(da_motion, normal)
-    with pytest.raises(ChoiceError, match=r"seconds: expected some from 0 to 3\.4, as recorded"):
-        drawn(da_motion, accident_of(da_motion), seconds=[7.0])
-    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'labels'"):
-        drawn(da_motion, accident_of(da_motion), layers=["labels"])
-
-
 def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccident, accident: str) -> None:
     fig = detached_figure((12.8, 7.2))
-    draw_countdown(da, f"{accident}/004", AGENTS, None, fig)
+    draw_countdown(da, f"{accident}/004", agents=AGENTS, layers=None, fig=fig)
     agents = [ax.get_title().split(":")[0] for ax in fig.axes if ":" in ax.get_title()]
     assert agents == ["ego", "ego behind", "other", "other behind", "infrastructure"]
     assert ": 0.2 s to the impact other (car" in title_of(fig)
@@ -164,7 +154,7 @@ def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccide
 
 def test_an_agent_that_is_not_asked_for_has_an_empty_place(da: DeepAccident, accident: str) -> None:
     fig = detached_figure((12.8, 7.2))
-    draw_countdown(da, f"{accident}/006", ["infrastructure"], ["boxes"], fig)
+    draw_countdown(da, f"{accident}/006", agents=["infrastructure"], layers=["boxes"], fig=fig)
     assert sum(ax.axison for ax in fig.axes) == 3  # a camera, from above, speeds
     assert not any(ax.images for ax in fig.axes)
     assert ": the impact other (car" in title_of(fig)

@@ -3,14 +3,12 @@
 from typing import Any
 
 import numpy as np
-import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, TokenError
 from deepaccident_devkit.render import detached_figure, render_calibration
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
@@ -64,10 +62,3 @@ def test_boxes_are_those_of_all_agents_but_the_camera_s_own_vehicle(da: DeepAcci
     assert clouds(front) == []
     assert not front.images
     assert not fig.legends
-
-
-def test_what_is_no_moment_and_no_layer_is_refused(da: DeepAccident) -> None:
-    with pytest.raises(TokenError, match="has no token"):
-        render_calibration(da, "nothing")
-    with pytest.raises(ChoiceError, match="layers: expected one of image, points, boxes, ids, found 'bev'"):
-        render_calibration(da, da.sample[3], layers=["bev"])

@@ -1,6 +1,5 @@
 """The colour table keeps its promises to normal and colour-blind eyes; `docs/check_colors.py` prints the numbers."""
 
-import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,17 +8,16 @@ from types import ModuleType
 import numpy as np
 import pytest
 from matplotlib import colormaps
-from matplotlib.colors import is_color_like, to_hex
+from matplotlib.colors import to_hex
 from scripts import loaded_script
 
 import deepaccident_devkit
 from deepaccident_devkit.render import colors
-from deepaccident_devkit.render.motion_cells import direction_colors
+from deepaccident_devkit.render.motion_maps import direction_colors
 
 PACKAGE = Path(deepaccident_devkit.__file__).parent
 PAINTED = ("synth", "testing")
 """These paint a world for cameras, not pictures for readers."""
-PLAIN = {"black", "white", "none"}
 HEX = re.compile(r"#(?:[0-9a-fA-F]{8}|[0-9a-fA-F]{6}|[0-9a-fA-F]{3,4})\b")
 EYES = ("normal", "protanopia", "deuteranopia", "tritanopia")
 
@@ -120,24 +118,3 @@ def test_colours_come_from_the_one_table() -> None:
 def is_grey(color: str) -> bool:
     red, green, blue = (int(each, 16) for each in re.findall("..", to_hex(color)[1:]))
     return max(red, green, blue) - min(red, green, blue) <= 4
-
-
-def test_no_picture_names_a_colour_of_matplotlib() -> None:
-    """No argument of a call, no entry of its style, is such a name, except black, white and none."""
-    found = []
-    for name, text in sources(".py"):
-        for node in ast.walk(ast.parse(text)):
-            pairs = list(zip(node.keys, node.values, strict=True)) if isinstance(node, ast.Dict) else []
-            given = [(key.value, value) for key, value in pairs if isinstance(key, ast.Constant)]
-            given += [(key.arg, key.value) for key in getattr(node, "keywords", []) if isinstance(key, ast.keyword)]
-            for key, value in given:
-                kind = re.fullmatch(r"(?:\w*colors?|c|cmap|foreground|mfc|mec)", str(key))
-                if kind and isinstance(value, ast.Constant) and is_named(value.value):
-                    found.append(f"{name}:{value.lineno}: {key}={value.value!r}")
-    assert found == []
-
-
-def is_named(value: object) -> bool:
-    if not isinstance(value, str) or value in PLAIN:
-        return False
-    return value in colormaps or (is_color_like(value) and not value.startswith("#"))

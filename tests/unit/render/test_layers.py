@@ -3,7 +3,7 @@
 import pytest
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.layers import LAYERS, layers_of
+from deepaccident_devkit.render.axes import LAYERS, layers_of
 
 
 def test_none_is_the_default_and_nothing_is_nothing() -> None:

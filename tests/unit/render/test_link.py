@@ -9,7 +9,6 @@ from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.bev import link_words
 from deepaccident_devkit.render.colors import AGENT_COLORS, TRUE_PLACE_COLOR
@@ -91,13 +90,3 @@ def test_a_link_in_words() -> None:
     assert link_words(Link(latency=0.2)) == "latency 0.2 s"
     said = link_words(Link(pose_noise=PoseNoise(mean=0.3, heading_std=0.1), packet_loss=0.1))
     assert said == "latency 0 s, poses off by 0.3 m (σ 0.02 m), headings by σ 5.7°, 10 % of messages lost"
-
-
-def test_what_cannot_be_linked_is_named(da_motion: DeepAccident) -> None:
-    sample = da_motion.get_sample(da_motion.scenario[0], "ego_vehicle", 3)
-    with pytest.raises(ChoiceError, match="agents: expected a partner of ego_vehicle, found none"):
-        drawn(da_motion, sample, NOISE, agents="single")
-    with pytest.raises(ConfigError, match="reaches back before the first frame"):
-        drawn(da_motion, sample, Link(latency=0.5), layers=["boxes"])
-    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'image'"):
-        drawn(da_motion, sample, NOISE, layers=["image"])

@@ -32,7 +32,7 @@ from deepaccident_devkit.render import (
     draw_motion_trail,
 )
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, OWN_COLOR
-from deepaccident_devkit.render.motion_cells import PALEST
+from deepaccident_devkit.render.motion_maps import PALEST
 from deepaccident_devkit.render.roles import collider_ids
 
 CONFIG = MotionLabelConfig(
@@ -220,7 +220,3 @@ def test_labels_as_a_trail(da_motion: DeepAccident, sample: str) -> None:
     figure = da_motion.render_motion_labels(sample, style="trail", fig=detached_figure((6, 6)))
     assert len(figure.axes) == 2
     assert tokens_of(figure) == [sample]
-    with pytest.raises(ChoiceError, match="trail: each frame is in its own ego frame; warp the labels"):
-        da_motion.render_motion_labels(sample, style="trail", at_present=False)
-    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'velocities'"):
-        da_motion.render_motion_labels(sample, style="trail", layers=["velocities"])

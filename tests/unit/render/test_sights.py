@@ -3,7 +3,7 @@
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.sights import sightings
+from deepaccident_devkit.render.actors import sightings
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import visible_instances
 

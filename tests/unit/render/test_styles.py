@@ -18,7 +18,7 @@ from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.render.safety import render_lead_times, render_twins
 from deepaccident_devkit.render.statistics import render_statistics
 from deepaccident_devkit.render.training import render_curve
-from deepaccident_devkit.render.video.views import Scene, views_of
+from deepaccident_devkit.render.video import Scene, views_of
 from deepaccident_devkit.safety import lead_time_ledger, twin_diff
 from deepaccident_devkit.statistics import dataset_statistics
 

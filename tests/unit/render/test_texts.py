@@ -20,7 +20,7 @@ DRAWN = ("boxes", "trajectories", "grid")
 
 def countdown(da: DeepAccident, scenario: Any) -> Any:
     figure = detached_figure((12.8, 7.2))
-    draw_countdown(da, scenario["last_frame_token"], AGENTS, DRAWN, figure)
+    draw_countdown(da, scenario["last_frame_token"], agents=AGENTS, layers=DRAWN, fig=figure)
     return figure
 
 

@@ -8,7 +8,7 @@ from drawing import title_of, tokens_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import detached_figure, style
-from deepaccident_devkit.render.styles import style_dpi
+from deepaccident_devkit.render.styles import current_style
 from deepaccident_devkit.render.titles import moment_words, scene_words, set_scene_title, set_title
 
 
@@ -57,10 +57,10 @@ def test_a_paper_and_a_slide_have_their_sizes_and_no_tokens(da: DeepAccident, fr
         camera = f"{frame.rsplit('/', 1)[0]}/ego_vehicle/004/Camera_Front"
         assert da.render_sample_data(camera).figure.get_figwidth() == 3.5
         figure = da.render_frame(frame)
-        assert (figure.get_figwidth(), style_dpi()) == (7.2, 300)
+        assert (figure.get_figwidth(), current_style().dpi) == (7.2, 300)
         assert tokens_of(figure) == []
     with style("slide"):
-        assert da.render_frame(frame).get_size_inches() * style_dpi() == pytest.approx([1920, 1080])
+        assert da.render_frame(frame).get_size_inches() * current_style().dpi == pytest.approx([1920, 1080])
     assert tokens_of(da.render_frame(frame)) == [frame]
     with pytest.raises(ChoiceError, match="style: expected paper or slide, found 'poster'"), style("poster"):  # type: ignore[arg-type]
         pass

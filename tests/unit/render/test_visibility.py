@@ -8,11 +8,9 @@ from matplotlib.colors import to_hex, to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, TokenError
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.sights import sights
-from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
+from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix, sights
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -130,18 +128,6 @@ def test_a_normal_scenario_hides_nothing(da_motion: DeepAccident) -> None:
     assert not sights(da_motion, f"{normal['token']}/005").hidden_from("ego_vehicle").any()
 
 
-def test_what_is_not_there_is_named(da_motion: DeepAccident) -> None:
-    token = da_motion.sample[0]["token"]
-    with pytest.raises(TokenError, match="has no token 'nobody'"):
-        panel(da_motion, "nobody")
-    with pytest.raises(ChoiceError, match=r"layers: expected one of .*points.*, found 'image'"):
-        panel(da_motion, token, layers=["image"])
-    with pytest.raises(ChoiceError, match="agent: expected one of"):
-        panel(da_motion, token, agents=["me"])
-    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, found 'Camera_Front'"):
-        panel(da_motion, token, frame="Camera_Front")
-
-
 def test_two_that_see_each_other_have_two_lines_and_the_legend_says_what_marks_mean(hidden: DeepAccident) -> None:
     scenario = hidden.scenario[0]
     ax = panel(hidden, hidden.get_sample(scenario, "ego_vehicle", scenario["num_frames"]))
@@ -162,10 +148,3 @@ def test_no_actor_of_the_view_is_cut(hidden: DeepAccident, index: int) -> None:
     known = sights(hidden, sample)
     corners = known.boxes.bottom_corners()[known.collides | known.records, :, :2].reshape(-1, 2)
     assert ((corners > low) & (corners < high)).all()
-
-
-def test_the_title_is_whole(da: DeepAccident) -> None:
-    ax = render_visibility(da, da.frame[0])
-    ax.figure.draw_without_rendering()
-    assert ax.title.get_window_extent().y1 <= ax.figure.bbox.y1
-    assert ax.get_legend().get_window_extent().y0 >= 0

@@ -18,8 +18,8 @@ from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection
 from deepaccident_devkit.evaluation.runs.prevention import prevention_evaluator
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.render.outcomes.accident import difference_words
-from deepaccident_devkit.render.outcomes.verdicts import sample_verdict
+from deepaccident_devkit.render.outcomes.above import difference_words
+from deepaccident_devkit.render.outcomes.evaluation import sample_verdict
 from deepaccident_devkit.safety import describe
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x.collisions import default_scenario

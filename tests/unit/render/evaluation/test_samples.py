@@ -19,8 +19,7 @@ from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
-from deepaccident_devkit.render.evaluation.figures import complete_figure, run_figures
-from deepaccident_devkit.render.evaluation.samples import sample_figures
+from deepaccident_devkit.render.evaluation.figures import complete_figure, run_figures, sample_figures
 from deepaccident_devkit.render.titles import moment_words, scene_words
 
 pytestmark = pytest.mark.slow

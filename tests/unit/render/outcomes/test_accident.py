@@ -11,7 +11,7 @@ from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, box_trut
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import ComparedAccidents
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.outcomes import draw_accident_outcome
-from deepaccident_devkit.render.outcomes.accident import difference_words, verdict_words
+from deepaccident_devkit.render.outcomes.above import difference_words, verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
 
 

@@ -14,7 +14,6 @@ from numpy.testing import assert_allclose
 from picture_texts import text_faults
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import (
     Accident,
     AccidentEvaluator,
@@ -27,7 +26,7 @@ from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS,
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
-from deepaccident_devkit.render.outcomes.accident import verdict_words
+from deepaccident_devkit.render.outcomes.above import verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
 from deepaccident_devkit.render.roles import collider_ids
 
@@ -74,15 +73,6 @@ def test_motion_is_seen_as_accidents_by_every_protocol(
     assert_allclose(drawn, true)
     crosses = [line.get_xydata() for line in figure.axes[1].lines if line.get_marker() == "x"]
     assert_allclose(crosses, [predicted])
-
-
-def test_what_cannot_be_evaluated_is_named(da_motion: DeepAccident, sample: str) -> None:
-    with pytest.raises(ChoiceError, match="task of this prediction: expected one of accident, found 'motion'"):
-        render_evaluation(da_motion, sample, [], task="motion")
-    with pytest.raises(EvaluationError, match="the released protocol compares motion"):
-        render_evaluation(da_motion, sample, [], protocol="released")
-    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'labels'"):
-        render_evaluation(da_motion, sample, [], layers=["labels"])
 
 
 def test_the_pair_that_collides_is_red_in_every_task(

@@ -50,7 +50,7 @@ def test_motion_outcomes_are_those_that_are_counted(da_motion: DeepAccident, sam
 
 
 def test_what_lies_beyond_the_range_is_not_judged(labels: MotionLabels, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deepaccident_devkit.render.outcomes.motion.RANGES", {"30x30": 30.0})
+    monkeypatch.setattr("deepaccident_devkit.render.outcomes.above.RANGES", {"30x30": 30.0})
     output = instances_of(labels.instance, labels.config.grid)
     cells = motion_outcome(output, labels).outcomes("true")
     here = labels.instance[0] > 0

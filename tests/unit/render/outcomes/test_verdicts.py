@@ -16,8 +16,8 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.outcomes import sample_verdict
-from deepaccident_devkit.render.outcomes.accident import verdict_words
-from deepaccident_devkit.render.outcomes.verdicts import AccidentVerdict, DetectionVerdict, MotionVerdict, judged_as
+from deepaccident_devkit.render.outcomes.above import verdict_words
+from deepaccident_devkit.render.outcomes.evaluation import AccidentVerdict, DetectionVerdict, MotionVerdict, judged_as
 
 
 def test_a_prediction_is_judged_in_its_own_task(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:

@@ -11,8 +11,7 @@ from video_views import SIZE, decoded, grey, greys
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.video.views import Scene, views_of
-from deepaccident_devkit.render.video.writers import write_video
+from deepaccident_devkit.render.video import Scene, views_of, write_video
 from deepaccident_devkit.tables.tokens import frame_token
 
 pytestmark = pytest.mark.slow

@@ -10,8 +10,7 @@ from video_views import STEP, grey
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, draw_camera
-from deepaccident_devkit.render.video import VIEWS
-from deepaccident_devkit.render.video.views import Scene, names_at, views_of
+from deepaccident_devkit.render.video import VIEWS, Scene, names_at, views_of
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 

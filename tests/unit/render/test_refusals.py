@@ -1,0 +1,123 @@
+"""What a view cannot render is refused with a sentence that says what it can, before anything is rendered."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from matplotlib import pyplot as plt
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError, TokenError
+from deepaccident_devkit.evaluation import instances_of
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.render.outcomes import draw_outcome_in_camera, render_outcome_in_cameras, sample_verdict
+from deepaccident_devkit.v2x import Link
+
+Draw = Callable[[Any, str], object]
+
+
+def scenario_of(sample: str) -> str:
+    return sample.rsplit("/", 2)[0]
+
+
+def of_layers(name: str, layer: str, *rest: Any, **how: Any) -> tuple[Draw, type[Exception], str]:
+    """A method that has no such layer."""
+    sentence = rf"layers: expected one of .*, found '{layer}'"
+    return lambda da, sample: getattr(da, name)(sample, *rest, layers=[layer], **how), ChoiceError, sentence
+
+
+def of_range(name: str, metres: float, *rest: Any) -> tuple[Draw, type[Exception], str]:
+    """A method that cannot show so many metres."""
+    sentence = f"view_range: expected metres above 0, found {metres}"
+    return lambda da, sample: getattr(da, name)(sample, *rest, view_range=metres), ChoiceError, sentence
+
+
+REFUSED: list[tuple[Draw, type[Exception], str]] = [
+    of_layers("render_bev", "image"),
+    of_layers("render_visibility", "image"),
+    of_layers("render_calibration", "bev"),
+    of_layers("render_link", "image", Link()),
+    of_layers("render_sample", "labels"),
+    of_layers("render_evaluation", "labels", []),
+    of_layers("render_motion_labels", "velocities", style="trail"),
+    (lambda da, sample: da.render_accident(scenario_of(sample), layers=["labels"]), ChoiceError, "layers: .* 'labels'"),
+    (lambda da, sample: da.render_sample_data(f"{sample}/Camera_Front", layers=["bev"]), ChoiceError, "found 'bev'"),
+    (lambda da, sample: da.render_sample_data(f"{sample}/lidar01", layers=["image"]), ChoiceError, "found 'image'"),
+    (lambda da, _: da.render_instance(da.instance[0], layers=["ids"]), ChoiceError, r"layers: .*, found 'ids'"),
+    *(of_range("render_bev", metres) for metres in (0.0, -5.0, float("nan"), float("inf"))),
+    of_range("render_visibility", 0.0),
+    of_range("render_link", -5.0, Link()),
+    (lambda da, sample: da.render_bev(sample, frame="Camera_Front"), ChoiceError, "frame: expected one of world, ego,"),
+    (lambda da, sample: da.render_visibility(sample, frame="Camera_Front"), ChoiceError, "frame: expected one of"),
+    (lambda da, sample: da.render_bev(sample, agents="ego_vehicle"), ChoiceError, "agents: expected one of single"),
+    (lambda da, sample: da.render_frame(sample.rsplit("/", 2)[0] + "/004", agents="pole"), ChoiceError, "agents: "),
+    (lambda da, sample: da.render_visibility(sample, agents=["me"]), ChoiceError, "agent: expected one of"),
+    (lambda da, sample: da.render_link(sample, Link(), agents="single"), ChoiceError, "agents: expected a partner of"),
+    (lambda da, sample: da.render_link(sample, Link(latency=5.0)), ConfigError, "reaches back before the first frame"),
+    (lambda da, _: da.render_visibility("nobody"), TokenError, "has no token 'nobody'"),
+    (lambda da, _: da.render_calibration("nothing"), TokenError, "has no token"),
+    (lambda da, _: da.render_instance("no/one/actor/9999"), TokenError, "has no token"),
+    (
+        lambda da, _: da.render_accident(next(each for each in da.scenario if not each["collision"])),
+        NotAvailableError,
+        "nobody collides in it, so there is nothing to count down to",
+    ),
+    (
+        lambda da, sample: da.render_accident(scenario_of(sample), seconds=[7.0]),
+        ChoiceError,
+        r"seconds: expected some from 0 to 3\.4, as recorded",
+    ),
+    (
+        lambda da, sample: da.render_pointcloud_in_image(f"{sample}/Camera_Front", color_by="time"),
+        ChoiceError,
+        "color_by: expected one of depth, height, agent, found 'time'",
+    ),
+    (
+        lambda da, sample: da.render_motion_labels(sample, style="trail", at_present=False),
+        ChoiceError,
+        "trail: each frame is in its own ego frame; warp the labels",
+    ),
+    *(
+        entry
+        for draw in (DeepAccident.render_evaluation, render_outcome_in_cameras)
+        for entry in (
+            (
+                lambda da, sample, draw=draw: draw(da, sample, [], task="motion"),
+                ChoiceError,
+                "task of this prediction: expected one of accident, found 'motion'",
+            ),
+            (
+                lambda da, sample, draw=draw: draw(da, sample, [], protocol="released"),
+                EvaluationError,
+                "the released protocol compares motion",
+            ),
+        )
+    ),
+    (lambda da, sample: render_outcome_in_cameras(da, sample, [], frame=1), ChoiceError, "only motion has frames"),
+    (lambda da, sample: render_outcome_in_cameras(da, f"{sample}0", []), TokenError, "table 'sample' has no token"),
+]
+
+
+@pytest.mark.parametrize(("draw", "error", "sentence"), REFUSED)
+def test_what_cannot_be_rendered_is_refused(
+    draw: Draw, error: type[Exception], sentence: str, da_motion: DeepAccident, sample: str
+) -> None:
+    with pytest.raises(error, match=sentence):
+        draw(da_motion, sample)
+    assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize(
+    ("camera", "frame", "sentence"),
+    [
+        ("Camera_Front", -1, "frame: expected a recorded one, from 0 to {last}, found -1"),
+        ("Camera_Front", 99, "frame: expected a recorded one, from 0 to {last}, found 99"),
+        ("lidar01", None, "camera: expected one of .*, found 'lidar01'"),
+    ],
+)
+def test_a_panel_of_no_camera_or_frame_is_refused(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, camera: str, frame: int | None, sentence: str
+) -> None:
+    verdict = sample_verdict(da_motion, sample, instances_of(labels.instance, labels.config.grid), label=labels)
+    with pytest.raises(ChoiceError, match=sentence.format(last=int(labels.label_valid.sum()) - 1)):
+        draw_outcome_in_camera(da_motion, verdict, camera, frame=frame)
