@@ -10,7 +10,7 @@ from functools import cache
 from typing import Annotated, Final, TypedDict
 
 from deepaccident_devkit.tables.columns import Key, Number, TableSpec, Vector
-from deepaccident_devkit.tables.specs import spec_of
+from deepaccident_devkit.tables.records import spec_of
 
 
 def _number(doc: str, unit: str) -> Number:

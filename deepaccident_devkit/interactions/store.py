@@ -17,7 +17,7 @@ from deepaccident_devkit.interactions.records import interaction_specs
 from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names
 from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.tables.columns import NULL_INTEGER
-from deepaccident_devkit.tables.streams import read_streams, streams
+from deepaccident_devkit.tables.store import read_streams, streams
 
 logger = logging.getLogger(__name__)
 

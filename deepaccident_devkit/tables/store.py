@@ -1,5 +1,9 @@
-"""Tables on disk: one Arrow file a table with one uncompressed batch, written by streaming, read memory-mapped."""
+"""Tables on disk: one Arrow file a table with one uncompressed batch, written by streaming, read memory-mapped.
 
+The rows of some tables that are kept together, such as a scenario's, are compressed Arrow streams one after the other.
+"""
+
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +22,7 @@ from deepaccident_devkit.tables.arrow import (
     is_streamable,
     numpy_dtype,
     record_batch,
+    unpacked,
     value_fault_of,
     views,
     width,
@@ -154,3 +159,42 @@ class StoredTable:
         if fault := value_fault_of(self.spec, table):
             raise IndexStoreError(f"{self._path}: damaged ({shortened(fault)}); {REMEDY}")
         return table
+
+
+def streams(tables: Sequence[tuple[TableSpec, Columns]], metadata: Mapping[str, str] | None = None) -> bytes:
+    """The rows of each table, with or without words, as compressed Arrow streams one after the other."""
+    import pyarrow as pa
+
+    options = pa.ipc.IpcWriteOptions(compression="zstd")
+    sink = pa.BufferOutputStream()
+    for spec, columns in tables:
+        with pa.ipc.new_stream(sink, arrow_schema(spec).with_metadata(dict(metadata or {})), options=options) as writer:
+            writer.write_batch(record_batch(spec, columns))
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def streams_metadata(content: bytes) -> dict[str, str]:
+    """The words of `streams`."""
+    import pyarrow as pa
+
+    metadata = pa.ipc.open_stream(content).schema.metadata or {}
+    return {name.decode(): value.decode() for name, value in metadata.items()}
+
+
+def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]] | None:
+    """Of each table stored column → its values, as `streams` took them; None if they are not of these tables.
+
+    Args:
+        source: an Arrow file or bytes in an Arrow reader, at the first stream.
+        specs: the tables, in their order.
+    """
+    import pyarrow as pa
+
+    tables = []
+    for spec in specs:
+        batches = list(pa.ipc.open_stream(source))  # to the stream's end, where the next one starts
+        if len(batches) != 1 or fault_of(spec, batches[0]):
+            return None
+        tables.append({name: unpacked(view) for name, view in views(spec, batches[0]).items()})
+    return tables

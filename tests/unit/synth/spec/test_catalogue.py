@@ -26,7 +26,7 @@ from deepaccident_devkit.synth.spec import (
     parse_spec,
     read_spec,
 )
-from deepaccident_devkit.tables.accidents import accident_type
+from deepaccident_devkit.tables.build import accident_type
 
 
 @pytest.mark.parametrize("number", DESIGN_NUMBERS)
