@@ -58,7 +58,7 @@ _EARLIER = ("shards", ".unfinished")
 """What earlier versions put beside these."""
 _FILE = re.compile(
     rf"{re.escape(MANIFEST_FILE)}|\.lock|\.making|\.unfinished|(.+/)?(kept|locks|thumbnails)/.+|shards/.+\.arrow"
-    rf"|\.?{_TABLES}[^/]+/([^/]+\.arrow|town_map-\w+\.npz)|(.+/)?\.[^/]+\.(tmp|part)",
+    rf"|\.?{_TABLES}[^/]+/([^/]+\.arrow|town_map-\w+\.npz)|(.+/)?\.[^/]+\.tmp",
     re.DOTALL,
 )
 """Paths of files that a devkit puts into an index folder."""
@@ -506,7 +506,9 @@ def index_report(dataroot: Dataroot, *, version: str | None = None, index_dir: P
         DatarootError: the folder is missing, or holds neither a release nor an index.
         VersionError: the version is unknown.
     """
-    infos, looked_in, faults = [], [], []
+    infos: list[IndexInfo] = []
+    looked_in: list[str] = []
+    faults: list[DatarootError | VersionError] = []
     versions = VERSIONS if version is None else (version,)
     for each in versions:
         layout = None

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO
+from tempfile import TemporaryFile
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from deepaccident_devkit.tables.arrow import (
     views,
     width,
 )
-from deepaccident_devkit.tables.columns import TableSpec
+from deepaccident_devkit.tables.columns import Column, TableSpec
 
 REMEDY = "mend it with: deepaccident index DATAROOT --check"
 """What to do with a damaged table."""
@@ -43,54 +43,37 @@ def table_path(folder: Path, table: str) -> Path:
     return folder / f"{table}.arrow"
 
 
-class TableWriter:
+class TableWriter(ExitStack):
     """Collects a table's rows piece by piece and writes them as one batch.
 
-    Rows of fixed width go to a scratch file a column; the batch is then written from these, memory-mapped, so that
-    a table of any size needs little memory. A context manager: leaving it removes the scratch files.
+    Rows of fixed width go to a scratch file a column, without a name; the batch is then written from these,
+    memory-mapped, so that a table of any size needs little memory. A context manager: leaving it removes these files.
     """
 
     def __init__(self, folder: Path, spec: TableSpec) -> None:
         """Start writing the table to `folder`, which must exist."""
-        self._folder = folder
-        self._spec = spec
-        self._stack = ExitStack()
-        self._scratch: dict[str, BinaryIO] = {}
-        self._words: dict[str, list[Any]] = {}
-        self.num_rows = 0
-        for name in [column.stored for column in spec.stored_columns if column.stored]:
-            if is_streamable(spec):
-                self._scratch[name] = self._stack.enter_context(self._scratch_path(name).open("wb"))
-            else:
-                self._words[name] = []
-
-    def __enter__(self) -> "TableWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._stack.close()
-        for name in self._scratch:
-            self._scratch_path(name).unlink(missing_ok=True)
+        super().__init__()
+        self._folder, self._spec, self.num_rows = folder, spec, 0
+        self._columns: dict[str | None, Any] = {
+            column.stored: self.enter_context(TemporaryFile(dir=folder)) if is_streamable(spec) else []  # noqa: SIM115
+            for column in spec.stored_columns
+        }
 
     def append(self, columns: Columns) -> None:
         """Add rows; every stored column must be there, all of one length."""
         for column in self._spec.stored_columns:
-            name = column.stored or ""
-            if name in self._scratch:
-                np.ascontiguousarray(columns[name], dtype=numpy_dtype(column.kind)).tofile(self._scratch[name])
+            values, collected = columns[column.stored or ""], self._columns[column.stored]
+            if isinstance(collected, list):
+                collected.extend(values)
             else:
-                self._words[name].extend(columns[name])
-        self.num_rows += len(columns[self._spec.stored_columns[0].stored or ""])
+                np.ascontiguousarray(values, dtype=numpy_dtype(column.kind)).tofile(collected)
+        self.num_rows += len(values)
 
     def finish(self) -> None:
         """Write the table's file."""
         import pyarrow as pa
 
-        for file in self._scratch.values():
-            file.flush()
-        columns = {column.stored: self._collected(column.stored or "", column.kind) for column in self._spec_columns()}
+        columns = {column.stored or "": self._collected(column) for column in self._spec.stored_columns}
         with (
             replacing(table_path(self._folder, self._spec.name)) as temporary,
             pa.OSFile(str(temporary), "wb") as sink,
@@ -98,19 +81,15 @@ class TableWriter:
         ):
             writer.write_batch(record_batch(self._spec, columns))
 
-    def _spec_columns(self) -> Any:
-        return self._spec.stored_columns
-
-    def _scratch_path(self, name: str) -> Path:
-        return self._folder / f".{self._spec.name}.{name}.part"
-
-    def _collected(self, name: str, kind: Any) -> Any:
-        if name not in self._scratch:
-            return self._words[name]
-        shape = (self.num_rows, width(kind)) if width(kind) > 1 else (self.num_rows,)
+    def _collected(self, column: Column) -> Any:
+        collected, dtype = self._columns[column.stored], numpy_dtype(column.kind)
+        if isinstance(collected, list):
+            return collected
+        shape = (self.num_rows, width(column.kind)) if width(column.kind) > 1 else (self.num_rows,)
         if not self.num_rows:
-            return np.zeros(shape, dtype=numpy_dtype(kind))
-        return np.memmap(self._scratch_path(name), dtype=numpy_dtype(kind), mode="r", shape=shape)
+            return np.zeros(shape, dtype=dtype)
+        collected.flush()
+        return np.memmap(collected, dtype=dtype, mode="r", shape=shape)
 
 
 def write_table(folder: Path, spec: TableSpec, columns: Columns) -> None:

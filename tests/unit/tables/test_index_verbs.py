@@ -113,7 +113,7 @@ def test_clear_removes_every_index_and_says_what(root: Path, cache: Path, monkey
     own = root / INDEX
     shutil.copytree(next(cache.rglob("v1")), own)
     left = (
-        ".tables-01.1.tmp/.track.size.part",
+        ".tables-01.1.tmp/.track.arrow.1.tmp",
         ".manifest.json.1.tmp",
         "shards/type/a.arrow",
         ".unfinished",
