@@ -110,11 +110,11 @@ class Index(ShortRepr):
         """The index in a folder, up to date or not; None if there is none that today's code can use."""
         content = _manifest(folder)
         try:
-            if content.pop("schema_version") != SCHEMA_VERSION:
+            if content.pop("checksum") != _checksum(content) or content.pop("schema_version") != SCHEMA_VERSION:
                 return None
             problems = [Problem(**{**each, "messages": tuple(each["messages"])}) for each in content.pop("problems")]
             files = {name: (int(size), str(digest)) for name, (size, digest) in content.pop("table_files").items()}
-            notices = tuple(map(str, content.pop("notices")))
+            notices = tuple(content.pop("notices"))
             index = cls(folder=folder, table_files=files, problems=tuple(problems), notices=notices, **content)
             names = {table_path(Path(), table).name for table in table_specs()} if index.tables else set()
             whole = set(files) == names and re.fullmatch(rf"({_TABLES}\w+)?", index.tables, re.ASCII)
@@ -126,7 +126,8 @@ class Index(ShortRepr):
         """Write the manifest: from then on the tables that it names are the index."""
         content = {"schema_version": SCHEMA_VERSION, **asdict(self)}
         del content["folder"]
-        write_bytes(self.folder / MANIFEST_FILE, json.dumps(content, indent=1).encode())
+        text = json.dumps({**content, "checksum": _checksum(content)}, indent=1)
+        write_bytes(self.folder / MANIFEST_FILE, text.encode())
 
     def is_current(self, layout: ReleaseLayout, fingerprint: str) -> bool:
         """Whether nothing was added or removed, the tables are there, and no broken scenario was changed.
@@ -333,6 +334,11 @@ def _manifest(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError, MemoryError):
         return {}
     return content if isinstance(content, dict) else {}
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    """A checksum of all else that a manifest says."""
+    return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def _schema_version(folder: Path) -> int | None:

@@ -88,10 +88,6 @@ class Resolver:
         """The agents of a scenario by name, in order, and their rows."""
         return self._agents[scenario_row]
 
-    def num_frames(self, scenario_row: int) -> int:
-        """Frames of a scenario."""
-        return self._num_frames[scenario_row]
-
     def sample_at(self, agent_row: int, index: int) -> int:
         """The row of an agent's sample at frame number `index`, which must be one of the scenario's."""
         return self._first_sample[agent_row] + index - 1

@@ -3,6 +3,7 @@
 As a script it is the process that opens damaged tables: `python test_index_damage.py FOLDER`.
 """
 
+import hashlib
 import json
 import os
 import random
@@ -22,7 +23,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import BrokenReleaseError, DeepAccidentError, IndexStoreError, OutputFolderError
 from deepaccident_devkit.tables import OpenTables, Table, indexing
-from deepaccident_devkit.tables.index import MANIFEST_FILE, SCHEMA_VERSION
+from deepaccident_devkit.tables.index import MANIFEST_FILE
 from deepaccident_devkit.tables.records import table_spec
 from deepaccident_devkit.tables.store import StoredTable, write_table
 
@@ -156,22 +157,39 @@ def test_check_mends_every_damage(root: Path) -> None:
 
 
 TEXTS = ("", "{", "[]", "null", '{"schema_version": "2"}', "[" * 100_000, '{"schema_version": true}', "\0")
-FIELDS: tuple[dict[str, object], ...] = (
-    {"schema_version": SCHEMA_VERSION - 1},
-    {"table_files": {}},
-    {"table_files": {"track.arrow": [float("inf"), ""]}},
-    {"tables": "../../elsewhere"},
-    {"tables": 5},
-    {"problems": [{"scenario": ""}]},
-    {"fingerprint": "0"},
-)
 
 
-@pytest.mark.parametrize("damage", [*TEXTS, *FIELDS])
-def test_an_older_or_damaged_manifest_is_made_again(root: Path, damage: str | dict[str, object]) -> None:
+@pytest.mark.parametrize("text", TEXTS)
+def test_a_manifest_that_is_none_is_made_again(root: Path, text: str) -> None:
+    opened(root)
+    before = contents(root / INDEX)
+    (root / INDEX / MANIFEST_FILE).write_text(text)
+    assert len(opened(root).scenario) == 1
+    assert contents(root / INDEX) == before
+
+
+def test_a_damaged_manifest_is_made_again(root: Path) -> None:
+    rewrite(label(root), "van", "vat")
+    with pytest.raises(BrokenReleaseError, match="class is 'vat'") as told:
+        opened(root)
+    path = root / INDEX / MANIFEST_FILE
+    before = path.read_bytes()
+    for place in range(0, len(before), len(before) // 25):
+        path.write_bytes(before[:place] + bytes([before[place] ^ 1]) + before[place + 1 :])
+        with pytest.raises(BrokenReleaseError, match="1 of 1 scenarios are broken") as again:
+            opened(root)
+        assert (str(again.value), path.read_bytes()) == (str(told.value), before), place
+
+
+@pytest.mark.parametrize("damage", [{"table_files": {}}, {"tables": "../../elsewhere"}, {"tables": 5}, {"problems": 5}])
+def test_a_manifest_of_something_else_is_made_again(root: Path, damage: dict[str, object]) -> None:
+    """Its checksum is right."""
     opened(root)
     before, path = contents(root / INDEX), root / INDEX / MANIFEST_FILE
-    path.write_text(damage if isinstance(damage, str) else json.dumps({**json.loads(path.read_text()), **damage}))
+    content = {**json.loads(path.read_text()), **damage}
+    del content["checksum"]
+    digest = hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
+    path.write_text(json.dumps({**content, "checksum": digest}))
     assert len(opened(root).scenario) == 1
     assert contents(root / INDEX) == before
 
