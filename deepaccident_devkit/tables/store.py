@@ -67,7 +67,7 @@ class TableWriter(ExitStack):
                 collected.extend(values)
             else:
                 np.ascontiguousarray(values, dtype=numpy_dtype(column.kind)).tofile(collected)
-        self.num_rows += len(values)
+        self.num_rows += len(columns[self._spec.stored_columns[0].stored or ""])
 
     def finish(self) -> None:
         """Write the table's file."""
