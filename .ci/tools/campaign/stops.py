@@ -227,7 +227,7 @@ def _told(run: Mapping[str, Any]) -> Iterator[str]:
 def _unwhole(found: Mapping[str, bytes], healthy: Mapping[str, bytes], progress: str) -> Iterator[str]:
     """Files under a final name that are not those of an undisturbed run; what an evaluation resumes from has none."""
     for name, content in found.items():
-        own = any(part.startswith(".") or part.endswith(".unfinished") for part in name.split("/"))
+        own = any(part.startswith(".") or part.endswith(".unfinished") or part == "locks" for part in name.split("/"))
         if name == progress:
             json.loads(content)
         elif not own and healthy.get(name) != content:
