@@ -18,11 +18,11 @@ from benchmarks.releases import index_share_of_raw
 from deepaccident_devkit.geometry.se3 import SE3
 from deepaccident_devkit.release import Calibs, Collision, Labels, Meta, ScenarioFolder, find_release, write_meta
 from deepaccident_devkit.release.store import INDEX_FOLDER
+from deepaccident_devkit.tables import Index
 from deepaccident_devkit.tables.build import ScenarioFiles, scenario_rows
-from deepaccident_devkit.tables.indexing import table_file_states
-from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, write_manifest
+from deepaccident_devkit.tables.index import table_files
+from deepaccident_devkit.tables.indexing import join_tables, rows_to_keep
 from deepaccident_devkit.tables.scan import ScenarioScan, folder_digest
-from deepaccident_devkit.tables.shards import ShardState, join_tables, write_shard
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CAMERAS,
@@ -90,9 +90,9 @@ print(json.dumps(figures))
 def measure() -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="deepaccident_scale_") as folder:
         root = write_whole_release(Path(folder))
-        tables, shards = (
+        tables, kept = (
             sum(path.stat().st_size for path in root.glob(f"{INDEX_FOLDER}/v1/{files}"))
-            for files in ("tables-*/*", "shards/*")
+            for files in ("tables-*/*", "kept/*")
         )
         runs = [probe(root) for _ in range(PROCESSES + 1)][1:]  # the first compiles and fills the file cache
     best = {name: min(run[name] for run in runs) for name in runs[0]}
@@ -101,11 +101,11 @@ def measure() -> list[Figure]:
     figures = [
         Figure(name=name, value=value, unit=units.get(name, ""), bound=bounds.get(name)) for name, value in best.items()
     ]
-    share = index_share_of_raw(tables + shards, int(best["samples"]))
+    share = index_share_of_raw(tables + kept, int(best["samples"]))
     return [
         *figures,
         Figure(name="tables_mb", value=tables / 1e6, unit="MB"),
-        Figure(name="index_mb", value=(tables + shards) / 1e6, unit="MB"),
+        Figure(name="index_mb", value=(tables + kept) / 1e6, unit="MB"),
         Figure(name="index_share_of_raw", value=share, bound=0.01),
     ]
 
@@ -124,7 +124,8 @@ def write_whole_release(root: Path) -> Path:
     """Folders, meta files and tables of 691 scenarios."""
     index = root / INDEX_FOLDER / "v1"
     index.mkdir(parents=True)
-    shards = []
+    kept = index / "kept"
+    kept.mkdir()
     files = one_scenario()
     tables = scenario_rows(files)
     for number in range(SCENARIOS):
@@ -135,22 +136,14 @@ def write_whole_release(root: Path) -> Path:
             for kind in ("calib", "label"):
                 scenario.kind_folder(agent, kind).mkdir(parents=True)
         write_meta(scenario.meta_path, META)
-        shard = index / "shards" / f"{number}.arrow"
         story = {**tables["scenario"], "name": [name], "town": [town], **told(number)}
-        write_shard(shard, {**tables, "scenario": story}, ShardState(times="", contents=""))
-        shards.append(shard)
+        (kept / f"{number:03d}").write_bytes(rows_to_keep({**tables, "scenario": story}, ""))
     folder = index / "tables-scale"
     folder.mkdir()
-    join_tables(folder, shards, [SPLITS[number % len(SPLITS)] for number in range(SCENARIOS)])
+    join_tables(folder, sorted(kept.iterdir()), [SPLITS[number % len(SPLITS)] for number in range(SCENARIOS)])
     layout = find_release(root)
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    manifest = Manifest(
-        schema_version=SCHEMA_VERSION,
-        fingerprint=fingerprint,
-        tables=folder.name,
-        table_files=table_file_states(folder),
-    )
-    write_manifest(index, manifest)
+    Index(folder=index, fingerprint=fingerprint, tables=folder.name, table_files=table_files(folder)).write()
     return root
 
 

@@ -119,7 +119,7 @@ class DeepAccident(Dataset):
                     layout=layout.layout,
                     split_files=layout.split_files,
                     tables_folder=index.tables_folder,
-                    problems=index.manifest.problems,
+                    problems=index.problems,
                 )
                 break
             except IndexStoreError:

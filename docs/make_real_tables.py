@@ -78,10 +78,10 @@ def index_table(dataset: DeepAccident) -> str:
     """What the index costs, and how much more it would with as many boxes a sample as the whole release has."""
     index, samples = dataset.tables_folder.parent, len(dataset.sample)
     boxes = len(dataset.annotation) / samples
-    size = {path: path.stat().st_size / samples for path in index.rglob("*.arrow")}
+    size = {path: path.stat().st_size / samples for path in index.rglob("*") if path.is_file()}
     of_boxes = sum(value for path, value in size.items() if path.stem in ("annotation", "track"))
-    shards = sum(value for path, value in size.items() if "shards" in path.parts)
-    whole = sum(size.values()) + (of_boxes + shards) * (BOXES_A_SAMPLE / boxes - 1)  # all of a shard, so too much
+    kept = sum(value for path, value in size.items() if "kept" in path.parts)
+    whole = sum(size.values()) + (of_boxes + kept) * (BOXES_A_SAMPLE / boxes - 1)  # all that is kept, so too much
     lines = ["| index of a real scenario | bytes a sample | share of the raw data |", "| --- | ---: | ---: |"]
     for words, value in (
         (f"measured, {boxes:.0f} boxes a sample", sum(size.values())),

@@ -24,7 +24,7 @@ from deepaccident_devkit.synth.scenario import Scenario, build_scenario
 from deepaccident_devkit.synth.sensors.rig import make_rig
 from deepaccident_devkit.synth.spec import DESIGNS
 from deepaccident_devkit.tables import visible_mask
-from deepaccident_devkit.tables.accidents import accident_type
+from deepaccident_devkit.tables.build import accident_type
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS, frame_timestamp
 from deepaccident_devkit.v2x import accident_visible_mask, pair_in_view
 

@@ -23,7 +23,6 @@ from deepaccident_devkit import cli
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import open_index
-from deepaccident_devkit.tables.indexing import MARK_FILE
 
 assert pyarrow.csv  # what the work imports lazily is there before the clock starts
 
@@ -92,7 +91,7 @@ def _command(words: list[str], errors: int) -> None:
 
 
 def _kill_at(step: int, *, after: bool) -> None:
-    """End this process, as kill -9 would, before or after its n-th renaming, removal of a folder or of the mark.
+    """End this process, as kill -9 would, before or after its n-th renaming or removal of a folder.
 
     Of the twelve tables one is enough: all lie in a folder that is removed if it is not renamed.
     """
@@ -114,7 +113,6 @@ def _kill_at(step: int, *, after: bool) -> None:
         os.replace, lambda _, path: not path.parent.name.startswith(".tables-") or path.name == "track.arrow"
     )
     shutil.rmtree = watched(shutil.rmtree, lambda path, *_: Path(path).exists())
-    Path.unlink = watched(Path.unlink, lambda path: path.name == MARK_FILE)  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":

@@ -168,7 +168,7 @@ def test_ten_moments(number: signal.Signals, status: int, release_root_b: Path, 
             lines = stopped(process, number)
             ended.append(process.returncode)
         assert (lines, process.returncode) in [([LINE], status), ([], 0)], moment  # at the end there is nothing to stop
-        with started(*words, out) as process:
+        with started(*words, out, "--check") as process:  # removes locks that were left at the very end, too
             assert lines_of(process) == []
         assert files(out) == files(tmp_path / "whole")
     assert ended.count(status) > 3, ended  # by the load of the machine

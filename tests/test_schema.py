@@ -10,8 +10,8 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.tables.arrow import arrow_schema
-from deepaccident_devkit.tables.manifest import SCHEMA_VERSION
-from deepaccident_devkit.tables.specs import table_specs
+from deepaccident_devkit.tables.index import SCHEMA_VERSION
+from deepaccident_devkit.tables.records import table_specs
 
 SCHEMA = Path(__file__).parents[1] / "schema"
 
@@ -63,4 +63,4 @@ def test_stored_columns_do_not_change_without_a_new_schema_version() -> None:
         for field in arrow_schema(spec)
     ]
     digest = hashlib.blake2b(repr(stored).encode(), digest_size=8).hexdigest()
-    assert (SCHEMA_VERSION, digest) == (3, "a56005d98bcb9522")
+    assert (SCHEMA_VERSION, digest) == (4, "a56005d98bcb9522")

@@ -4,7 +4,7 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import engine_of, index_check_parameter, refuse_unused, release_parameters
+from deepaccident_devkit.cli.options import engine_of, refuse_unused, release_parameters
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.tables import Tables, clear_index, open_index
@@ -13,7 +13,9 @@ from deepaccident_devkit.taxonomy import OnError
 
 @click.command()
 @release_parameters
-@index_check_parameter
+@click.option(
+    "--check", is_flag=True, help="Compare the content of each label, calib and meta file and of the tables, not times."
+)
 @click.option(
     "--clear",
     is_flag=True,
@@ -24,7 +26,7 @@ def index(dataroot: Dataroot, version: str, on_error: OnError, check: bool, clea
     if clear:
         refuse_unused("with --clear, which makes no index", "check", "workers", "on_error")
         cleared = clear_index(dataroot, version=version, index_dir=options["index_dir"])
-        click.echo("\n".join(removed.to_text() for removed in cleared) or f"{dataroot}: no index to remove")
+        click.echo("\n".join(f"removed {folder}" for folder in cleared) or f"{dataroot}: no index to remove")
         return
     engine = {**engine_of(options), "progress": True}
     layout = find_release(open_dataroot(dataroot, options["index_dir"], refresh=True, **engine), version)

@@ -7,7 +7,6 @@ import click
 
 from deepaccident_devkit.cli.options import (
     engine_of,
-    index_check_parameter,
     refuse_unused,
     release_parameters,
     say_report,
@@ -54,7 +53,6 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     help="Print instead where the indexes of all versions are, what they hold, and whether they are up to date. "
     "Nothing is changed.",
 )
-@index_check_parameter
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def info(
     where: tuple[str, ...],
@@ -62,7 +60,6 @@ def info(
     interactions: bool,
     out: str | None,
     of_index: bool,
-    check: bool,
     as_json: bool,
     **release: Any,
 ) -> None:
@@ -72,11 +69,9 @@ def info(
     """
     if not statistics:
         refuse_unused("without --statistics", *_OF_STATISTICS)
-    if not of_index:
-        refuse_unused("without --index", "check")
     if of_index:
         refuse_unused("with --index, which makes none", "where", "statistics", "workers", "on_error")
-        _print_index(release, check=check, as_json=as_json)
+        _print_index(release, as_json=as_json)
         return
     dataset = DeepAccident(**release)
     chosen = dataset.find(*where) if where else None
@@ -107,9 +102,9 @@ def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None
     say_report(found, written, folder, as_json=as_json)
 
 
-def _print_index(release: dict[str, Any], *, check: bool, as_json: bool) -> None:
+def _print_index(release: dict[str, Any], *, as_json: bool) -> None:
     from deepaccident_devkit.tables import index_report
 
     version = release["version"] if was_given("version") else None
-    report = index_report(release["dataroot"], version=version, index_dir=release["index_dir"], check_files=check)
+    report = index_report(release["dataroot"], version=version, index_dir=release["index_dir"])
     click.echo(report.to_json() if as_json else report.to_text())

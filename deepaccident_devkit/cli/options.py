@@ -257,11 +257,6 @@ def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
     return names if alone in AGENTS else alone
 
 
-index_check_parameter = click.option(
-    "--check", is_flag=True, help="Compare the content of each label, calib and meta file and of the tables, not times."
-)
-
-
 def was_given(parameter: str) -> bool:
     """Whether the call of the verb that runs has this option, be it with its default."""
     return click.get_current_context().get_parameter_source(parameter) is not ParameterSource.DEFAULT

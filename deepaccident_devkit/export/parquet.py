@@ -16,7 +16,7 @@ from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
 from deepaccident_devkit.export.shards import README, SPLIT_NAMES, readme, shards
 from deepaccident_devkit.tables.columns import Key, Kind, Number, Vector
 from deepaccident_devkit.tables.record_tables import RecordTables
-from deepaccident_devkit.tables.specs import table_specs
+from deepaccident_devkit.tables.records import table_specs
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset

@@ -15,7 +15,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.interactions.config import InteractionConfig
 from deepaccident_devkit.tables.columns import Key, Number, TableSpec, Vector
-from deepaccident_devkit.tables.specs import spec_of
+from deepaccident_devkit.tables.records import spec_of
 from deepaccident_devkit.tables.tokens import frame_token, instance_token
 
 

@@ -15,7 +15,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import FieldError, NotAvailableError
 from deepaccident_devkit.interactions import InteractionPairs, Interactions, interactions_of
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
-from deepaccident_devkit.tables.specs import table_spec
+from deepaccident_devkit.tables.records import table_spec
 from deepaccident_devkit.text import columns_text, possible_text
 from deepaccident_devkit.v2x import accident_visibility, collision
 from deepaccident_devkit.v2x.accident_visibility import VISIBILITIES

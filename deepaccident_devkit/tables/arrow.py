@@ -22,7 +22,7 @@ from deepaccident_devkit.tables.columns import (
     Vector,
     Word,
 )
-from deepaccident_devkit.tables.specs import record_columns
+from deepaccident_devkit.tables.records import record_columns
 
 Columns = Mapping[str, Any]
 """Stored column name → array (or list, for words) of one table's rows."""

@@ -15,35 +15,37 @@ NULL_INTEGER = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Derived:
-    """A field that is made when a record is, and not stored."""
+class _Documented:
+    """Base of the kinds: `doc` says what the values mean."""
 
     doc: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Key:
+class Derived(_Documented):
+    """A field that is made when a record is, and not stored."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Key(_Documented):
     """A row of another table: stored as its number, shown as its token."""
 
     table: str
-    doc: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Number:
+class Number(_Documented):
     """One number (or bool) of a numpy type."""
 
     dtype: str
-    doc: str
     unit: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Vector:
+class Vector(_Documented):
     """Some float64 numbers; `shape` (3,) is a list in a record, (3, 3) a list of lists."""
 
     shape: tuple[int, ...]
-    doc: str
     unit: str = ""
 
     @property
@@ -53,43 +55,37 @@ class Vector:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
+class Choice(_Documented):
     """One of some known words, stored as its position."""
 
     values: tuple[str, ...]
-    doc: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Subset:
+class Subset(_Documented):
     """Some of at most eight known words, stored as a bit mask: bit k stands for `values[k]`."""
 
     values: tuple[str, ...]
-    doc: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Word:
+class Word(_Documented):
     """Any text; for small tables only."""
 
-    doc: str
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Items:
+class Items(_Documented):
     """Two values of a JSON type (`integer`, `string`); within structs only."""
 
     type: str
-    doc: str
     nullable: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Struct:
+class Struct(_Documented):
     """A record within the record, given by a TypedDict; for small tables only."""
 
     record: type
-    doc: str
 
 
 Kind = Derived | Key | Number | Vector | Choice | Subset | Word | Items | Struct

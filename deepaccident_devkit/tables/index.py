@@ -3,119 +3,205 @@
     <index folder>/<version>/
       manifest.json        what the index was made from, and what is broken
       tables-<digest>/     one Arrow file a table
-      shards/              one file a scenario, from which the tables are joined
-      .lock                held by the process that makes the index
-      .unfinished          there while it is made; the next process finishes the work of a stopped one
+      kept/                the rows of each scenario, from which the tables are joined; see `parallel.Store`
 
-Opening compares the times of folders, meta and split files and the sizes of the tables with the manifest; making it
-compares the times of every label and calib file (with `check_files` their contents), reads only the scenarios that
-changed, and compares the checksums of shards and tables. Everything is written under a temporary name and renamed, the
-manifest last, so that a reader sees the old index or the new one.
+Opening compares the times of folders, meta and split files and the sizes of the tables with the manifest, and reads the
+tables' footers. Making it compares the times of every label and calib file, and with `check_files` the contents of all
+files, and reads only the scenarios that changed. Everything is written under a temporary name and renamed, the manifest
+last, so that a reader sees the old index or the new one.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError
-from deepaccident_devkit.files import is_writable_folder, place_in
-from deepaccident_devkit.reading import RefusedFileError, fault_text, limit_of
-from deepaccident_devkit.release import ReleaseLayout
-from deepaccident_devkit.release.store import Dataroot, index_places
-from deepaccident_devkit.tables.indexing import is_unfinished, make_index
-from deepaccident_devkit.tables.locking import index_lock
-from deepaccident_devkit.tables.manifest import (
-    MANIFEST_FILE,
-    SCHEMA_VERSION,
-    Manifest,
-    Problem,
-    read_manifest,
-    stored_schema_version,
+from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError, VersionError
+from deepaccident_devkit.files import (
+    is_writable_folder,
+    place_in,
+    remove_in,
+    replacing_folder,
+    temporary_of,
+    write_bytes,
 )
+from deepaccident_devkit.parallel import Engine, Places, Store
+from deepaccident_devkit.reading import RefusedFileError, fault_text, file_checksum, limit_of, read_bytes
+from deepaccident_devkit.release import ReleaseLayout, find_release
+from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in, open_dataroot, places_of
+from deepaccident_devkit.reports import Report
+from deepaccident_devkit.tables.indexing import SCHEMA_VERSION, Outcome, index_scenario, join_tables
+from deepaccident_devkit.tables.records import table_specs
 from deepaccident_devkit.tables.scan import contents_digest, folder_digest
-from deepaccident_devkit.taxonomy import OnError
+from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
+from deepaccident_devkit.tables.store import StoredTable, table_path
+from deepaccident_devkit.taxonomy import VERSIONS, OnError
 from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
 
 logger = logging.getLogger(__name__)
 
-_MESSAGES_A_SCENARIO = 5
+MANIFEST_FILE = "manifest.json"
+_TABLES = "tables-"
+_EARLIER = ("shards", ".unfinished")
+"""What earlier versions put beside these."""
+_FILE = re.compile(
+    rf"{re.escape(MANIFEST_FILE)}|\.lock|\.making|\.unfinished|(.+/)?(kept|locks|thumbnails)/.+|shards/.+\.arrow"
+    rf"|\.?{_TABLES}[^/]+/([^/]+\.arrow|town_map-\w+\.npz)|(.+/)?\.[^/]+\.tmp",
+    re.DOTALL,
+)
+"""Paths of files that a devkit puts into an index folder."""
+_NAMED = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem(ShortRepr):
+    """What is wrong with one scenario.
+
+    Attributes:
+        scenario: its token.
+        messages: a sentence each, naming file, line and remedy.
+        contents: digest of its files as they were when this was found; empty if they are not the cause.
+    """
+
+    scenario: str
+    messages: tuple[str, ...]
+    contents: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Index(ShortRepr):
-    """An index on disk.
+    """An index on disk, as its manifest describes it.
 
     Attributes:
         folder: where it lies.
-        manifest: what it was made from.
+        fingerprint: digest of the release's folder, meta and split file times.
+        tables: name of the folder that holds the tables; empty if none could be made.
+        table_files: the size and checksum of each file in it, by name.
+        problems: the scenarios left out.
+        notices: what else was left aside, a sentence each.
     """
 
     folder: Path
-    manifest: Manifest
+    fingerprint: str
+    tables: str
+    table_files: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    problems: tuple[Problem, ...] = ()
+    notices: tuple[str, ...] = ()
 
     @property
     def tables_folder(self) -> Path:
         """The folder with one Arrow file a table; raises OutputFolderError if it is a link."""
-        return place_in(self.folder, self.manifest.tables, opened=True)
+        return place_in(self.folder, self.tables, opened=True)
+
+    @classmethod
+    def read(cls, folder: Path) -> Index | None:
+        """The index in a folder, up to date or not; None if there is none that today's code can use."""
+        content = _manifest(folder)
+        try:
+            if content.pop("checksum") != _checksum(content) or content.pop("schema_version") != SCHEMA_VERSION:
+                return None
+            problems = [Problem(**{**each, "messages": tuple(each["messages"])}) for each in content.pop("problems")]
+            files = {name: (int(size), str(digest)) for name, (size, digest) in content.pop("table_files").items()}
+            notices = tuple(content.pop("notices"))
+            index = cls(folder=folder, table_files=files, problems=tuple(problems), notices=notices, **content)
+            names = {table_path(Path(), table).name for table in table_specs()} if index.tables else set()
+            whole = set(files) == names and re.fullmatch(rf"({_TABLES}\w+)?", index.tables, re.ASCII)
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+            return None
+        return index if whole else None
+
+    def write(self) -> None:
+        """Write the manifest: from then on the tables that it names are the index."""
+        content = {"schema_version": SCHEMA_VERSION, **asdict(self)}
+        del content["folder"]
+        text = json.dumps({**content, "checksum": _checksum(content)}, indent=1)
+        write_bytes(self.folder / MANIFEST_FILE, text.encode())
+
+    def is_current(self, layout: ReleaseLayout, fingerprint: str) -> bool:
+        """Whether nothing was added or removed, the tables are there, and no broken scenario was changed.
+
+        Broken scenarios are read: a file mended in place leaves its folder's time alone, and one that is restored from
+        an archive may have the damaged one's size and time.
+        """
+        sizes = {name: size for name, (size, _) in self.table_files.items()}
+        if self.fingerprint != fingerprint or (sizes and sizes != _sizes(self.tables_folder)):
+            return False
+        broken = {problem.scenario: problem.contents for problem in self.problems if problem.contents}
+        return all(contents_digest(each) == broken[each.token] for each in layout.scenarios if each.token in broken)
 
 
 def open_index(
     layout: ReleaseLayout,
     *,
     index_dir: Path | None = None,
-    workers: int | None = None,
-    executor: Executor | None = None,
     on_error: OnError = "raise",
-    progress: bool = False,
     check_files: bool = False,
+    **how: Unpack[Engine],
 ) -> Index:
     """The index of a release, made or brought up to date first where needed.
+
+    Several processes, also on several hosts, that open the same release share the work.
 
     Args:
         layout: the release.
         index_dir: where indexes are kept; by default in the dataroot, or in the user's cache if that is read-only.
-        workers: processes to read with; see `parallel.run_batch`.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and logs them.
-        progress: whether to show a progress bar.
         check_files: compare the content of every label, calib and meta file, and of every file of the index, with
             the checksums of the indexing; else only times and sizes are compared (schema/README.md).
+        **how: of `parallel.Engine`: `workers`, `executor`, `progress`.
 
     Raises:
         BrokenReleaseError: some scenarios are broken and `on_error` is `raise`, or all of them are.
         DatarootError: no scenario has any file.
         IndexStoreError: the index cannot be written, or is a newer devkit's; or the limits of files' sizes that the
             environment gives cannot be understood.
+        OutputFolderError: a link leads out of the index's folder.
+        SplitFileError: a split file cannot be read.
+        SomeFailedError: the connection to a URL broke.
     """
     on_error = choice("on_error", on_error, get_args(OnError))
     _refuse_wrong_limits()
     index = None if check_files else _current_index(layout, index_dir)
-    make = partial(
-        _found_or_made,
-        layout,
-        index_dir,
-        check_files=check_files,
-        workers=workers,
-        executor=executor,
-        progress=progress,
-    )
-    if index is None:
+    while index is None:
         folder = _writable_folder(layout, index_dir)
-        with index_lock(folder):
-            index = make(folder)
-    elif is_unfinished(index.folder):
-        index = _finished(index, make)
+        index = _made(layout, folder, check_files=check_files, **how) or _current_index(layout, index_dir)
     _accept(layout, index, on_error)
     return index
+
+
+def index_folders(root: Dataroot, version: str, index_dir: Path | None = None) -> Iterator[Path]:
+    """Where a release's index may lie, the first choice first."""
+    return (place / version for place in index_places(root, index_dir))
+
+
+def place_outside(layout: ReleaseLayout) -> Path | None:
+    """The `index_dir` with which opening a release writes nothing into its folder: None where a good index is there."""
+    if _current_index(layout, None) is not None:
+        return None
+    *_, cache = index_folders(layout.root, layout.version)
+    return cache.parent
+
+
+def _fingerprint(layout: ReleaseLayout) -> str:
+    return folder_digest(layout.scenarios, layout.split_files.values())
+
+
+def _current_index(layout: ReleaseLayout, index_dir: Path | None) -> Index | None:
+    fingerprint = _fingerprint(layout)
+    found = map(Index.read, index_folders(layout.root, layout.version, index_dir))
+    return next((index for index in found if index and index.is_current(layout, fingerprint)), None)
 
 
 def _refuse_wrong_limits() -> None:
@@ -126,64 +212,63 @@ def _refuse_wrong_limits() -> None:
         raise IndexStoreError(fault_text(error)) from None
 
 
-def find_indexes(layout: ReleaseLayout, index_dir: Path | None = None) -> Iterator[Index]:
-    """The release's indexes on disk, up to date or not, the first choice first."""
-    for folder in index_folders(layout.root, layout.version, index_dir):
-        manifest = read_manifest(folder)
-        if manifest:
-            yield Index(folder=folder, manifest=manifest)
+def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
+    folders = list(index_folders(layout.root, layout.version, index_dir))
+    folder = next(filter(is_writable_folder, folders), None)
+    if folder is None:
+        places = " or ".join(map(str, folders))
+        raise IndexStoreError(f"{places}: no place to write the index; give a writable folder with index_dir=")
+    return folder
 
 
-def index_folders(root: Dataroot, version: str, index_dir: Path | None = None) -> Iterator[Path]:
-    """Where a release's index may lie, the first choice first."""
-    return (place / version for place in index_places(root, index_dir))
+def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpack[Engine]) -> Index | None:
+    """Bring the index in `folder` up to date; None if another process, with which it shared the work, has done that.
 
-
-def place_outside(layout: ReleaseLayout) -> Path | None:
-    """The `index_dir` with which opening a release writes nothing into its folder: None where a good index is there."""
-    index = _current_index(layout, None)
-    if index is not None and not is_unfinished(index.folder):
-        return None
-    *_, cache = index_folders(layout.root, layout.version)
-    return cache.parent
-
-
-def _current_index(layout: ReleaseLayout, index_dir: Path | None) -> Index | None:
-    fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    found = (index for index in find_indexes(layout, index_dir) if is_current(layout, index, fingerprint))
-    return next(found, None)
-
-
-def _found_or_made(
-    layout: ReleaseLayout,
-    index_dir: Path | None,
-    folder: Path,
-    **how: Any,
-) -> Index:
-    """The index, made in `folder`, whose lock is held, unless another process has made it meanwhile."""
-    index = None if how["check_files"] else _current_index(layout, index_dir)
-    if index is not None and not (index.folder == folder and is_unfinished(folder)):
-        return index
+    Broken scenarios do not stop it: they are listed in the manifest. Damaged rows and tables are made again.
+    """
     _refuse_newer(folder)
-    fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    manifest = make_index(layout, folder, fingerprint, **how)
-    return Index(folder=folder, manifest=manifest)
+    fingerprint, splits = _fingerprint(layout), assign_splits(layout)
+    store = _store(folder, f"{SCHEMA_VERSION} {fingerprint} {check_files}")
+    candidates = {each.token: each for each in layout.scenarios if each.token not in splits.problems}
+    with store.shared(tidy=partial(_tidy, folder)) as turn:
+        outcomes = store.run(
+            partial(index_scenario, store, check_files=check_files),
+            candidates,
+            label="indexing scenarios",
+            places=Places(reads=places_of(layout.root), writes=(folder,)),
+            **how,
+        )
+        if not turn.alone():
+            return None
+        tables, files = _written_tables(store, [each for each in outcomes.values() if each.indexed], splits)
+        broken = [
+            Problem(scenario=each.token, messages=each.messages, contents=each.contents)
+            for each in outcomes.values()
+            if each.messages
+        ]
+        misplaced = [Problem(scenario=token, messages=messages) for token, messages in splits.problems.items()]
+        index = Index(
+            folder=folder,
+            fingerprint=fingerprint,
+            tables=tables,
+            table_files=files,
+            problems=tuple(sorted(broken + misplaced, key=lambda problem: problem.scenario)),
+            notices=(*splits.notices, *(notice for each in outcomes.values() for notice in each.notices)),
+        )
+        index.write()
+        kept = {f"kept/{token}" for token, outcome in outcomes.items() if outcome.indexed}
+        there = {path.relative_to(folder).as_posix() for path in folder.glob("kept/*/*")}
+        _tidy(folder, there - kept)
+        store.remove(keep=True)
+    return index
 
 
-def _finished(index: Index, make: Callable[[Path], Index]) -> Index:
-    """Finish what a stopped process left; if that cannot be done, a good index is used as it is."""
-    if not is_writable_folder(index.folder):
-        return index
-    try:
-        with index_lock(index.folder, wait=False) as held:
-            return make(index.folder) if held else index
-    except IndexStoreError as error:
-        logger.warning("%s", error)
-        return index
+def _store(folder: Path, command: str) -> Store:
+    return Store(folder, folder, "makes an index", IndexStoreError, command)
 
 
 def _refuse_newer(folder: Path) -> None:
-    version = stored_schema_version(folder)
+    version = _schema_version(folder)
     if version is not None and version > SCHEMA_VERSION:
         raise IndexStoreError(
             f"{folder / MANIFEST_FILE}: a newer devkit's index (schema version {version}, this devkit's is "
@@ -192,72 +277,276 @@ def _refuse_newer(folder: Path) -> None:
         )
 
 
-def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
-    folders = list(index_folders(layout.root, layout.version, index_dir))
-    for folder in folders:
-        if is_writable_folder(folder):
-            return folder
-    places = " or ".join(map(str, folders))
-    raise IndexStoreError(f"{places}: no place to write the index; give a writable folder with index_dir=")
+def _written_tables(
+    store: Store, outcomes: Sequence[Outcome], splits: SplitAssignment
+) -> tuple[str, dict[str, tuple[int, str]]]:
+    """Join scenarios into a new folder of tables, named by what they were made from; its name and its files' states.
 
-
-def is_current(layout: ReleaseLayout, index: Index, fingerprint: str) -> bool:
-    """Whether nothing was added or removed, and no broken scenario was changed.
-
-    Broken scenarios are read: a file mended in place leaves its folder's time alone, and one that is restored from an
-    archive may have the damaged one's size and time.
+    The name is empty if there is nothing to join. Whole tables of that name are left as they are.
     """
-    if index.manifest.fingerprint != fingerprint or not _is_whole(index):
-        return False
-    broken = {problem.scenario: problem.contents for problem in index.manifest.problems if problem.contents}
-    return all(
-        contents_digest(scenario) == broken[scenario.token] for scenario in layout.scenarios if scenario.token in broken
-    )
+    if not outcomes:
+        return "", {}
+    assigned = [splits.split_of.get(each.token) for each in outcomes]
+    made_from = [(each.token, each.contents, split) for each, split in zip(outcomes, assigned, strict=True)]
+    text = repr((SCHEMA_VERSION, made_from))
+    name = _TABLES + hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+    folder, before = place_in(store.folder, name, opened=True), Index.read(store.folder)
+    files = table_files(folder)
+    if before is None or (before.tables, before.table_files) != (name, files):
+        remove_in(store.folder, name)  # damaged, or of a process that was stopped before its manifest
+        with replacing_folder(folder) as temporary:
+            join_tables(temporary, [store.path(each.token) for each in outcomes], assigned)
+            files = table_files(temporary)
+    return name, files
 
 
-def _is_whole(index: Index) -> bool:
-    """Whether every table's file is there in its size."""
-    files = {index.tables_folder / name: size for name, (size, _) in index.manifest.table_files.items()}
+def table_files(folder: Path) -> dict[str, tuple[int, str]]:
+    """Size and checksum of each file of a folder of tables, by name; nothing if there is no such folder."""
+    return {name: (size, file_checksum(folder / name)) for name, size in _sizes(folder).items()}
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_size for path in folder.glob("*.arrow") if path.is_file()}
+
+
+def _tidy(folder: Path, stale: Iterable[str] = ()) -> None:
+    """Remove what stopped processes left, tables that the manifest does not name, and what is given by its path.
+
+    What cannot be removed is left to the next time. The caller has the folder alone.
+    """
+    index = Index.read(folder)
+    for name in (*_unnamed(folder, index.tables if index else ""), *stale):
+        with suppress(OSError):
+            remove_in(folder, name)
+
+
+def _unnamed(folder: Path, tables: str = "") -> list[str]:
+    """Tables and manifests in an index folder, but for the manifest and its tables."""
+    begin = (_TABLES, f".{_TABLES}")
+    names = [path.name for path in folder.iterdir() if path.name != tables]
+    return [name for name in names if name.startswith(begin) or temporary_of(name) == MANIFEST_FILE]
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    """The manifest's JSON object, empty if there is none."""
     try:
-        return all(path.stat().st_size == size for path, size in files.items())
-    except OSError:
-        return False
+        content = json.loads(read_bytes(folder / MANIFEST_FILE, "index"))  # names of files may have half characters
+    except (OSError, ValueError, RecursionError, MemoryError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    """A checksum of all else that a manifest says."""
+    return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def _schema_version(folder: Path) -> int | None:
+    """The schema version that an index folder's manifest states, known here or not; None if it states none."""
+    version = _manifest(folder).get("schema_version")
+    return version if type(version) is int else None
 
 
 def _accept(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:
-    problems = index.manifest.problems
-    if problems and (on_error == "raise" or not index.manifest.tables):
-        raise BrokenReleaseError(_report(layout, problems))
-    if not index.manifest.tables:
+    if index.problems and (on_error == "raise" or not index.tables):
+        raise BrokenReleaseError(_problems_text(layout, index.problems))
+    if not index.tables:
         raise DatarootError(f"{layout.root}: its scenarios hold no calib files; unpack the calib archives")
-    for problem in problems:
+    for problem in index.problems:
         logger.warning("left out %s: %s", problem.scenario, " | ".join(problem.messages))
-    for notice in summed_notices(index.manifest.notices):
-        logger.warning("%s", notice)
-
-
-def summed_notices(notices: Sequence[str]) -> list[str]:
-    """Notices, with one sentence in place of several that say the same of different files."""
     places: dict[str, list[str]] = {}
-    for notice in notices:
+    for notice in index.notices:
         place, _, words = notice.partition(": ")
         places.setdefault(words, []).append(place)
-    return [
-        f"{found[0]}: {words}" if len(found) == 1 else f"{len(found)} scenarios, such as {found[0]}: {words}"
-        for words, found in places.items()
-    ]
+    for words, (first, *others) in places.items():  # one sentence of all that lack the same
+        head = f"{1 + len(others)} scenarios, such as {first}" if others else first
+        logger.warning("%s: %s", head, words)
 
 
-def _report(layout: ReleaseLayout, problems: Sequence[Problem]) -> str:
+def _problems_text(layout: ReleaseLayout, problems: Sequence[Problem]) -> str:
     total = len({scenario.token for scenario in layout.scenarios})
     lines = [f"{layout.root}: {len(problems)} of {total} scenarios are broken:"]
     for problem in problems:
-        shown = problem.messages[:_MESSAGES_A_SCENARIO]
-        lines += [f"  {problem.scenario}", *(f"    {message}" for message in shown)]
-        if len(problem.messages) > len(shown):
-            lines.append(f"    … and {len(problem.messages) - len(shown)} more")
+        lines += [f"  {problem.scenario}", *_first_lines(problem.messages)]
     good = total - len(problems)
     lines.append(
         f"Mend them, or open the other {good} with on_error='skip' (--on-error skip)." if good else "Mend them first."
     )
     return "\n".join(lines)
+
+
+def _first_lines(messages: Sequence[str]) -> list[str]:
+    more = [f"    … and {len(messages) - _NAMED} more"] if len(messages) > _NAMED else []
+    return [*(f"    {message}" for message in messages[:_NAMED]), *more]
+
+
+def clear_index(dataroot: Dataroot, *, version: str = "v1", index_dir: Path | None = None) -> list[Path]:
+    """Remove the indexes of a release, in its own folder and in the user's cache, with what stopped processes left.
+
+    Waits for a process that makes one. The release itself is not needed, nor touched.
+
+    Args:
+        dataroot: the release, as of `DeepAccident`; it need not be there.
+        version: whose indexes.
+        index_dir: the only place to look in, where given.
+
+    Returns:
+        The folders that were removed; empty if there was no index.
+
+    Raises:
+        IndexStoreError: something there is no part of an index, and then nothing is removed; or the removal failed.
+        VersionError: the version is unknown.
+    """
+    version = choice("version", version, VERSIONS, error=VersionError)
+    folders = list(filter(_holds_index, index_folders(dataroot, version, index_dir)))
+    for folder in folders:
+        _refuse_foreign(folder)
+    for folder in folders:
+        store = _store(folder, "clear")
+        with store.shared(partial(_refuse_foreign, folder)) as turn:
+            if turn.alone():
+                _remove(store)
+    for place in index_places(dataroot, index_dir):
+        with suppress(OSError):  # not there, or not empty: another version's index
+            for listing in list_files_in(place):
+                listing.unlink(missing_ok=True)
+            if index_dir is None:
+                place.rmdir()
+    return folders
+
+
+def _holds_index(folder: Path) -> bool:
+    """Whether there is an index, or part of one."""
+    parts = folder.glob(f"{_TABLES}*"), folder.glob("kept"), folder.glob(".lock")
+    return _schema_version(folder) is not None or any(map(any, parts))
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Raise IndexStoreError if there is anything in the folder that no devkit puts there."""
+    paths = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
+    foreign = [
+        name for name, path in paths.items() if path.is_symlink() or not (path.is_dir() or _FILE.fullmatch(name))
+    ]
+    if foreign:
+        names = ", ".join(foreign[:_NAMED])
+        raise IndexStoreError(f"{folder}: not removed: it holds what is no part of an index: {names}; look at it")
+
+
+def _remove(store: Store) -> None:
+    """Remove an index: the manifest first, so that half of it is not taken for one."""
+    try:
+        for name in (MANIFEST_FILE, *_EARLIER, *_unnamed(store.folder)):
+            remove_in(store.folder, name)
+        store.remove()
+    except OSError as error:
+        raise IndexStoreError(f"{store.folder}: cannot be removed ({error})") from error
+
+
+IndexState = Literal["up to date", "out of date", "unfinished", "another devkit's", "no release"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexInfo(ShortRepr):
+    """An index on disk.
+
+    Attributes:
+        folder: where it lies.
+        version: of the release.
+        state: `up to date`; `out of date` and `unfinished` are remade when the release is opened, `another devkit's`
+            too if that is older; `no release`: the dataroot has none of this version.
+        total_bytes: size of the whole folder.
+        tables: table → rows; empty where they cannot be read.
+        left_out: broken scenario → what is wrong with it.
+        notices: what else was left aside.
+    """
+
+    folder: str
+    version: str
+    state: IndexState
+    total_bytes: int
+    tables: Mapping[str, int]
+    left_out: Mapping[str, Sequence[str]]
+    notices: Sequence[str]
+
+    def to_text(self) -> str:
+        """Some lines for a terminal."""
+        lines = [
+            f"{self.folder}: {self.state}",
+            f"  release {self.version}, {self.total_bytes / 1e6:,.1f} MB, {len(self.left_out)} scenarios left out",
+            *(f"  {name:<20}{rows:>14,} rows" for name, rows in self.tables.items()),
+        ]
+        for token, messages in self.left_out.items():
+            lines += [f"  left out: {token}", *_first_lines(messages)]
+        return "\n".join([*lines, *(f"  {notice}" for notice in self.notices)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexReport(Report):
+    """The indexes of one dataroot.
+
+    Attributes:
+        dataroot: the release's folder.
+        indexes: the first choice first.
+        looked_in: the folders where one could be.
+    """
+
+    dataroot: str
+    indexes: Sequence[IndexInfo]
+    looked_in: Sequence[str]
+
+    def to_text(self) -> str:
+        """Some lines an index for a terminal."""
+        none = "\n".join([f"{self.dataroot}: no index; looked in", *(f"  {folder}" for folder in self.looked_in)])
+        return "\n\n".join(info.to_text() for info in self.indexes) or none
+
+
+def index_report(dataroot: Dataroot, *, version: str | None = None, index_dir: Path | None = None) -> IndexReport:
+    """Look at the indexes of a dataroot, in its own folder and in the user's cache; changes none.
+
+    Args:
+        dataroot: the release, as of `DeepAccident`.
+        version: whose indexes; None looks for every version's.
+        index_dir: the only place to look in, where given.
+
+    Raises:
+        DatarootError: the folder is missing, or holds neither a release nor an index.
+        VersionError: the version is unknown.
+    """
+    infos: list[IndexInfo] = []
+    looked_in: list[str] = []
+    faults: list[DatarootError | VersionError] = []
+    versions = VERSIONS if version is None else (version,)
+    for each in versions:
+        layout = None
+        try:
+            layout = find_release(open_dataroot(dataroot, index_dir), each)
+        except (DatarootError, VersionError) as error:
+            faults.append(error)
+        folders = list(index_folders(dataroot, each, index_dir))
+        looked_in += map(str, folders)
+        infos += [_info(folder, each, layout) for folder in folders if _holds_index(folder)]
+    if not infos and len(faults) == len(versions):
+        raise faults[0]
+    return IndexReport(dataroot=str(dataroot), indexes=infos, looked_in=looked_in)
+
+
+def _info(folder: Path, version: str, layout: ReleaseLayout | None) -> IndexInfo:
+    index = Index.read(folder)
+    state: IndexState = "no release"
+    if index is None:
+        state = "unfinished" if _schema_version(folder) in (None, SCHEMA_VERSION) else "another devkit's"
+    elif layout is not None:
+        state = "up to date" if index.is_current(layout, _fingerprint(layout)) else "out of date"
+    rows = {}
+    if index and index.tables:
+        with suppress(IndexStoreError):
+            rows = {name: StoredTable(index.tables_folder, spec).num_rows for name, spec in table_specs().items()}
+    return IndexInfo(
+        folder=str(folder),
+        version=version,
+        state=state,
+        total_bytes=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
+        tables=rows,
+        left_out={problem.scenario: problem.messages for problem in index.problems} if index else {},
+        notices=index.notices if index else (),
+    )

@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenErro
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.release.store import ReleasePath, places_of
-from deepaccident_devkit.tables.manifest import Problem
+from deepaccident_devkit.tables.index import Problem
 from deepaccident_devkit.tables.tables import Table, Tables, table_names
 from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS, OnError
 from deepaccident_devkit.text import choice, spelled

@@ -12,7 +12,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables.columns import Choice, Column, Key, Struct, Subset, Vector
-from deepaccident_devkit.tables.specs import table_spec
+from deepaccident_devkit.tables.records import table_spec
 from deepaccident_devkit.tables.store import damaged_value
 from deepaccident_devkit.tables.tokens import ACTOR
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS

@@ -4,7 +4,7 @@ Rows are ordered by scenario; within it samples by agent, then frame; sensor fil
 sample, then label row; instances by actor id; tracks by frame, then instance.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,15 @@ import numpy as np
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.tables import tokens
 from deepaccident_devkit.tables.store import damaged_value
-from deepaccident_devkit.tables.tokens import Parts, parse_number, unknown_token
+from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 from deepaccident_devkit.text import meant_text
 
 Views = Mapping[str, Mapping[str, Any]]
 """Table → stored column → view of it."""
+_NUM_WORDS = {
+    table: form.replace("<scenario>", "<scenario_type>/<name>").count("/") + 1 for table, form in tokens.FORMS.items()
+}
 
 
 class Resolver:
@@ -38,19 +41,19 @@ class Resolver:
         self._first_sample: list[int] = agent["first_sample_row"].tolist()
         for row, (scenario_row, name) in enumerate(zip(self._agent_scenario, self._agent_names, strict=True)):
             self._agents[scenario_row][name] = row
-        self._row_finders: dict[str, Callable[[str], int]] = {
+        self._row_finders: dict[str, Callable[..., int]] = {
             "scenario": self._scenario_row,
             "agent": self._agent_row,
             "frame": self._frame_row,
             "sample": self._sample_row,
             "sample_data": self._sample_data_row,
-            "sensor": self._sensor_row,
+            "sensor": _channel_code,
             "calibrated_sensor": self._calibrated_sensor_row,
             "ego_pose": self._sample_row,
             "instance": self._instance_row,
             "annotation": self._annotation_row,
             "track": self._track_row,
-            "category": self._category_row,
+            "category": _category_code,
         }
         self.token_makers: dict[str, Callable[[int], str]] = {
             "scenario": self.scenario_tokens.__getitem__,
@@ -70,7 +73,10 @@ class Resolver:
     def row(self, table: str, token: str) -> int:
         """The row of a token; raises TokenError, and IndexStoreError if the index is damaged."""
         try:
-            return self._row_finders[table](token)
+            return self._row_finders[table](*_words(table, token))
+        except _UnknownError as error:
+            why = self._lacks_its_type(token) or str(error) or f"expected the form {tokens.FORMS[table]}"
+            raise TokenError(f"table '{table}' has no token '{token}': {why}") from None
         except IndexError as error:
             raise damaged_value(table) from error
 
@@ -81,10 +87,6 @@ class Resolver:
     def agents_of(self, scenario_row: int) -> Mapping[str, int]:
         """The agents of a scenario by name, in order, and their rows."""
         return self._agents[scenario_row]
-
-    def num_frames(self, scenario_row: int) -> int:
-        """Frames of a scenario."""
-        return self._num_frames[scenario_row]
 
     def sample_at(self, agent_row: int, index: int) -> int:
         """The row of an agent's sample at frame number `index`, which must be one of the scenario's."""
@@ -143,15 +145,6 @@ class Resolver:
         actor = self._views["instance"]["actor_id"].item(view["instance_row"].item(row))
         return tokens.track_token(self._frame_token(view["frame_row"].item(row)), actor)
 
-    def _split(self, table: str, token: str) -> Parts:
-        try:
-            return tokens.split(table, token)
-        except TokenError:
-            why = self._lacks_its_type(token)
-            if why:
-                raise unknown_token(table, token, why) from None
-            raise
-
     def _lacks_its_type(self, token: str) -> str:
         """What to write where a token begins with the name of a scenario; empty for all others."""
         name, slash, rest = token.partition("/")
@@ -161,112 +154,102 @@ class Resolver:
         shown = " or ".join(here[:3]) + (f" or one of {len(here) - 3} more" if len(here) > 3 else "")
         return f"a scenario's name is not unique, its token begins with its type; write {shown}"
 
-    def _scenario_row(self, token: str) -> int:
-        return self._scenario_of("scenario", token, token)
+    def _scenario_row(self, scenario: str) -> int:
+        if scenario not in self._scenario_rows:
+            raise _UnknownError(f"this release has no scenario '{scenario}' (see list_scenarios())")
+        return self._scenario_rows[scenario]
 
-    def _scenario_of(self, table: str, token: str, scenario: str) -> int:
-        row = self._scenario_rows.get(scenario)
-        if row is None:
-            why = self._lacks_its_type(token) or f"this release has no scenario '{scenario}' (see list_scenarios())"
-            raise unknown_token(table, token, why)
-        return row
-
-    def _agent_of(self, table: str, token: str, scenario_row: int, agent: str) -> int:
-        agents = self._agents[scenario_row]
+    def _agent_row(self, scenario: str, agent: str) -> int:
+        agents = self._agents[self._scenario_row(scenario)]
         if agent not in agents:
-            known = ", ".join(agents)
-            raise unknown_token(table, token, f"the scenario's agents are {known}{meant_text(agent, agents)}")
+            raise _UnknownError(f"the scenario's agents are {', '.join(agents)}{meant_text(agent, agents)}")
         return agents[agent]
 
-    def _index_of(self, table: str, token: str, scenario_row: int, word: str) -> int:
-        index = parse_number(word, 3)
-        if index is None or not 1 <= index <= self._num_frames[scenario_row]:
-            last = self._num_frames[scenario_row]
-            raise unknown_token(table, token, f"the scenario's frames are 001 to {last:03d}")
+    def _index(self, scenario: str, word: str) -> int:
+        index, last = parse_number(word, 3), self._num_frames[self._scenario_row(scenario)]
+        if index is None or not 1 <= index <= last:
+            raise _UnknownError(f"the scenario's frames are 001 to {last:03d}")
         return index
 
-    def _agent_row(self, token: str) -> int:
-        scenario, (agent,) = self._split("agent", token)
-        return self._agent_of("agent", token, self._scenario_of("agent", token, scenario), agent)
+    def _frame_row(self, scenario: str, number: str) -> int:
+        return self._first_frame[self._scenario_row(scenario)] + self._index(scenario, number) - 1
 
-    def _frame_row(self, token: str) -> int:
-        scenario, (word,) = self._split("frame", token)
-        scenario_row = self._scenario_of("frame", token, scenario)
-        return self._first_frame[scenario_row] + self._index_of("frame", token, scenario_row, word) - 1
+    def _sample_row(self, scenario: str, agent: str, number: str) -> int:
+        return self.sample_at(self._agent_row(scenario, agent), self._index(scenario, number))
 
-    def _sample_row(self, token: str) -> int:
-        scenario, (agent, word) = self._split("sample", token)
-        return self._sample_of("sample", token, scenario, agent, word)
+    def _sample_data_row(self, scenario: str, agent: str, number: str, channel: str) -> int:
+        return self._sample_row(scenario, agent, number) * len(CHANNELS) + _channel_code(channel)
 
-    def _sample_of(self, table: str, token: str, scenario: str, agent: str, word: str) -> int:
-        scenario_row = self._scenario_of(table, token, scenario)
-        agent_row = self._agent_of(table, token, scenario_row, agent)
-        return self.sample_at(agent_row, self._index_of(table, token, scenario_row, word))
-
-    def _sample_data_row(self, token: str) -> int:
-        scenario, (agent, word, channel) = self._split("sample_data", token)
-        sample = self._sample_of("sample_data", token, scenario, agent, word)
-        return sample * len(CHANNELS) + self._channel_code("sample_data", token, channel)
-
-    def _channel_code(self, table: str, token: str, channel: str) -> int:
-        if channel not in CHANNELS:
-            raise unknown_token(table, token, f"the channels are {', '.join(CHANNELS)}{meant_text(channel, CHANNELS)}")
-        return CHANNELS.index(channel)
-
-    def _sensor_row(self, token: str) -> int:
-        return self._channel_code("sensor", token, token)
-
-    def _calibrated_sensor_row(self, token: str) -> int:
-        table = "calibrated_sensor"
-        scenario, (agent, channel, *rest) = self._split(table, token)
-        agent_row = self._agent_of(table, token, self._scenario_of(table, token, scenario), agent)
-        wanted = (self._channel_code(table, token, channel), parse_number(rest[0]) if rest else 1)
-        view = self._views[table]
+    def _calibrated_sensor_row(self, scenario: str, agent: str, channel: str, number: str = "") -> int:
+        agent_row = self._agent_row(scenario, agent)
+        wanted = _channel_code(channel), parse_number(number) if number else 1
+        view = self._views["calibrated_sensor"]
         first, last = np.searchsorted(view["agent_row"], (agent_row, agent_row + 1))
-        found = zip(view["sensor_row"][first:last].tolist(), view["number"][first:last].tolist(), strict=True)
-        for offset, values in enumerate(found):
-            if values == wanted and rest != ["1"]:
-                return int(first) + offset
-        raise unknown_token(table, token, "this sensor has fewer distinct values")
+        found = list(zip(view["sensor_row"][first:last].tolist(), view["number"][first:last].tolist(), strict=True))
+        if wanted not in found or number == "1":  # the first value's token has no number
+            raise _UnknownError("this sensor has fewer distinct values")
+        return int(first) + found.index(wanted)
 
-    def _instance_row(self, token: str) -> int:
-        scenario, (word, actor) = self._split("instance", token)
-        return self._instance_of("instance", token, self._scenario_of("instance", token, scenario), word, actor)
-
-    def _instance_of(self, table: str, token: str, scenario_row: int, word: str, actor: str) -> int:
-        view, actor_id = self._views["instance"], parse_number(actor)
+    def _instance_row(self, scenario: str, word: str, actor: str) -> int:
+        scenario_row, actor_id = self._scenario_row(scenario), parse_number(actor)
         if word != tokens.ACTOR or actor_id is None:
-            raise unknown_token(table, token, f"expected the form {tokens.FORMS[table]}")
+            raise _UnknownError
+        view = self._views["instance"]
         first, last = np.searchsorted(view["scenario_row"], (scenario_row, scenario_row + 1))
-        ids = view["actor_id"][first:last]
-        position = int(np.searchsorted(ids, actor_id))
-        if position == len(ids) or ids[position] != actor_id:
-            raise unknown_token(table, token, f"the scenario has no actor {actor_id}")
-        return int(first) + position
+        return int(first) + _place(view["actor_id"][first:last], actor_id, f"the scenario has no actor {actor_id}")
 
-    def _annotation_row(self, token: str) -> int:
-        scenario, (agent, word, row_word) = self._split("annotation", token)
-        sample = self._sample_of("annotation", token, scenario, agent, word)
-        row, count = parse_number(row_word), self._views["sample"]["num_annotations"].item(sample)
+    def _annotation_row(self, scenario: str, agent: str, number: str, place: str) -> int:
+        sample, row = self._sample_row(scenario, agent, number), parse_number(place)
+        view = self._views["sample"]
+        count = view["num_annotations"].item(sample)
         if row is None or not 0 <= row < count:
-            raise unknown_token("annotation", token, f"the sample has {count} annotations, counted from 0")
-        first: int = self._views["sample"]["first_annotation_row"].item(sample)
+            raise _UnknownError(f"the sample has {count} annotations, counted from 0")
+        first: int = view["first_annotation_row"].item(sample)
         return first + row
 
-    def _track_row(self, token: str) -> int:
-        scenario, (frame, word, actor) = self._split("track", token)
-        scenario_row = self._scenario_of("track", token, scenario)
-        frame_row = self._first_frame[scenario_row] + self._index_of("track", token, scenario_row, frame) - 1
-        instance = self._instance_of("track", token, scenario_row, word, actor)
+    def _track_row(self, scenario: str, number: str, word: str, actor: str) -> int:
+        frame, instance = self._frame_row(scenario, number), self._instance_row(scenario, word, actor)
         view = self._views["track"]
-        first, last = np.searchsorted(view["frame_row"], (frame_row, frame_row + 1))
-        position = int(first) + int(np.searchsorted(view["instance_row"][first:last], instance))
-        if position == last or view["instance_row"][position] != instance:
-            raise unknown_token("track", token, "nobody annotated this actor at that moment")
-        return position
+        first, last = np.searchsorted(view["frame_row"], (frame, frame + 1))
+        return int(first) + _place(
+            view["instance_row"][first:last], instance, "nobody annotated this actor at that moment"
+        )
 
-    def _category_row(self, token: str) -> int:
-        if token not in CATEGORIES:
-            known = ", ".join(CATEGORIES)
-            raise unknown_token("category", token, f"the categories are {known}{meant_text(token, CATEGORIES)}")
-        return CATEGORIES.index(token)
+
+class _UnknownError(Exception):
+    """Why a token names no row; without words if it has another form."""
+
+
+def _words(table: str, token: str) -> list[str]:
+    """A token cut up: its scenario (type and name), and the words that follow."""
+    words, wanted = token.split("/"), _NUM_WORDS[table]
+    if len(words) != wanted and not (table == "calibrated_sensor" and len(words) == wanted - 1):
+        remedy = ""
+        if table == "sample" and len(words) == 5 and words[-1] in CHANNELS:
+            remedy = f"; it names a sensor file: leave out '/{words[-1]}'"
+        elif table == "sample_data" and len(words) == 4 and parse_number(words[-1], 3) is not None:
+            remedy = f"; it names a sample: add a channel, such as '/{CHANNELS[0]}'"
+        raise _UnknownError(f"expected the form {tokens.FORMS[table]}{remedy}")
+    return words if wanted == 1 else ["/".join(words[:2]), *words[2:]]
+
+
+def _place(values: Any, wanted: int, why: str) -> int:
+    """Where a number is among others that are sorted."""
+    place = int(np.searchsorted(values, wanted))
+    if place == len(values) or values[place] != wanted:
+        raise _UnknownError(why)
+    return place
+
+
+def _channel_code(channel: str) -> int:
+    return _code("channels", channel, CHANNELS)
+
+
+def _category_code(category: str) -> int:
+    return _code("categories", category, CATEGORIES)
+
+
+def _code(kind: str, word: str, known: Sequence[str]) -> int:
+    if word not in known:
+        raise _UnknownError(f"the {kind} are {', '.join(known)}{meant_text(word, known)}")
+    return known.index(word)

@@ -18,7 +18,7 @@ from deepaccident_devkit.tables.columns import (
     Vector,
     Word,
 )
-from deepaccident_devkit.tables.specs import record_columns, table_specs
+from deepaccident_devkit.tables.records import record_columns, table_specs
 from deepaccident_devkit.tables.tokens import FORMS
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"

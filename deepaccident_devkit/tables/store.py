@@ -1,10 +1,14 @@
-"""Tables on disk: one Arrow file a table with one uncompressed batch, written by streaming, read memory-mapped."""
+"""Tables on disk: one Arrow file a table with one uncompressed batch, written by streaming, read memory-mapped.
 
+The rows of some tables that are kept together, such as a scenario's, are compressed Arrow streams one after the other.
+"""
+
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO
+from tempfile import TemporaryFile
+from typing import Any
 
 import numpy as np
 
@@ -18,11 +22,12 @@ from deepaccident_devkit.tables.arrow import (
     is_streamable,
     numpy_dtype,
     record_batch,
+    unpacked,
     value_fault_of,
     views,
     width,
 )
-from deepaccident_devkit.tables.columns import TableSpec
+from deepaccident_devkit.tables.columns import Column, TableSpec
 
 REMEDY = "mend it with: deepaccident index DATAROOT --check"
 """What to do with a damaged table."""
@@ -38,54 +43,37 @@ def table_path(folder: Path, table: str) -> Path:
     return folder / f"{table}.arrow"
 
 
-class TableWriter:
+class TableWriter(ExitStack):
     """Collects a table's rows piece by piece and writes them as one batch.
 
-    Rows of fixed width go to a scratch file a column; the batch is then written from these, memory-mapped, so that
-    a table of any size needs little memory. A context manager: leaving it removes the scratch files.
+    Rows of fixed width go to a scratch file a column, without a name; the batch is then written from these,
+    memory-mapped, so that a table of any size needs little memory. A context manager: leaving it removes these files.
     """
 
     def __init__(self, folder: Path, spec: TableSpec) -> None:
         """Start writing the table to `folder`, which must exist."""
-        self._folder = folder
-        self._spec = spec
-        self._stack = ExitStack()
-        self._scratch: dict[str, BinaryIO] = {}
-        self._words: dict[str, list[Any]] = {}
-        self.num_rows = 0
-        for name in [column.stored for column in spec.stored_columns if column.stored]:
-            if is_streamable(spec):
-                self._scratch[name] = self._stack.enter_context(self._scratch_path(name).open("wb"))
-            else:
-                self._words[name] = []
-
-    def __enter__(self) -> "TableWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._stack.close()
-        for name in self._scratch:
-            self._scratch_path(name).unlink(missing_ok=True)
+        super().__init__()
+        self._folder, self._spec, self.num_rows = folder, spec, 0
+        self._columns: dict[str | None, Any] = {
+            column.stored: self.enter_context(TemporaryFile(dir=folder)) if is_streamable(spec) else []  # noqa: SIM115
+            for column in spec.stored_columns
+        }
 
     def append(self, columns: Columns) -> None:
         """Add rows; every stored column must be there, all of one length."""
         for column in self._spec.stored_columns:
-            name = column.stored or ""
-            if name in self._scratch:
-                np.ascontiguousarray(columns[name], dtype=numpy_dtype(column.kind)).tofile(self._scratch[name])
+            values, collected = columns[column.stored or ""], self._columns[column.stored]
+            if isinstance(collected, list):
+                collected.extend(values)
             else:
-                self._words[name].extend(columns[name])
+                np.ascontiguousarray(values, dtype=numpy_dtype(column.kind)).tofile(collected)
         self.num_rows += len(columns[self._spec.stored_columns[0].stored or ""])
 
     def finish(self) -> None:
         """Write the table's file."""
         import pyarrow as pa
 
-        for file in self._scratch.values():
-            file.flush()
-        columns = {column.stored: self._collected(column.stored or "", column.kind) for column in self._spec_columns()}
+        columns = {column.stored or "": self._collected(column) for column in self._spec.stored_columns}
         with (
             replacing(table_path(self._folder, self._spec.name)) as temporary,
             pa.OSFile(str(temporary), "wb") as sink,
@@ -93,19 +81,15 @@ class TableWriter:
         ):
             writer.write_batch(record_batch(self._spec, columns))
 
-    def _spec_columns(self) -> Any:
-        return self._spec.stored_columns
-
-    def _scratch_path(self, name: str) -> Path:
-        return self._folder / f".{self._spec.name}.{name}.part"
-
-    def _collected(self, name: str, kind: Any) -> Any:
-        if name not in self._scratch:
-            return self._words[name]
-        shape = (self.num_rows, width(kind)) if width(kind) > 1 else (self.num_rows,)
+    def _collected(self, column: Column) -> Any:
+        collected, dtype = self._columns[column.stored], numpy_dtype(column.kind)
+        if isinstance(collected, list):
+            return collected
+        shape = (self.num_rows, width(column.kind)) if width(column.kind) > 1 else (self.num_rows,)
         if not self.num_rows:
-            return np.zeros(shape, dtype=numpy_dtype(kind))
-        return np.memmap(self._scratch_path(name), dtype=numpy_dtype(kind), mode="r", shape=shape)
+            return np.zeros(shape, dtype=dtype)
+        collected.flush()
+        return np.memmap(collected, dtype=dtype, mode="r", shape=shape)
 
 
 def write_table(folder: Path, spec: TableSpec, columns: Columns) -> None:
@@ -154,3 +138,42 @@ class StoredTable:
         if fault := value_fault_of(self.spec, table):
             raise IndexStoreError(f"{self._path}: damaged ({shortened(fault)}); {REMEDY}")
         return table
+
+
+def streams(tables: Sequence[tuple[TableSpec, Columns]], metadata: Mapping[str, str] | None = None) -> bytes:
+    """The rows of each table, with or without words, as compressed Arrow streams one after the other."""
+    import pyarrow as pa
+
+    options = pa.ipc.IpcWriteOptions(compression="zstd")
+    sink = pa.BufferOutputStream()
+    for spec, columns in tables:
+        with pa.ipc.new_stream(sink, arrow_schema(spec).with_metadata(dict(metadata or {})), options=options) as writer:
+            writer.write_batch(record_batch(spec, columns))
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def streams_metadata(content: bytes) -> dict[str, str]:
+    """The words of `streams`."""
+    import pyarrow as pa
+
+    metadata = pa.ipc.open_stream(content).schema.metadata or {}
+    return {name.decode(): value.decode() for name, value in metadata.items()}
+
+
+def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]] | None:
+    """Of each table stored column → its values, as `streams` took them; None if they are not of these tables.
+
+    Args:
+        source: an Arrow file or bytes in an Arrow reader, at the first stream.
+        specs: the tables, in their order.
+    """
+    import pyarrow as pa
+
+    tables = []
+    for spec in specs:
+        batches = list(pa.ipc.open_stream(source))  # to the stream's end, where the next one starts
+        if len(batches) != 1 or fault_of(spec, batches[0]):
+            return None
+        tables.append({name: unpacked(view) for name, view in views(spec, batches[0]).items()})
+    return tables

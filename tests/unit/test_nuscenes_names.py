@@ -14,7 +14,7 @@ import pytest
 from deepaccident_devkit import DeepAccident, DeepAccidentError, nuscenes_names, render
 from deepaccident_devkit.errors import FieldError, KeywordError, MissingNameError, TableError
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud
-from deepaccident_devkit.tables.specs import table_specs
+from deepaccident_devkit.tables.records import table_specs
 
 CLASSES: list[tuple[type, Mapping[str, str]]] = [
     (DeepAccident, nuscenes_names.DATASET),

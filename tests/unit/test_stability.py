@@ -7,7 +7,7 @@ from pathlib import Path
 from deepaccident_devkit.evaluation.results import FORMAT_VERSION
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_VERSION
 from deepaccident_devkit.motion import label_folder
-from deepaccident_devkit.tables.manifest import SCHEMA_VERSION
+from deepaccident_devkit.tables.index import SCHEMA_VERSION
 
 TOP = Path(__file__).parents[2]
 PAGE = (TOP / "docs" / "stability.md").read_text(encoding="utf-8")

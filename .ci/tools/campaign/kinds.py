@@ -24,7 +24,8 @@ from deepaccident_devkit.release import find_release, read_calib
 from deepaccident_devkit.render.evaluation.report import report_html
 from deepaccident_devkit.synth.spec import draw, read_spec
 from deepaccident_devkit.synth.spec.model import Items, Part
-from deepaccident_devkit.tables.manifest import MANIFEST_FILE, read_manifest
+from deepaccident_devkit.tables import Index
+from deepaccident_devkit.tables.index import MANIFEST_FILE
 from deepaccident_devkit.validation import validate_release
 
 # ---- a release's small files
@@ -361,10 +362,9 @@ def _judge_opened(room: Room, read: Any) -> str | None:
     """Other values are there only where a table's checksum says so."""
     if _same_tables(room, read):
         return None
-    manifest = read_manifest(room.tree / "v1")
-    kept = {} if manifest is None else manifest.table_files
-    folder = room.tree / "v1" / (manifest.tables if manifest else "")
-    damaged = [name for name, (_, checksum) in kept.items() if _checksum(folder / name) != checksum]
+    index = Index.read(room.tree / "v1")
+    files = index.table_files if index else {}
+    damaged = [name for name, (_, checksum) in files.items() if _checksum(index.tables_folder / name) != checksum]
     return None if damaged else "other values, and all checksums are right"
 
 
@@ -437,7 +437,7 @@ KINDS = {
         Kind("scenario file", "yaml", "specs", "*.yaml", (Action(_spec, _judge_spec),)),
         Kind("index's list", "json", "index", f"v1/{MANIFEST_FILE}", _INDEX),
         Kind("index's tables", "arrow", "index", "v1/tables-*/*.arrow", _INDEX),
-        Kind("index's shards", "shard", "index", "v1/shards/*/*.arrow", _INDEX),
+        Kind("index's rows", "shard", "index", "v1/kept/*/*", _INDEX),
         *other_kinds.KINDS,
         *weights_kinds.KINDS,
     )

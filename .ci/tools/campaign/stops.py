@@ -39,7 +39,7 @@ _RELEASE = "{home}/release --index-dir {home}/index --workers 1"
 _SENSORS = f"{{home}}/sensors {SCENARIO} --index-dir {{home}}/index_of_sensors --workers 1"
 _EVALUATE = f"{_RELEASE} --split train --samples all"
 VERBS = (
-    Verb("index", "index {home}/release --index-dir {out} --workers 1"),
+    Verb("index", "index {home}/release --index-dir {out} --workers 1 --check"),
     Verb("labels", f"labels {_RELEASE} --split train --out {{out}}/labels", progress="labels/manifest.json"),
     Verb("synth", "synth {out}/made --scenarios 2 --frames 3 --sensors none --seed 1 --workers 1"),
     Verb("split", f"split {_RELEASE} --out {{out}} --overwrite"),
@@ -227,7 +227,7 @@ def _told(run: Mapping[str, Any]) -> Iterator[str]:
 def _unwhole(found: Mapping[str, bytes], healthy: Mapping[str, bytes], progress: str) -> Iterator[str]:
     """Files under a final name that are not those of an undisturbed run; what an evaluation resumes from has none."""
     for name, content in found.items():
-        own = any(part.startswith(".") or part.endswith(".unfinished") for part in name.split("/"))
+        own = any(part.startswith(".") or part.endswith(".unfinished") or part == "locks" for part in name.split("/"))
         if name == progress:
             json.loads(content)
         elif not own and healthy.get(name) != content:

@@ -80,8 +80,7 @@ def test_a_file_that_is_no_good_is_made_again(
         case "empty":
             path.write_bytes(b"")
         case "foreign":
-            shard = next((own.tables_folder.parent / "shards").rglob("*.arrow"))
-            shutil.copyfile(shard, path)
+            shutil.copyfile(own.tables_folder.parent / "kept" / token, path)
         case "older":
             monkeypatch.setattr(scenario, "VERSION", "1")
         case "folder":

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -92,3 +94,23 @@ def test_other_threads_get_no_signals_to_put_off() -> None:
     thread.start()
     thread.join()
     assert entered
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    paths = [str(tmp_path / "a"), str(tmp_path / "b")]
+    script = (
+        "import workers\nfrom deepaccident_devkit.parallel import run_batch\n"
+        f"run_batch(workers.told_and_asleep, {paths!r}, workers=2)"
+    )
+    path = os.pathsep.join([str(Path(workers.__file__).parent), *sys.path])
+    parent = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": path})
+    wait_for(lambda: len([file for file in tmp_path.iterdir() if file.read_text()]) == 2)
+    numbers = [int(file.read_text()) for file in tmp_path.iterdir()]
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not any(map(is_running, numbers)), seconds=20)
+
+
+def test_run_batch_needs_no_items() -> None:
+    assert run_batch(workers.following, [], workers=3) == []

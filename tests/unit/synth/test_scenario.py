@@ -9,7 +9,7 @@ from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.synth.spec import DESIGNS
-from deepaccident_devkit.tables.accidents import accident_type
+from deepaccident_devkit.tables.build import accident_type
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 
 pytestmark = pytest.mark.slow

@@ -4,7 +4,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.tables.columns import Key
-from deepaccident_devkit.tables.specs import table_specs
+from deepaccident_devkit.tables.records import table_specs
 
 KEYS = [
     (name, column.field, column.kind.table)

@@ -1,33 +1,34 @@
 """Making, finding, refreshing and refusing indexes."""
 
 import logging
+import os
 import pickle
 import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
+from click.testing import CliRunner
+from tiny_index import INDEX, OTHER, THIRD, contents, edit, label, opened
 
-from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import BrokenReleaseError, IndexStoreError, NotAvailableError, SplitFileError
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import (
+    BrokenReleaseError,
+    ChoiceError,
+    DatarootError,
+    IndexStoreError,
+    NotAvailableError,
+    SplitFileError,
+)
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables import indexing
-
-OTHER = "Town05_type001_subtype0001_scenario00007"
-
-
-def opened(root: Path, **arguments: object) -> DeepAccident:
-    return DeepAccident(dataroot=root, verbose=False, **arguments)  # type: ignore[arg-type]
-
-
-def label(root: Path, agent: str = "ego_vehicle", frame: int = 2, name: str = tiny.NAME) -> Path:
-    return root / tiny.TYPE / agent / "label" / name / f"{name}_{frame:03d}.txt"
 
 
 def calib(root: Path, agent: str = "ego_vehicle", frame: int = 2) -> Path:
@@ -84,51 +85,45 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
 }
 
 
-@pytest.fixture
-def two_scenarios(tmp_path: Path) -> Path:
-    tiny.write_tiny_release(tmp_path / "release")
-    return tiny.write_tiny_release(tmp_path / "release", name=OTHER)
-
-
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_broken_scenario_is_named_and_never_hides_the_good_one(
-    two_scenarios: Path, fault: str, caplog: pytest.LogCaptureFixture
+    root: Path, fault: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     damage, message = FAULTS[fault]
-    damage(two_scenarios)
+    damage(root)
     with pytest.raises(BrokenReleaseError, match=message) as raised:
-        opened(two_scenarios)
+        opened(root)
     assert "1 of 2 scenarios are broken" in str(raised.value)
     assert "--on-error skip" in str(raised.value)
     with caplog.at_level(logging.WARNING):
-        release = opened(two_scenarios, on_error="skip")
+        release = opened(root, on_error="skip")
     assert [scenario["name"] for scenario in release.scenario] == [OTHER]
     assert [problem.scenario for problem in release.problems] == [tiny.TOKEN]
     assert f"left out {tiny.TOKEN}" in caplog.text
     with pytest.raises(BrokenReleaseError, match="1 of 2 scenarios"):
-        opened(two_scenarios)  # an index made with skip does not hide it afterwards
+        opened(root)  # an index made with skip does not hide it afterwards
 
 
-def test_all_broken_scenarios_are_listed_at_once(two_scenarios: Path) -> None:
-    label(two_scenarios).write_text("0 0\ncar")
-    label(two_scenarios, name=OTHER).write_text("")
-    replace(label(two_scenarios, frame=3), "van", "lorry")
+def test_all_broken_scenarios_are_listed_at_once(root: Path) -> None:
+    label(root).write_text("0 0\ncar")
+    label(root, name=OTHER).write_text("")
+    replace(label(root, frame=3), "van", "lorry")
     with pytest.raises(BrokenReleaseError, match="2 of 2 scenarios are broken") as raised:
-        opened(two_scenarios)
+        opened(root)
     text = str(raised.value)
     assert f"{OTHER}_002.txt:1: expected '<speed_x> <speed_y>', found an empty file" in text
     assert f"{tiny.NAME}_003.txt:3: class is 'lorry', expected one of car" in text
     with pytest.raises(BrokenReleaseError, match="2 of 2"):
-        opened(two_scenarios, on_error="skip")  # nothing is left to open
+        opened(root, on_error="skip")  # nothing is left to open
 
 
-def test_a_label_mended_in_place_is_read_again(two_scenarios: Path) -> None:
-    good = label(two_scenarios).read_text()
-    label(two_scenarios).write_text("0 0\ncar 1 2")
+def test_a_label_mended_in_place_is_read_again(root: Path) -> None:
+    good = label(root).read_text()
+    label(root).write_text("0 0\ncar 1 2")
     with pytest.raises(BrokenReleaseError, match="found 3"):
-        opened(two_scenarios)
-    label(two_scenarios).write_text(good)
-    assert len(opened(two_scenarios).scenario) == 2
+        opened(root)
+    label(root).write_text(good)
+    assert len(opened(root).scenario) == 2
 
 
 def test_the_same_scenario_in_two_split_files(own_release: Path) -> None:
@@ -218,88 +213,180 @@ def test_labels_without_calib_are_left_out_and_said_so(tmp_path: Path, caplog: p
     assert len(release.agent) == 4
 
 
-def test_opening_again_reads_no_label(two_scenarios: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = opened(two_scenarios)
-    monkeypatch.setattr(index_module, "make_index", lambda *_, **__: pytest.fail("made again"))
-    assert opened(two_scenarios).arrow("track").equals(first.arrow("track"))
+def test_opening_again_reads_no_label(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = opened(root)
+    monkeypatch.setattr(index_module, "_made", lambda *_, **__: pytest.fail("made again"))
+    assert opened(root).arrow("track").equals(first.arrow("track"))
 
 
-def test_only_what_changed_is_read_again(two_scenarios: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened(two_scenarios)
-    read = []
+def test_a_refresh_reads_just_what_was_edited_added_or_removed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
     original = indexing.read_scenario
+    monkeypatch.setattr(
+        indexing, "read_scenario", lambda scenario, scan: (read.append(scenario.name), original(scenario, scan))[1]
+    )
 
-    def counted(scenario: object, scan: object) -> object:
-        read.append(scenario.token)  # type: ignore[attr-defined]
-        return original(scenario, scan)  # type: ignore[arg-type]
+    def refreshed(*options: str) -> tuple[int, list[str]]:
+        read.clear()
+        assert CliRunner().invoke(deepaccident, ["index", str(root), *options]).exit_code == 0
+        names = sorted(read)
+        shutil.rmtree(root.parent / "fresh", ignore_errors=True)
+        count = len(opened(root, root.parent / "fresh").annotation)
+        assert contents(root / INDEX.parent) == contents(root.parent / "fresh")
+        return count, names
 
-    monkeypatch.setattr(indexing, "read_scenario", counted)
-    third = "Town01_type001_subtype0001_scenario00001"
-    tiny.write_tiny_release(two_scenarios, name=third)
-    assert len(opened(two_scenarios).scenario) == 3
-    assert read == [f"{tiny.TYPE}/{third}"]
-    for agent in tiny.AGENTS:
-        for kind in ("calib", "label"):
-            shutil.rmtree(two_scenarios / tiny.TYPE / agent / kind / OTHER)
-    assert [scenario["name"] for scenario in opened(two_scenarios).scenario] == [third, tiny.NAME]
-    assert len(read) == 1
-    assert sorted(path.stem for path in two_scenarios.glob(".deepaccident/v1/shards/*/*.arrow")) == [third, tiny.NAME]
+    before, names = refreshed()
+    assert names == [tiny.NAME, OTHER]
+    assert refreshed("--check") == (before, [])
+    edit(root, OTHER)
+    assert refreshed("--check") == (before - 1, [OTHER])
+    tiny.write_tiny_release(root, scenario_type="type1_subtype2_accident", name=THIRD)
+    assert refreshed()[1] == [THIRD]
+    shutil.rmtree(root / "type1_subtype2_accident")
+    assert refreshed() == (before - 1, [])
 
 
 @pytest.mark.slow
-def test_one_and_two_workers_write_the_same_bytes(release_root_b: Path, tmp_path: Path) -> None:
-    contents = []
-    for workers in (1, 2):
-        release = opened(release_root_b, index_dir=tmp_path / str(workers), workers=workers)
-        files = sorted(path for path in release.tables_folder.iterdir())
-        contents.append([(path.name, path.read_bytes()) for path in files])
-    assert contents[0] == contents[1]
-    assert len(contents[0]) == 12
+def test_workers_and_executors_write_the_same_bytes(release_root_b: Path, tmp_path: Path) -> None:
+    release = opened(release_root_b, tmp_path / "one", workers=1)
+    assert len(list(release.tables_folder.iterdir())) == 12
+    opened(release_root_b, tmp_path / "two", workers=2)
+    with ThreadPoolExecutor(3) as threads:
+        opened(release_root_b, tmp_path / "threads", executor=threads)
+    assert contents(tmp_path / "one") == contents(tmp_path / "two") == contents(tmp_path / "threads")
 
 
 def test_a_read_only_dataroot_gets_its_index_in_the_cache(
-    two_scenarios: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache = tmp_path / "cache"
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     writable = index_module.is_writable_folder
-    monkeypatch.setattr(
-        index_module, "is_writable_folder", lambda path: two_scenarios not in path.parents and writable(path)
-    )
-    release = opened(two_scenarios)
+    monkeypatch.setattr(index_module, "is_writable_folder", lambda path: root not in path.parents and writable(path))
+    release = opened(root)
     assert cache in release.tables_folder.parents
-    assert not (two_scenarios / ".deepaccident").exists()
-    monkeypatch.setattr(index_module, "make_index", lambda *_, **__: pytest.fail("made again"))
-    assert len(opened(two_scenarios).scenario) == 2
+    assert not (root / ".deepaccident").exists()
+    monkeypatch.setattr(index_module, "_made", lambda *_, **__: pytest.fail("made again"))
+    assert len(opened(root).scenario) == 2
     monkeypatch.undo()
     monkeypatch.setattr(index_module, "is_writable_folder", lambda _path: False)
     with pytest.raises(IndexStoreError, match="no place to write the index; give a writable folder with index_dir="):
         opened(tiny.write_tiny_release(tmp_path / "third"))
 
 
-def test_a_stop_while_writing_leaves_the_old_index(two_scenarios: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened(two_scenarios)
-    before = {path: path.read_bytes() for path in two_scenarios.glob(".deepaccident/v1/tables-*/*")}
-    label(two_scenarios).write_text("1.0 2.0\n")
-
-    def stopped(*_arguments: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(indexing, "join_tables", stopped)
-    (two_scenarios / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME / "now.tmp").touch()  # the folder's time moves
-    with pytest.raises(IndexStoreError, match=r"the index cannot be written .*No space left"):
-        opened(two_scenarios)
-    after = {path: path.read_bytes() for path in two_scenarios.glob(".deepaccident/v1/tables-*/*")}
-    assert after == before
-
-
 @pytest.mark.slow
-def test_a_script_without_a_main_guard_may_index_with_workers(two_scenarios: Path) -> None:
-    script = two_scenarios.parent / "script.py"
+def test_a_script_without_a_main_guard_may_index_with_workers(root: Path) -> None:
+    script = root.parent / "script.py"
     script.write_text(
         "from deepaccident_devkit import DeepAccident\n"
-        f"da = DeepAccident(dataroot={str(two_scenarios)!r}, workers=2, verbose=False)\n"
+        f"da = DeepAccident(dataroot={str(root)!r}, workers=2, verbose=False)\n"
         "print('opened', len(da.scenario))\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout == "opened 2\n", done.stderr
+
+
+def test_a_relative_dataroot_survives_chdir(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root.parent)
+    release = opened(root.name, "index")
+    pickled = pickle.dumps(release)
+    monkeypatch.chdir("/")
+    assert release.get_sample_data_path(f"{tiny.TOKEN}/ego_vehicle/001/lidar01").parent.parent.is_relative_to(root)
+    copy = pickle.loads(pickled)
+    assert len(copy.track) == len(release.track) > 0
+
+
+def test_a_home_folder_is_found(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(root.parent))
+    assert len(opened(f"~/{root.name}").scenario) == 2
+
+
+def test_a_file_in_a_folders_place_breaks_its_scenario_alone(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    labels = root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME
+    shutil.rmtree(labels)
+    labels.write_text("")
+    with pytest.raises(BrokenReleaseError, match=rf"1 of 2 scenarios are broken:\n.*\n.*{labels}: cannot be listed"):
+        opened(root)
+    assert [scenario["name"] for scenario in opened(root, on_error="skip").scenario] == [OTHER]
+    assert f"left out {tiny.TOKEN}" in caplog.text
+
+
+def test_an_agent_that_is_a_file_breaks_the_scenarios_of_its_type(root: Path) -> None:
+    good = "type1_subtype2_accident"
+    tiny.write_tiny_release(root, scenario_type=good)
+    agent = root / tiny.TYPE / "other_vehicle"
+    shutil.rmtree(agent)
+    agent.write_text("")
+    with pytest.raises(BrokenReleaseError, match=r"2 of 3 scenarios are broken(.|\n)*other_vehicle.*Not a directory"):
+        opened(root)
+    assert [scenario["scenario_type"] for scenario in opened(root, on_error="skip").scenario] == [good]
+
+
+def test_a_path_that_is_no_utf8_is_refused(tmp_path: Path) -> None:
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
+    odd.mkdir()
+    with pytest.raises(DatarootError, match="is not UTF-8"):
+        opened(odd)
+
+
+def test_an_open_release_outlives_a_new_index(root: Path) -> None:
+    release = opened(root)
+    pickled = pickle.dumps(release)
+    tiny.write_tiny_release(root, name=THIRD)
+    assert len(opened(root).scenario) == 3
+    assert len(release.scenario) == 2
+    assert len(release.track[:]) == len(release.track) > 0
+    with pytest.raises(IndexStoreError, match="the index was made again; open the release again"):
+        pickle.loads(pickled)
+
+
+def test_tables_that_vanish_while_they_are_opened(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from deepaccident_devkit import deepaccident as facade
+
+    original, calls = facade.open_index, []
+
+    def overtaken(*arguments: object, **options: object) -> object:
+        index = original(*arguments, **options)  # type: ignore[arg-type]
+        calls.append(index)
+        if len(calls) == 1:
+            shutil.rmtree(index.tables_folder)  # as another process does that has made newer ones
+        return index
+
+    monkeypatch.setattr(facade, "open_index", overtaken)
+    assert len(opened(root).scenario) == 2
+    assert len(calls) == 2
+
+
+def test_a_scenario_without_meta_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: object) -> None:
+    release = opened(tiny.write_tiny_release(tmp_path, meta=None))
+    assert f"meta/{tiny.NAME}.txt: missing or not readable: weather and collision" in caplog.text
+    release.list_scenarios()
+    assert "collision unknown" in capsys.readouterr().out  # type: ignore[attr-defined]
+
+
+def test_scenarios_that_lack_the_same_are_told_in_one_line(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for meta in root.glob("*/meta/*.txt"):
+        meta.unlink()
+    opened(root)
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert told.startswith(f"2 scenarios, such as {root / tiny.TYPE}/meta/")
+    assert told.endswith(": missing or not readable: weather and collision of this scenario are unknown")
+
+
+@pytest.mark.parametrize("frames", [3, 6])
+def test_an_accident_that_does_not_end_where_meta_says_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, frames: int
+) -> None:
+    root = tiny.write_tiny_release(tmp_path, frames=frames)
+    for _ in range(2):  # indexed, and opened again
+        opened(root)
+        assert "times to the impact are wrong; see: deepaccident validate" in caplog.text
+        caplog.clear()
+    whole = tiny.write_tiny_release(tmp_path / "whole")
+    opened(whole)
+    assert not caplog.records
+
+
+def test_workers_below_one_are_refused(root: Path) -> None:
+    with pytest.raises(ChoiceError, match="workers: expected a number of at least 1, or None, found 0"):
+        opened(root, workers=0)

@@ -3,6 +3,7 @@
 As a script it is the process that opens damaged tables: `python test_index_damage.py FOLDER`.
 """
 
+import hashlib
 import json
 import os
 import random
@@ -16,17 +17,17 @@ from pathlib import Path
 import pytest
 import tiny
 from click.testing import CliRunner
+from tiny_index import INDEX, OTHER, contents, label, opened, rewrite
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import BrokenReleaseError, DeepAccidentError, IndexStoreError
+from deepaccident_devkit.errors import BrokenReleaseError, DeepAccidentError, IndexStoreError, OutputFolderError
 from deepaccident_devkit.tables import OpenTables, Table, indexing
-from deepaccident_devkit.tables.manifest import MANIFEST_FILE
-from deepaccident_devkit.tables.specs import table_spec
+from deepaccident_devkit.tables.index import MANIFEST_FILE
+from deepaccident_devkit.tables.records import table_spec
 from deepaccident_devkit.tables.store import StoredTable, write_table
 
 MUTATIONS = 120
-INDEX = Path(".deepaccident") / "v1"
 
 
 @pytest.fixture
@@ -34,36 +35,9 @@ def root(tmp_path: Path) -> Path:
     return tiny.write_tiny_release(tmp_path / "release")
 
 
-def opened(root: Path, **arguments: object) -> DeepAccident:
-    return DeepAccident(dataroot=root, verbose=False, **arguments)  # type: ignore[arg-type]
-
-
 def check(root: Path) -> None:
     result = CliRunner().invoke(deepaccident, ["index", str(root), "--check"])
     assert result.exit_code == 0, result.output
-
-
-def state(root: Path) -> str:
-    result = CliRunner().invoke(deepaccident, ["index", "info", str(root), "--check", "--json"])
-    found: str = json.loads(result.stdout)["indexes"][0]["state"]
-    return found
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def label(root: Path) -> Path:
-    return root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_002.txt"
-
-
-def rewrite(path: Path, old: str, new: str) -> None:
-    """Change a file as a damaged disk or a restored archive does: its size and times stay, and its folder's too."""
-    before, folder = path.stat(), path.parent.stat()
-    path.write_text(path.read_text().replace(old, new))
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-    os.utime(path.parent, ns=(folder.st_atime_ns, folder.st_mtime_ns))
-    assert path.stat().st_size == before.st_size
 
 
 def test_a_value_that_was_restored_behind_its_size_and_time_is_seen_by_check(root: Path) -> None:
@@ -75,16 +49,14 @@ def test_a_value_that_was_restored_behind_its_size_and_time_is_seen_by_check(roo
     damaged = opened(root).tables_folder
     rewrite(label(root), " 1300 72 ", " 1300 12 ")
     assert points(opened(root)) == 72  # opening compares no contents; schema/README.md says so
-    assert state(root) == "out of date"
     check(root)
-    assert (points(opened(root)), state(root)) == (12, "up to date")
+    assert points(opened(root)) == 12
     assert opened(root).tables_folder != damaged  # nobody's open tables are overwritten
 
 
 def test_a_broken_scenario_that_was_restored_behind_its_size_and_time_opens(root: Path) -> None:
     opened(root)
     rewrite(label(root), "van", "vat")
-    assert state(root) == "out of date"
     assert CliRunner().invoke(deepaccident, ["index", str(root), "--check"]).exit_code == 1
     with pytest.raises(BrokenReleaseError, match="class is 'vat'"):
         opened(root)
@@ -105,7 +77,6 @@ def test_check_reads_no_scenario_again_without_a_cause(root: Path, monkeypatch: 
     shutil.rmtree(root / tiny.TYPE / "other_vehicle" / "calib")  # its labels are not read, but compared
     before = contents(opened(root).tables_folder.parent)
     monkeypatch.setattr(indexing, "read_scenario", lambda *_: pytest.fail("read again"))
-    assert state(root) == "up to date"
     check(root)
     assert contents(root / INDEX) == before
 
@@ -176,17 +147,25 @@ def test_damaged_tables_end_in_our_error_and_never_in_a_crash(root: Path, tmp_pa
 
 
 @pytest.mark.slow
-def test_check_finds_and_mends_every_damage(root: Path) -> None:
+def test_check_mends_every_damage(root: Path) -> None:
     folder = opened(root).tables_folder.parent
     before = contents(folder)
-    names = [name for name in before if name.endswith((".arrow", MANIFEST_FILE))]
-    for seed in range(2 * len(names)):
-        path = folder / names[seed % len(names)]
-        replace(path, mutated(path.read_bytes(), seed))
-        if path.read_bytes() != before[names[seed % len(names)]]:
-            assert state(root) != "up to date", path
+    for seed, name in enumerate([*before, *before]):
+        replace(folder / name, mutated((folder / name).read_bytes(), seed))
         check(root)
-        assert contents(folder) == before, path
+        assert contents(folder) == before, name
+
+
+TEXTS = ("", "{", "[]", "null", '{"schema_version": "2"}', "[" * 100_000, '{"schema_version": true}', "\0")
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_a_manifest_that_is_none_is_made_again(root: Path, text: str) -> None:
+    opened(root)
+    before = contents(root / INDEX)
+    (root / INDEX / MANIFEST_FILE).write_text(text)
+    assert len(opened(root).scenario) == 1
+    assert contents(root / INDEX) == before
 
 
 def test_a_damaged_manifest_is_made_again(root: Path) -> None:
@@ -202,7 +181,44 @@ def test_a_damaged_manifest_is_made_again(root: Path) -> None:
         assert (str(again.value), path.read_bytes()) == (str(told.value), before), place
 
 
-@pytest.mark.parametrize("name", [MANIFEST_FILE, f"shards/{tiny.TYPE}/{tiny.NAME}.arrow", "tables"])
+@pytest.mark.parametrize("damage", [{"table_files": {}}, {"tables": "../../elsewhere"}, {"tables": 5}, {"problems": 5}])
+def test_a_manifest_of_something_else_is_made_again(root: Path, damage: dict[str, object]) -> None:
+    """Its checksum is right."""
+    opened(root)
+    before, path = contents(root / INDEX), root / INDEX / MANIFEST_FILE
+    content = {**json.loads(path.read_text()), **damage}
+    del content["checksum"]
+    digest = hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
+    path.write_text(json.dumps({**content, "checksum": digest}))
+    assert len(opened(root).scenario) == 1
+    assert contents(root / INDEX) == before
+
+
+@pytest.mark.parametrize("damage", ["cut", "gone"])
+def test_damaged_tables_are_made_again(root: Path, damage: str) -> None:
+    tables = opened(root).tables_folder
+    before, track = contents(tables), tables / "track.arrow"
+    if damage == "cut":
+        track.write_bytes(track.read_bytes()[:100])
+    else:
+        track.unlink()
+    assert contents(opened(root).tables_folder) == before
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda whole: whole[:-1], lambda whole: whole[:9] + b"!" + whole[10:], lambda _: b""]
+)
+def test_damaged_rows_are_made_again(root: Path, damage: Callable[[bytes], bytes]) -> None:
+    opened(root)
+    path = root / INDEX / "kept" / tiny.TOKEN
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    tiny.write_tiny_release(root, name=OTHER)
+    assert len(opened(root).scenario) == 2
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize("name", [MANIFEST_FILE, f"kept/{tiny.TOKEN}", "tables"])
 def test_nobody_waits_for_a_pipe(root: Path, name: str) -> None:
     tables = opened(root).tables_folder
     before = contents(root / INDEX)
@@ -225,29 +241,6 @@ def test_limits_that_cannot_be_understood_cost_no_index(root: Path, monkeypatch:
     assert contents(root / INDEX) == before
 
 
-def linked(path: Path, target: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.symlink_to(target)
-
-
-LINKS: dict[str, Callable[[Path, Path], None]] = {
-    "the shards": lambda index, target: linked(index / "shards", target),
-    "some shards": lambda index, target: linked(index / "shards" / tiny.TYPE, target / "sub"),
-    "the lock": lambda index, target: linked(index / ".lock", target / "sub" / "own.arrow"),
-}
-
-
-@pytest.mark.parametrize("what", LINKS)
-def test_nothing_is_written_or_removed_through_a_link(root: Path, tmp_path: Path, what: str) -> None:
-    precious = tmp_path / "precious"
-    (precious / "sub").mkdir(parents=True)
-    (precious / "sub" / "own.arrow").write_bytes(b"precious")
-    LINKS[what](root / INDEX, precious)
-    with pytest.raises(IndexStoreError, match="a symbolic link, which no devkit makes; remove it"):
-        opened(root)
-    assert contents(precious) == {"sub/own.arrow": b"precious"}
-
-
 def test_a_table_that_arrow_would_read_beyond_its_memory_is_refused(tmp_path: Path) -> None:
     spec = table_spec("category")
     write_table(tmp_path, spec, {"name": [0, -100], "index": [0, 1]})
@@ -255,6 +248,21 @@ def test_a_table_that_arrow_would_read_beyond_its_memory_is_refused(tmp_path: Pa
     assert stored.num_rows == 2
     with pytest.raises(IndexStoreError, match=r"category\.arrow: damaged \(.*out of bounds.*index DATAROOT --check"):
         _ = stored.table
+
+
+LINKS = (".lock", "kept", f"kept/{tiny.TYPE}")
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_nothing_is_written_or_removed_through_a_link(root: Path, tmp_path: Path, name: str) -> None:
+    precious = tmp_path / "precious"
+    (precious / "sub").mkdir(parents=True)
+    (precious / "sub" / "own.arrow").write_bytes(b"precious")
+    (root / INDEX / name).parent.mkdir(parents=True)
+    (root / INDEX / name).symlink_to(precious / "sub" / "own.arrow" if name == ".lock" else precious)
+    with pytest.raises(OutputFolderError, match="a symbolic link, which no devkit makes; remove it"):
+        opened(root)
+    assert contents(precious) == {"sub/own.arrow": b"precious"}
 
 
 if __name__ == "__main__":

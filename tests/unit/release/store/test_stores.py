@@ -13,7 +13,7 @@ from packing import files_of, image_sum, packed
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import DatarootError, MissingFileError, NotAvailableError
+from deepaccident_devkit.errors import MissingFileError, NotAvailableError, SomeFailedError
 from deepaccident_devkit.reading import RefusedFileError
 from deepaccident_devkit.release.store import open_dataroot
 from deepaccident_devkit.release.store.cache import FileCache
@@ -118,10 +118,10 @@ def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path) 
             ["validate", "--files", "--workers", "1"],
             ["validate", "--workers", "1"],
             ["export", "opencood", "--out", str(tmp_path / "opencood"), "--workers", "1"],
-            ["index", "info"],
+            ["info", "--index"],
         )
     ):
-        at = 2 if verb[0] == "export" or verb[:2] == ["index", "info"] else 1
+        at = 2 if verb[0] == "export" else 1
         command = [*verb[:at], places[kind], *verb[at:]]
         if verb[0] != "validate":
             command += ["--index-dir", str(tmp_path / "index")]
@@ -200,14 +200,16 @@ def test_a_url_that_fails_amid_indexing_is_told(
         raise RefusedFileError(5, "cannot be read (the line is dead)")
 
     monkeypatch.setattr(UrlSource, "read_all", gone)
-    with pytest.raises(DatarootError, match=r"memory://.*: cannot be read \(the line is dead\); check the connection"):
+    with pytest.raises(
+        SomeFailedError, match=r"memory://.*: cannot be read \(the line is dead\); check the connection"
+    ):
         DeepAccident(dataroot=places[kind], index_dir=tmp_path, workers=1, verbose=False)
 
 
 def test_clear_removes_the_lists_too(release_root: Path, tmp_path: Path) -> None:
     archive = packed(release_root, tmp_path / "all.zip")
     DeepAccident(dataroot=archive, workers=1, verbose=False)
-    assert [each.folder.name for each in clear_index(archive)] == ["v1"]
+    assert [folder.name for folder in clear_index(archive)] == ["v1"]
     open_dataroot(archive, workers=1)
     assert clear_index(archive) == []
     assert [each for each in (tmp_path / ".deepaccident").rglob("*") if each.is_file()] == []
