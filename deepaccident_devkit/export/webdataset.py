@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
+from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.sample_json import CAMERA_NAMES, JSON_FIELDS, JSON_TYPES, sample_json
-from deepaccident_devkit.export.sensor_files import points_in, sensor_files
+from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.export.shards import README, readme, shards
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import image_size, read_image_bytes
@@ -32,9 +32,8 @@ if TYPE_CHECKING:
 
 Frames = Literal["every", "keyframes"]
 
-_POINT_BYTES: Final = 16
 _FACTS_BYTES: Final = 20_000
-"""Of a sample's JSON and of the headers of its files, about."""
+"""Of a sample's JSON and of the headers of its files, about; shards are divided by it."""
 _IN_SHARDS: Final = (*CAMERAS, LIDAR)
 _TYPES: Final[Mapping[str, Any]] = {
     **{f"{name}.jpg": "image" for name in CAMERA_NAMES.values()},
@@ -85,21 +84,13 @@ class WebDataset(Format):
             raise ConfigError(f"shard_size: expected a number of bytes from 1, found {self.shard_size}")
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
-        """A shard each, by the sizes of the first files: all would take minutes, and plan looks at them."""
+        """A shard each, by the sizes of the first files: all would take minutes."""
         sizes = {scenario: _Recording(dataset, scenario, self).quick_size() for scenario in scenarios}
         return [
             Unit(name=f"{split}-{number:06d}", scenarios=group)
             for split, groups in shards(dataset, sizes, self.shard_size).items()
             for number, group in enumerate(groups)
         ]
-
-    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
-        """By the sizes of the images and the number of points of each first cloud."""
-        total = Plan(files=1)
-        for scenario in unit.scenarios:
-            recording = _Recording(dataset, scenario, self)
-            total += Plan(samples=recording.samples, bytes=recording.size())
-        return total
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a shard, in the format of GNU tar: it has names of any length."""
@@ -109,7 +100,7 @@ class WebDataset(Format):
         ):
             for scenario in unit.scenarios:
                 recording = _Recording(dataset, scenario, self)
-                recording.count_left_out(output)
+                recording.count(output)
                 recording.write(archive)
 
     def finish(
@@ -163,18 +154,9 @@ class _Recording:
             size += path.stat().st_size * len(self._numbers) if path.is_file() else 0
         return size
 
-    def size(self) -> int:
-        """Bytes, as if all clouds of an agent had as many points as its first one."""
-        size = self.samples * _FACTS_BYTES
-        for (_, channel), files in self._files.items():
-            if channel in CAMERAS:
-                size += sum(each for _, each in files.values())
-            elif channel == LIDAR:
-                size += points_in(files) * _POINT_BYTES
-        return size
-
-    def count_left_out(self, output: Output) -> None:
-        """Count what is not written."""
+    def count(self, output: Output) -> None:
+        """Count the samples, and what is not written."""
+        output.tally.samples += self.samples
         absent = [agent for agent in self._wanted if agent not in self._here]
         counts = {channel: sum(len(self._files[agent, channel]) for agent in self._agents) for channel in CHANNELS}
         images = sum(counts[camera] for camera in CAMERAS)

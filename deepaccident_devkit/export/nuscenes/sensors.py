@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from deepaccident_devkit.geometry import PinholeCamera
 
 LidarAxes = Literal["ego", "nuscenes"]
-POINT_BYTES: Final = 20
-"""Of a point in a cloud: x, y, z, intensity and ring, float32."""
 TURNS: Final = {
     "ego": np.eye(3),
     "nuscenes": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),

@@ -11,16 +11,15 @@ from typing import Any, ClassVar, Final
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
-from deepaccident_devkit.export.opencood.cloud import POINT_BYTES, pcd_bytes
+from deepaccident_devkit.export.bulk import Format, Output, Unit
+from deepaccident_devkit.export.opencood.cloud import pcd_bytes
 from deepaccident_devkit.export.opencood.moments import CAMERA_NAMES, Moments
 from deepaccident_devkit.export.opencood.recording import Recording
-from deepaccident_devkit.export.sensor_files import points_in
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release import read_lidar
-from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
+from deepaccident_devkit.taxonomy import CATEGORIES, LIDAR, VEHICLE_AGENTS
 from deepaccident_devkit.text import choice
 
 logger = logging.getLogger(__name__)
@@ -28,8 +27,6 @@ logger = logging.getLogger(__name__)
 _SPLITS: Final[Mapping[str | None, str]] = {"train": "train", "val": "validate", "test": "test", None: "unknown"}
 """Our split → their folder."""
 _AGENTS: Final = "agents.json"
-_FACTS_BYTES, _BOX_BYTES = 6000, 450
-"""Of the yaml and the json of a moment, about: of its poses and cameras, and of each box."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,28 +58,10 @@ class OpenCood(Format):
         object.__setattr__(self, "classes", tuple(each for each in CATEGORIES if each in chosen))
         object.__setattr__(self, "ego", choice("ego", self.ego, VEHICLE_AGENTS))
 
-    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
-        """About how much a scenario is."""
-        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
-        total = Plan()
-        for agent in recording.agents:
-            images = [size for camera in CAMERAS for _, size in recording.files[agent][camera].values()]
-            first = dataset.get_sample(recording.token, agent, 1)
-            boxes, frames = first["num_annotations"], len(recording.frames)
-            total += Plan(
-                samples=frames,
-                files=2 * frames + len(recording.files[agent][LIDAR]),
-                bytes=frames * (_FACTS_BYTES + boxes * _BOX_BYTES)
-                + points_in(recording.files[agent][LIDAR]) * POINT_BYTES,
-                linked_files=len(images),
-                linked_bytes=sum(images),
-            )
-        return total
-
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a scenario's folder, which appears when it is whole."""
         recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
-        recording.count_left_out(output)
+        recording.count(output)
         if recording.frames:  # loaders stop at a scenario without agents
             with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:
                 folder.write("data_protocol.yaml", _yaml(recording.protocol()))

@@ -70,8 +70,9 @@ class Recording:
             "agents": {self.folders[agent]: {"name": agent, "actor_id": actor} for agent, actor in actors.items()},
         }
 
-    def count_left_out(self, output: Output) -> None:
-        """Count what of the scenario is not written; boxes are counted one moment after the other."""
+    def count(self, output: Output) -> None:
+        """Count the samples, and what of the scenario is not written; boxes are counted moment by moment."""
+        output.tally.samples += self.written
         images = sum(map(self._count, CAMERAS))
         output.leave_out("agents of scenarios that are not in this release", self._absent)
         output.leave_out("images that are not in this release", len(CAMERAS) * self.samples - images)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, ClassVar, Final, get_args
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
-from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
+from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.questions.observed import Seen
-from deepaccident_devkit.export.questions.pictures import FOLDER, Pictures
+from deepaccident_devkit.export.questions.pictures import FOLDER
 from deepaccident_devkit.export.questions.recordings import AskRules, recordings
 from deepaccident_devkit.export.questions.texts import answer_schema, readme
 from deepaccident_devkit.export.questions.truth import why_facts
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 QUESTIONS: Final = "questions.jsonl"
 TRUTH: Final = "truth.jsonl"
-_ROW_BYTES, _FACTS_BYTES = 70, 1500
-"""Of an actor at a moment, and of all else in a question and its truth, about."""
 _ID: Final = slice(len('{"id": "'), len('{"id": "') + 16)
 """Where the id stands in a line."""
 
@@ -120,21 +118,6 @@ class Questions(ShortRepr, Format):
             )
         return super().units(dataset, scenarios)
 
-    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
-        """By the boxes in the label of each present, and the sizes of the pictures."""
-        total = Plan()
-        for asked in recordings(dataset, unit.scenarios[0], self._rules, Counter()):
-            pictures = Pictures(asked.observations, self.cameras)
-            for window in asked.windows:
-                boxes, sizes = dataset.sample.get(asked.sample(window))["num_annotations"], pictures.sizes(window)
-                total += Plan(
-                    samples=1,
-                    bytes=_FACTS_BYTES + boxes * len(window.frames) * _ROW_BYTES,
-                    linked_files=len(sizes),
-                    linked_bytes=sum(sizes),
-                )
-        return total
-
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Keep the questions of a scenario and their truth, a line each, and put its pictures there."""
         token, left_out, lines = unit.scenarios[0], Counter[str](), []
@@ -142,6 +125,7 @@ class Questions(ShortRepr, Format):
         if asked:
             why = why_facts(dataset, dataset.scenario.get(token))
             lines = [pair for each in asked for pair in each.questions(why, output)]
+        output.tally.samples += len(lines)
         for number, name in enumerate((QUESTIONS, TRUTH)):
             content = "".join(f"{json.dumps(pair[number], allow_nan=False)}\n" for pair in lines)
             write_bytes(output.parts / name, content.encode())

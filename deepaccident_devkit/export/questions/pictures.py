@@ -40,10 +40,6 @@ class Pictures:
             for agent, camera in product(given.agents, self._cameras)
         }
 
-    def sizes(self, window: Window) -> list[int]:
-        """The bytes of each picture of a window."""
-        return [files[frame][1] for files in self._files.values() for frame in window.frames if frame in files]
-
     def put(self, window: Window, names: Names, question: str, output: Output) -> list[dict[str, Any]]:
         """Put the pictures of a window there, and list them by time, observer and camera.
 

@@ -165,12 +165,7 @@ def test_files_are_those_of_the_release(da: DeepAccident, exported: Exported, ta
             assert np.array_equal(points[:, :4], cloud.points.astype(np.float32))
             assert not points[:, 4].any()
     assert seen == {path for path in exported.folder.glob("s*/*/*") if path.is_file()}
-    assert exported.tally.linked == {"hard": exported.plan.linked_files}
-
-
-def test_the_plan_is_near(exported: Exported) -> None:
-    assert exported.plan.files <= exported.tally.files <= exported.plan.files + 20
-    assert exported.plan.bytes == pytest.approx(exported.tally.bytes, rel=0.1)
+    assert exported.tally.linked == {"hard": len(list(exported.folder.glob("s*/CAM*/*.jpg")))}
 
 
 def test_sweeps_belong_to_the_keyframe_after_them(tables: Tables) -> None:
