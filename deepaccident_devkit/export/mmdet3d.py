@@ -27,8 +27,7 @@ from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.export.bulk import Manifest
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
-from deepaccident_devkit.export.nuscenes.names import CAMERA_CHANNELS, VERSION, sensor_path, token
-from deepaccident_devkit.export.nuscenes.sensors import TURNS
+from deepaccident_devkit.export.nuscenes.scenes import CAMERA_CHANNELS, TURNS, VERSION, sensor_path, token
 from deepaccident_devkit.export.sensor_files import stored_camera
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3
@@ -39,8 +38,7 @@ from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output, Unit
-    from deepaccident_devkit.export.nuscenes.boxes import Van
-    from deepaccident_devkit.export.nuscenes.scenes import Scene
+    from deepaccident_devkit.export.nuscenes.scenes import Scene, Van
 
 CLASSES: Final = (
     *("car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian"),

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
-from deepaccident_devkit.maps.config import TownMapConfig
-from deepaccident_devkit.maps.looks import Looks, looks_of
+from deepaccident_devkit.maps.looks import Looks, TownMapConfig, looks_of
 from deepaccident_devkit.release import read_bev
 from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE

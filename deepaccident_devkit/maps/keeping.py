@@ -21,8 +21,8 @@ from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.maps.config import TownMapConfig
 from deepaccident_devkit.maps.counting import GROUND_CLASSES
+from deepaccident_devkit.maps.looks import TownMapConfig
 from deepaccident_devkit.maps.town_map import TownMap
 from deepaccident_devkit.reading import limit_of
 

@@ -11,11 +11,10 @@ import numpy as np
 from deepaccident_devkit.arrays import IntArray, as_floats
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.maps.config import TownMapConfig
 from deepaccident_devkit.maps.counting import GROUND_CLASSES, Counts, Window, cells_around, count_scenario
 from deepaccident_devkit.maps.hidden import hidden_ground
 from deepaccident_devkit.maps.keeping import keep_map, map_path, read_map
-from deepaccident_devkit.maps.looks import looks_of
+from deepaccident_devkit.maps.looks import TownMapConfig, looks_of
 from deepaccident_devkit.maps.town_map import TownMap, classes_of
 from deepaccident_devkit.parallel import Places, run_unordered
 from deepaccident_devkit.taxonomy import BEV_CAMERA

@@ -1,25 +1,40 @@
-"""The recordings that can be asked about, and the question and the truth of each of their windows."""
+"""The recordings that can be asked about, and of each of their windows the question, its pictures and its truth."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.export.questions.observed import Observations, Seen
-from deepaccident_devkit.export.questions.pictures import Pictures
-from deepaccident_devkit.export.questions.question import names_of, question_facts
-from deepaccident_devkit.export.questions.truth import truth_facts, unanswerable
-from deepaccident_devkit.export.questions.windows import Window, WindowRules, digest
+from deepaccident_devkit.evaluation.metrics.accident import box_truth
+from deepaccident_devkit.export.questions.observed import (
+    Observations,
+    Seen,
+    Window,
+    WindowRules,
+    digest,
+    names_of,
+    question_facts,
+)
+from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AgentName
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, AgentName
+from deepaccident_devkit.v2x.collisions import collision, labelled_pair
 from deepaccident_devkit.v2x.configurations import agents_of, cooperating_agents
+from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output
+    from deepaccident_devkit.export.questions.observed import Names, Observations, Window
+    from deepaccident_devkit.release.store import ReleasePath
 
 _ABSENT: Final = "agents of scenarios that are not in this release"
 _ALONE: Final = "recordings whose observers are not all in this release"
@@ -125,3 +140,156 @@ def _observers(dataset: Dataset, scenario: str, ego: AgentName, wanted: str | tu
         return cooperating_agents(dataset, sample_token(scenario, ego, 1), named)
     except NotAvailableError:
         return ()
+
+
+FOLDER: Final = "questions"
+"""Of what may be handed out, in the export's folder."""
+_MISSING: Final = "pictures that are not in this release"
+
+
+class Pictures:
+    """The pictures of some cameras of a recording's observers.
+
+    A picture has a name in each question that shows it, so that questions cannot be told to be of one recording by it.
+    """
+
+    def __init__(self, observations: Observations, cameras: Sequence[str]) -> None:
+        """Look at nothing yet."""
+        self._observations, self._cameras = observations, cameras
+
+    @cached_property
+    def _files(self) -> dict[tuple[str, str], dict[int, tuple[ReleasePath, int]]]:
+        """Agent and camera → frame → path and bytes of what is there."""
+        given = self._observations
+        return {
+            (agent, camera): dict(sensor_files(given.dataset, given.scenario, agent, camera))
+            for agent, camera in product(given.agents, self._cameras)
+        }
+
+    def put(self, window: Window, names: Names, question: str, output: Output) -> list[dict[str, Any]]:
+        """Put the pictures of a window there, and list them by time, observer and camera.
+
+        Args:
+            window: the moments.
+            names: of the observers.
+            question: its id.
+            output: where they go; counts those that are missing.
+        """
+        listed = []
+        moments = enumerate(zip(window.frames, window.times, strict=True))
+        for (number, (frame, time)), name, camera in product(moments, names.observers, self._cameras):
+            found = self._files[names.observers[name], camera].get(frame)
+            if found is None:
+                output.leave_out(_MISSING)
+                continue
+            path = f"images/{question}/{number:02d}_{name}_{camera}.jpg"
+            output.link(found[0], f"{FOLDER}/{path}", symbolic=False)
+            listed.append({"time": time, "observer": name, "camera": camera, "path": path})
+        return listed
+
+
+_SECOND: Final = round(1 / FRAME_PERIOD)
+_DESIGN: Final = ("accident_type", "signalized", "spawn_side", "ego_direction", "other_direction")
+_CONTACT: Final = ("sides", "speeds", "closing_speed", "impact_angle", "gap")
+Seconds = list[bool | None]
+"""Whether there is an accident in each second ahead; None where the recording does not say."""
+
+
+def unanswerable(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:
+    """Why nothing can be asked about a scenario, as a plural that is counted; None if it can."""
+    if scenario["weather"] is None:
+        return "scenarios without meta, which says whether there is an accident"
+    actors = scenario_tracks(dataset, scenario["token"]).actor_id
+    if not len(actors):
+        return "scenarios without labels"
+    told = scenario["collision"]
+    if told is not None and labelled_pair(told, actors) is None:
+        return "scenarios with an actor in the accident that no label shows"
+    return None
+
+
+def seconds_ahead(frames_to_impact: int | None, frames_to_end: int, ahead: int) -> Seconds:
+    """Whether there is an accident in each second: after n − 1 seconds, and up to n seconds, for n from 1 to `ahead`.
+
+    Nobody knows what comes after an impact, or after the recording: these seconds are None.
+
+    Args:
+        frames_to_impact: recorded frames from the present to the impact; None if there is none.
+        frames_to_end: to the recording's last frame.
+        ahead: number of seconds.
+    """
+    if frames_to_impact is None:
+        return [False if second * _SECOND <= frames_to_end else None for second in range(1, ahead + 1)]
+    there = math.ceil(frames_to_impact / _SECOND)
+    return [second == there if second <= there else None for second in range(1, ahead + 1)]
+
+
+def truth_facts(
+    dataset: Dataset, sample: str, names: Names, ahead: int, contact: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """What is known of a question's answer.
+
+    Args:
+        dataset: the release.
+        sample: token of the present.
+        names: of the question.
+        ahead: seconds that are asked about.
+        contact: why, as `why_facts` gives it for the scenario.
+
+    Returns:
+        `sample`, `last_frame`, the names, `accident` for each second, and for an accident in one of them `when`, `who`
+        (names, None for one that the question does not show), `actor_ids`, `where` (2, 2) in the present ego frame,
+        `last_seen` of each, and `why`; None where there is none.
+
+    Raises:
+        NotAvailableError: a label is missing without which the places are not known.
+    """
+    record = dataset.sample.get(sample)
+    to_impact, to_end = record["time_to_impact"], record["time_to_end"]
+    scenario = dataset.scenario.get(record["scenario_token"])
+    seconds = seconds_ahead(_frames(to_impact), round(to_end / FRAME_PERIOD), ahead)
+    found: dict[str, Any] = dict.fromkeys(("when", "who", "actor_ids", "where", "last_seen", "why"))
+    if True in seconds:
+        impact = box_truth(dataset, sample, float(ahead)).accident
+        if impact is not None and impact.ids is not None:
+            found = {
+                "when": round(impact.time, 1),
+                "who": [names.of_actor(actor) for actor in impact.ids],
+                "actor_ids": list(impact.ids),
+                "where": (np.round(impact.positions, 2) + 0.0).tolist(),
+                "last_seen": [names.last_seen.get(actor) for actor in impact.ids],
+                "why": contact,
+            }
+    return {
+        "sample": sample,
+        "last_frame": scenario["num_frames"],
+        "observers": dict(names.observers),
+        "actors": dict(names.actors),
+        "accident": seconds,
+        **found,
+    }
+
+
+def why_facts(dataset: Dataset, scenario: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The design of an accident and how the two met: metres, seconds, radians; None without a collision."""
+    if scenario["collision"] is None:
+        return None
+    design = {name: scenario[name] for name in _DESIGN}
+    try:
+        contact = collision(dataset, scenario["token"])
+    except NotAvailableError:  # the two are never labelled together
+        contact = None
+    return {**design, **{name: None if contact is None else _plain(getattr(contact, name)) for name in _CONTACT}}
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON holds it: numbers with two decimals, None in place of NaN."""
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(each) for each in value]
+    if isinstance(value, float):
+        return None if math.isnan(value) else round(value, 2) + 0.0
+    return value
+
+
+def _frames(seconds: float | None) -> int | None:
+    return None if seconds is None else round(seconds / FRAME_PERIOD)

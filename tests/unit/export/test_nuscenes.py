@@ -18,7 +18,7 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.nuscenes import NuScenes
-from deepaccident_devkit.export.nuscenes.names import CHANNEL_NAMES
+from deepaccident_devkit.export.nuscenes.scenes import CHANNEL_NAMES
 from deepaccident_devkit.release.images import write_image
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
 
