@@ -13,7 +13,7 @@ from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.pages.answers import explorer_of, picture
 from deepaccident_devkit.explore.pages.release_tabs import release_page
 from deepaccident_devkit.maps import TownMap, TownMapConfig, kept_town_map, town_map, towns_of
-from deepaccident_devkit.maps.looks import looks_of
+from deepaccident_devkit.maps.counting import looks_of
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.town_map import draw_whole_map
 from deepaccident_devkit.text import choice
