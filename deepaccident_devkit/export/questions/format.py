@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -15,7 +14,7 @@ from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.questions.observed import Seen, WindowRules
-from deepaccident_devkit.export.questions.recordings import FOLDER, AskRules, recordings, why_facts
+from deepaccident_devkit.export.questions.recordings import FOLDER, questions_of
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS
@@ -89,17 +88,6 @@ class Questions(ShortRepr, Format):
         """The pictures that go with questions; who observes depends on the ego."""
         return tuple(product(AGENTS, self.cameras))
 
-    @property
-    def _rules(self) -> AskRules:
-        return AskRules(
-            egos=self.agents,
-            observers=self.observers,
-            seen=self.seen,
-            window=self.window,
-            cameras=self.cameras,
-            seed=self.seed,
-        )
-
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
         """The scenarios, one each.
 
@@ -117,24 +105,14 @@ class Questions(ShortRepr, Format):
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Keep the questions of a scenario and their truth, a line each, and put its pictures there."""
-        token, left_out, lines = unit.scenarios[0], Counter[str](), []
-        asked = list(recordings(dataset, token, self._rules, left_out))
-        if asked:
-            why = why_facts(dataset, dataset.scenario.get(token))
-            lines = [pair for each in asked for pair in each.questions(why, output)]
+        lines = questions_of(dataset, unit.scenarios[0], self, output)
         output.tally.samples += len(lines)
         for number, name in enumerate((QUESTIONS, TRUTH)):
             content = "".join(f"{json.dumps(pair[number], allow_nan=False)}\n" for pair in lines)
             write_bytes(output.parts / name, content.encode())
-        for what, count in left_out.items():
-            output.leave_out(what, count)
 
     def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002 - others need the release
-        """Join the questions of all scenarios, and their truth, in the order of the ids, which were drawn.
-
-        Raises:
-            NotAvailableError: there is no question at all.
-        """
+        """Join the questions of all scenarios, and their truth, in the order of the ids, which were drawn."""
         folders, rules = [parts(unit) for unit in units], self.window
         for name, path in ((QUESTIONS, f"{FOLDER}/{QUESTIONS}"), (TRUTH, TRUTH)):
             lines = _by_id([folder / name for folder in folders])
@@ -147,19 +125,13 @@ class Questions(ShortRepr, Format):
 
 
 def _by_id(paths: Sequence[Path]) -> Iterator[bytes]:
-    """The lines of files in the order of their ids; in memory are their places alone.
-
-    Raises:
-        NotAvailableError: there is no line.
-    """
+    """The lines of files in the order of their ids; in memory are their places alone."""
     places: list[tuple[bytes, int, int, int]] = []
     for number, path in enumerate(paths):
         first = 0
         for line in read_bytes(path, "results").splitlines(keepends=True):
             places.append((line[_ID], number, first, len(line)))
             first += len(line)
-    if not places:
-        raise NotAvailableError(Questions.nothing)
     for _, number, first, length in sorted(places):
         with paths[number].open("rb") as file:
             file.seek(first)

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -16,9 +13,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.metrics.accident import box_truth
 from deepaccident_devkit.export.questions.observed import (
     Observations,
-    Seen,
     Window,
-    WindowRules,
     digest,
     names_of,
     question_facts,
@@ -33,104 +28,92 @@ from deepaccident_devkit.v2x.tracks import scenario_tracks
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output
-    from deepaccident_devkit.export.questions.observed import Names, Observations, Window
+    from deepaccident_devkit.export.questions.format import Questions
+    from deepaccident_devkit.export.questions.observed import Names
     from deepaccident_devkit.release.store import ReleasePath
 
 _ABSENT: Final = "agents of scenarios that are not in this release"
 _ALONE: Final = "recordings whose observers are not all in this release"
 _SHORT: Final = "recordings that are too short for a window"
 _UNLABELLED: Final = "windows with a moment at which an observer has no label"
+FOLDER: Final = "questions"
+"""Of what may be handed out, in the export's folder."""
+_MISSING: Final = "pictures that are not in this release"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskRules:
-    """What is asked, and of whom; `Questions` says what the values are.
-
-    Attributes:
-        egos: the agents that ask.
-        observers: who observes together with each of them.
-        seen: what counts as seen.
-        window: which windows there are.
-        cameras: whose pictures go with the questions.
-        seed: from which ids are drawn.
-    """
-
-    egos: tuple[str, ...]
-    observers: str | tuple[str, ...]
-    seen: Seen
-    window: WindowRules
-    cameras: tuple[str, ...]
-    seed: str
+Pair: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
+"""A question and its truth."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
-    """A recording that is asked about.
-
-    Attributes:
-        observations: of its observers, the ego first.
-        windows: in the order of time.
-        rules: of the questions.
-    """
-
-    observations: Observations
-    windows: Sequence[Window]
-    rules: AskRules
-
-    def sample(self, window: Window) -> str:
-        """The token of a window's present."""
-        return sample_token(self.observations.scenario, self.observations.agents[0], window.present)
-
-    def questions(
-        self, why: Mapping[str, Any] | None, output: Output
-    ) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-        """Question and truth of each window; puts the pictures there, and counts what is left out.
-
-        Args:
-            why: of the truth (`truth.why_facts`).
-            output: where pictures and counts go.
-        """
-        observed, pictures = self.observations, Pictures(self.observations, self.rules.cameras)
-        scenario = observed.dataset.scenario.get(observed.scenario)
-        for window in self.windows:
-            if not observed.is_labelled(window):
-                output.leave_out(_UNLABELLED)
-                continue
-            seen, paths = observed.seen(window), observed.paths(window)
-            names = names_of(seen, paths, observed.own_ids, window.times)
-            key, ahead = self._id(window), self.rules.window.ahead
-            question = {
-                "id": key,
-                "seconds": ahead,
-                **question_facts(seen, paths, names, window, scenario),
-                **({"images": pictures.put(window, names, key, output)} if self.rules.cameras else {}),
-            }
-            yield question, {"id": key, **truth_facts(observed.dataset, self.sample(window), names, ahead, why)}
-
-    def _id(self, window: Window) -> str:
-        """The same for the same sample, observers and moments."""
-        rules, agents = self.rules.window, self.observations.agents
-        what = (self.sample(window), *agents, f"{rules.observe:g}", str(rules.rate), self.rules.seen)
-        return digest(self.rules.seed, "question", *what)
-
-
-def recordings(dataset: Dataset, scenario: str, rules: AskRules, left_out: Counter[str]) -> Iterator[Asked]:
-    """The recordings of a scenario, given by its token, that can be asked about; the others are counted."""
+def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Output) -> list[Pair]:
+    """The questions of a scenario, given by its token; puts the pictures there, and counts what is left out."""
     record = dataset.scenario.get(scenario)
-    reason = unanswerable(dataset, record)
-    if reason is not None:
-        left_out[reason] += 1
-        return
-    here = agents_of(dataset, scenario)
-    left_out[_ABSENT] += sum(agent not in here for agent in rules.egos)
-    for ego in (agent for agent in here if agent in rules.egos):
-        agents = _observers(dataset, scenario, ego, rules.observers)
-        windows = rules.window.windows(record["num_frames"], f"{scenario}/{ego}", rules.seed)
-        left_out[_ALONE] += not agents
-        left_out[_SHORT] += bool(agents) and not windows
+    if reason := unanswerable(dataset, record):
+        output.leave_out(reason)
+        return []
+    here, asked = agents_of(dataset, scenario), []
+    output.leave_out(_ABSENT, sum(agent not in here for agent in form.agents))
+    for ego in (agent for agent in here if agent in form.agents):
+        agents = _observers(dataset, scenario, ego, form.observers)
+        windows = form.window.windows(record["num_frames"], f"{scenario}/{ego}", form.seed)
+        output.leave_out(_ALONE, not agents)
+        output.leave_out(_SHORT, bool(agents) and not windows)
         if agents and windows:
-            observations = Observations(dataset, scenario, agents, rules.seen)
-            yield Asked(observations=observations, windows=windows, rules=rules)
+            asked.append((Observations(dataset, scenario, agents, form.seen), windows))
+    why = why_facts(dataset, record) if asked else None
+    return [pair for observed, windows in asked for pair in _pairs(observed, windows, form, why, output)]
+
+
+def _pairs(
+    observed: Observations, windows: Sequence[Window], form: Questions, why: Mapping[str, Any] | None, output: Output
+) -> Iterator[Pair]:
+    """Question and truth of each window of a recording that is asked about."""
+    scenario, ahead, rules = observed.dataset.scenario.get(observed.scenario), form.window.ahead, form.window
+    files = {
+        (agent, camera): sensor_files(observed.dataset, observed.scenario, agent, camera)
+        for agent, camera in product(observed.agents, form.cameras)
+    }
+    for window in windows:
+        if not observed.is_labelled(window):
+            output.leave_out(_UNLABELLED)
+            continue
+        sample = sample_token(observed.scenario, observed.agents[0], window.present)
+        seen, paths = observed.seen(window), observed.paths(window)
+        names = names_of(seen, paths, observed.own_ids, window.times)
+        what = (sample, *observed.agents, f"{rules.observe:g}", str(rules.rate), form.seen)
+        key = digest(form.seed, "question", *what)  # the same for the same sample, observers and moments
+        question = {
+            "id": key,
+            "seconds": ahead,
+            **question_facts(seen, paths, names, window, scenario),
+            **({"images": _pictures(files, form.cameras, window, names, key, output)} if form.cameras else {}),
+        }
+        yield question, {"id": key, **truth_facts(observed.dataset, sample, names, ahead, why)}
+
+
+def _pictures(
+    files: Mapping[tuple[str, str], Mapping[int, tuple[ReleasePath, int]]],
+    cameras: Sequence[str],
+    window: Window,
+    names: Names,
+    question: str,
+    output: Output,
+) -> list[dict[str, Any]]:
+    """Put the pictures of a window there, and list them by time, observer and camera; `question` is its id.
+
+    A picture has a name in each question that shows it, so that questions cannot be told to be of one recording by it.
+    """
+    listed = []
+    moments = enumerate(zip(window.frames, window.times, strict=True))
+    for (number, (frame, time)), name, camera in product(moments, names.observers, cameras):
+        found = files[names.observers[name], camera].get(frame)
+        if found is None:
+            output.leave_out(_MISSING)
+            continue
+        path = f"images/{question}/{number:02d}_{name}_{camera}.jpg"
+        output.link(found[0], f"{FOLDER}/{path}", symbolic=False)
+        listed.append({"time": time, "observer": name, "camera": camera, "path": path})
+    return listed
 
 
 def _observers(dataset: Dataset, scenario: str, ego: AgentName, wanted: str | tuple[str, ...]) -> tuple[AgentName, ...]:
@@ -140,52 +123,6 @@ def _observers(dataset: Dataset, scenario: str, ego: AgentName, wanted: str | tu
         return cooperating_agents(dataset, sample_token(scenario, ego, 1), named)
     except NotAvailableError:
         return ()
-
-
-FOLDER: Final = "questions"
-"""Of what may be handed out, in the export's folder."""
-_MISSING: Final = "pictures that are not in this release"
-
-
-class Pictures:
-    """The pictures of some cameras of a recording's observers.
-
-    A picture has a name in each question that shows it, so that questions cannot be told to be of one recording by it.
-    """
-
-    def __init__(self, observations: Observations, cameras: Sequence[str]) -> None:
-        """Look at nothing yet."""
-        self._observations, self._cameras = observations, cameras
-
-    @cached_property
-    def _files(self) -> dict[tuple[str, str], dict[int, tuple[ReleasePath, int]]]:
-        """Agent and camera → frame → path and bytes of what is there."""
-        given = self._observations
-        return {
-            (agent, camera): dict(sensor_files(given.dataset, given.scenario, agent, camera))
-            for agent, camera in product(given.agents, self._cameras)
-        }
-
-    def put(self, window: Window, names: Names, question: str, output: Output) -> list[dict[str, Any]]:
-        """Put the pictures of a window there, and list them by time, observer and camera.
-
-        Args:
-            window: the moments.
-            names: of the observers.
-            question: its id.
-            output: where they go; counts those that are missing.
-        """
-        listed = []
-        moments = enumerate(zip(window.frames, window.times, strict=True))
-        for (number, (frame, time)), name, camera in product(moments, names.observers, self._cameras):
-            found = self._files[names.observers[name], camera].get(frame)
-            if found is None:
-                output.leave_out(_MISSING)
-                continue
-            path = f"images/{question}/{number:02d}_{name}_{camera}.jpg"
-            output.link(found[0], f"{FOLDER}/{path}", symbolic=False)
-            listed.append({"time": time, "observer": name, "camera": camera, "path": path})
-        return listed
 
 
 _SECOND: Final = round(1 / FRAME_PERIOD)
