@@ -1,28 +1,46 @@
-"""The export of questions: its settings, the files that questions and truth stand in, and what lies beside them."""
+"""The export of questions: its settings, the recordings that can be asked about, question and truth of each window."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeAlias, get_args
 
-from deepaccident_devkit._version import __version__
+import numpy as np
+
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
+from deepaccident_devkit.evaluation.metrics.accident import box_truth
 from deepaccident_devkit.export.bulk import Format, Output, Unit
-from deepaccident_devkit.export.questions.observed import Seen, WindowRules
-from deepaccident_devkit.export.questions.recordings import FOLDER, questions_of
+from deepaccident_devkit.export.questions.observed import (
+    Observations,
+    Seen,
+    Window,
+    WindowRules,
+    digest,
+    names_of,
+    question_facts,
+)
+from deepaccident_devkit.export.questions.texts import answer_schema, readme
+from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import read_bytes
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS, AgentName
 from deepaccident_devkit.text import Word, choice, spelled
-from deepaccident_devkit.v2x.configurations import AGENT_SETS
+from deepaccident_devkit.v2x.collisions import collision, labelled_pair
+from deepaccident_devkit.v2x.configurations import AGENT_SETS, agents_of, cooperating_agents
+from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
+    from deepaccident_devkit.export.bulk import Output
+    from deepaccident_devkit.export.questions.observed import Names
+    from deepaccident_devkit.release.store import ReleasePath
 
 QUESTIONS: Final = "questions.jsonl"
 TRUTH: Final = "truth.jsonl"
@@ -151,105 +169,201 @@ def _names(argument: str, given: str | Sequence[str], words: Sequence[Word]) -> 
     return tuple(name for name in words if name in named)
 
 
-_README: Final = """\
-# Questions on accidents
-
-Made by `deepaccident export questions` of the DeepAccident devkit {devkit}. Each line of `questions.jsonl` is a
-question on its own, and is answered from this line{pictures} alone. Lines stand in an order that was drawn. Windows of
-one recording may overlap, so nothing of one line may be used for another.
-
-Some agents (vehicles, or the infrastructure: the `ego`, and those that share what they see) have observed traffic at an
-intersection at the times in `moments`, in seconds; 0 is the present.
-
-| field | what |
-|---|---|
-| `id` | of the question |
-| `seconds` | how many seconds ahead it asks about |
-| `moments` | times of the observations, up to {observe:g} s before the present |
-| `conditions` | weather, time of day, kind of road |
-| `observers` | the agents, the ego first, with an entry a moment in `position`, `heading` and `speed` |
-| `actors` | the others that were seen, with an entry for each moment in `time` at which at least one agent saw it |
-| `seen_by` | which agents saw it then |
-{images}
-Positions are x forward, y left of where the ego is at the present, in metres, for all moments. Headings are
-counter-clockwise from forward, in radians. Speeds are over the ground, in m/s. Sizes are length, width and height.
-A value that is not known is null. An actor counts as seen
-{rule}.
-
-## What is asked
-
-Will two road users collide after more than n − 1 seconds and within n seconds, for n from 1 to {seconds}? Which two,
-where, and why? At most one accident happens.
-
-    {example}
-
-| field | what |
-|---|---|
-| `id` | of the question |
-| `accident` | for each second true or false, or a probability from 0 to 1 |
-| `who` | names of the two, from `observers` and `actors`; null for one that is not shown, or for both |
-| `where` | where the centres of the two are at the impact, in the order of `who`, or one point; null for no accident |
-| `when` | seconds from the present to the impact; may be left out |
-| `why` | a text; may be left out |
-
-Answers are such lines, one a question, in any order; `answer.schema.json` is the schema of a line. A question without
-an answer counts as answered with no accident.
-"""
-_RULES: Final = {
-    "released": "by an agent whose camera sees it and whose LiDAR hits it, or nearby if one of these does",
-    "camera": "by an agent whose camera sees it",
-    "annotated": "by each agent that is near enough to annotate it, even if something hides it",
-}
-_IMAGES: Final = "| `images` | pictures, with their time, observer, camera and path |\n"
+_ABSENT: Final = "agents of scenarios that are not in this release"
+_ALONE: Final = "recordings whose observers are not all in this release"
+_SHORT: Final = "recordings that are too short for a window"
+_UNLABELLED: Final = "windows with a moment at which an observer has no label"
+FOLDER: Final = "questions"
+"""Of what may be handed out, in the export's folder."""
+_MISSING: Final = "pictures that are not in this release"
 
 
-def readme(*, seconds: int, observe: float, seen: str, pictures: bool) -> bytes:
-    """The README.md for those who answer.
+Pair: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
+"""A question and its truth."""
+
+
+def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Output) -> list[Pair]:
+    """The questions of a scenario, given by its token; puts the pictures there, and counts what is left out."""
+    record = dataset.scenario.get(scenario)
+    if reason := unanswerable(dataset, record):
+        output.leave_out(reason)
+        return []
+    here, asked = agents_of(dataset, scenario), []
+    output.leave_out(_ABSENT, sum(agent not in here for agent in form.agents))
+    for ego in (agent for agent in here if agent in form.agents):
+        agents = _agents_of(dataset, scenario, ego, form.observers)
+        windows = form.window.windows(record["num_frames"], f"{scenario}/{ego}", form.seed)
+        output.leave_out(_ALONE, not agents)
+        output.leave_out(_SHORT, bool(agents) and not windows)
+        if agents and windows:
+            asked.append((Observations(dataset, scenario, agents, form.seen), windows))
+    why = why_facts(dataset, record) if asked else None
+    return [pair for observed, windows in asked for pair in _pairs(observed, windows, form, why, output)]
+
+
+def _pairs(
+    observed: Observations, windows: Sequence[Window], form: Questions, why: Mapping[str, Any] | None, output: Output
+) -> Iterator[Pair]:
+    """Question and truth of each window of a recording that is asked about."""
+    scenario, ahead, rules = observed.dataset.scenario.get(observed.scenario), form.window.ahead, form.window
+    files = {
+        (agent, camera): sensor_files(observed.dataset, observed.scenario, agent, camera)
+        for agent, camera in product(observed.agents, form.cameras)
+    }
+    for window in windows:
+        if not observed.is_labelled(window):
+            output.leave_out(_UNLABELLED)
+            continue
+        sample = sample_token(observed.scenario, observed.agents[0], window.present)
+        seen, paths = observed.seen(window), observed.paths(window)
+        names = names_of(seen, paths, observed.own_ids, window.times)
+        what = (sample, *observed.agents, f"{rules.observe:g}", str(rules.rate), form.seen)
+        key = digest(form.seed, "question", *what)  # the same for the same sample, observers and moments
+        question = {
+            "id": key,
+            "seconds": ahead,
+            **question_facts(seen, paths, names, window, scenario),
+            **({"images": _pictures(files, form.cameras, window, names, key, output)} if form.cameras else {}),
+        }
+        yield question, {"id": key, **truth_facts(observed.dataset, sample, names, ahead, why)}
+
+
+def _pictures(
+    files: Mapping[tuple[str, str], Mapping[int, tuple[ReleasePath, int]]],
+    cameras: Sequence[str],
+    window: Window,
+    names: Names,
+    question: str,
+    output: Output,
+) -> list[dict[str, Any]]:
+    """Put the pictures of a window there, and list them by time, observer and camera; `question` is its id.
+
+    A picture has a name in each question that shows it, so that questions cannot be told to be of one recording by it.
+    """
+    listed = []
+    moments = enumerate(zip(window.frames, window.times, strict=True))
+    for (number, (frame, time)), name, camera in product(moments, names.observers, cameras):
+        found = files[names.observers[name], camera].get(frame)
+        if found is None:
+            output.leave_out(_MISSING)
+            continue
+        path = f"images/{question}/{number:02d}_{name}_{camera}.jpg"
+        output.link(found[0], f"{FOLDER}/{path}", symbolic=False)
+        listed.append({"time": time, "observer": name, "camera": camera, "path": path})
+    return listed
+
+
+def _agents_of(dataset: Dataset, scenario: str, ego: AgentName, wanted: str | tuple[str, ...]) -> tuple[AgentName, ...]:
+    """The agents that observe with an ego; none if one of them is not in this (partial) release."""
+    named = wanted if isinstance(wanted, str) else [ego, *wanted]
+    try:
+        return cooperating_agents(dataset, sample_token(scenario, ego, 1), named)
+    except NotAvailableError:
+        return ()
+
+
+_SECOND: Final = round(1 / FRAME_PERIOD)
+_DESIGN: Final = ("accident_type", "signalized", "spawn_side", "ego_direction", "other_direction")
+_CONTACT: Final = ("sides", "speeds", "closing_speed", "impact_angle", "gap")
+Seconds = list[bool | None]
+"""Whether there is an accident in each second ahead; None where the recording does not say."""
+
+
+def unanswerable(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:
+    """Why nothing can be asked about a scenario, as a plural that is counted; None if it can."""
+    if scenario["weather"] is None:
+        return "scenarios without meta, which says whether there is an accident"
+    actors = scenario_tracks(dataset, scenario["token"]).actor_id
+    if not len(actors):
+        return "scenarios without labels"
+    told = scenario["collision"]
+    if told is not None and labelled_pair(told, actors) is None:
+        return "scenarios with an actor in the accident that no label shows"
+    return None
+
+
+def seconds_ahead(frames_to_impact: int | None, frames_to_end: int, ahead: int) -> Seconds:
+    """Whether there is an accident in each second: after n − 1 seconds, and up to n seconds, for n from 1 to `ahead`.
+
+    Nobody knows what comes after an impact, or after the recording: these seconds are None.
 
     Args:
-        seconds: that are asked about.
-        observe: seconds of a window.
-        seen: what counts as seen.
-        pictures: whether there are pictures.
+        frames_to_impact: recorded frames from the present to the impact; None if there is none.
+        frames_to_end: to the recording's last frame.
+        ahead: number of seconds.
     """
-    sure = 2 if seconds > 1 else 1
-    example = {
-        "id": "0123456789abcdef",
-        "accident": [second == sure for second in range(1, seconds + 1)],
-        "who": ["ego", "a1"],
-        "where": [[8.2, 0.1], [9.9, 2.4]],
-        "when": sure - 0.4,
-        "why": "a1 crosses without slowing down",
-    }
-    return _README.format(
-        devkit=__version__,
-        seconds=seconds,
-        observe=observe,
-        rule=_RULES[seen],
-        pictures=" and its pictures" if pictures else "",
-        images=_IMAGES if pictures else "",
-        example=json.dumps(example),
-    ).encode()
+    if frames_to_impact is None:
+        return [False if second * _SECOND <= frames_to_end else None for second in range(1, ahead + 1)]
+    there = math.ceil(frames_to_impact / _SECOND)
+    return [second == there if second <= there else None for second in range(1, ahead + 1)]
 
 
-def answer_schema(seconds: int) -> dict[str, Any]:
-    """The JSON Schema of an answer about so many seconds."""
-    point = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
-    name = {"type": ["string", "null"]}
-    likely = {"anyOf": [{"type": "boolean"}, {"type": "number", "minimum": 0, "maximum": 1}]}
-    pair = {"minItems": 2, "maxItems": 2}
+def truth_facts(
+    dataset: Dataset, sample: str, names: Names, ahead: int, contact: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """What is known of a question's answer.
+
+    Args:
+        dataset: the release.
+        sample: token of the present.
+        names: of the question.
+        ahead: seconds that are asked about.
+        contact: why, as `why_facts` gives it for the scenario.
+
+    Returns:
+        `sample`, `last_frame`, the names, `accident` for each second, and for an accident in one of them `when`, `who`
+        (names, None for one that the question does not show), `actor_ids`, `where` (2, 2) in the present ego frame,
+        `last_seen` of each, and `why`; None where there is none.
+
+    Raises:
+        NotAvailableError: a label is missing without which the places are not known.
+    """
+    record = dataset.sample.get(sample)
+    to_impact, to_end = record["time_to_impact"], record["time_to_end"]
+    scenario = dataset.scenario.get(record["scenario_token"])
+    seconds = seconds_ahead(_frames(to_impact), round(to_end / FRAME_PERIOD), ahead)
+    found: dict[str, Any] = dict.fromkeys(("when", "who", "actor_ids", "where", "last_seen", "why"))
+    if True in seconds:
+        impact = box_truth(dataset, sample, float(ahead)).accident
+        if impact is not None and impact.ids is not None:
+            found = {
+                "when": round(impact.time, 1),
+                "who": [names.of_actor(actor) for actor in impact.ids],
+                "actor_ids": list(impact.ids),
+                "where": (np.round(impact.positions, 2) + 0.0).tolist(),
+                "last_seen": [names.last_seen.get(actor) for actor in impact.ids],
+                "why": contact,
+            }
     return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "An answer",
-        "type": "object",
-        "properties": {
-            "id": {"type": "string"},
-            "accident": {"type": "array", "items": likely, "minItems": seconds, "maxItems": seconds},
-            "who": {"anyOf": [{"type": "array", "items": name, **pair}, {"type": "null"}]},
-            "where": {"anyOf": [point, {"type": "array", "items": point, **pair}, {"type": "null"}]},
-            "when": {"anyOf": [{"type": "number", "minimum": 0}, {"type": "null"}]},
-            "why": {"type": ["string", "null"]},
-        },
-        "required": ["id", "accident", "who", "where"],
-        "additionalProperties": False,
+        "sample": sample,
+        "last_frame": scenario["num_frames"],
+        "observers": dict(names.observers),
+        "actors": dict(names.actors),
+        "accident": seconds,
+        **found,
     }
+
+
+def why_facts(dataset: Dataset, scenario: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The design of an accident and how the two met: metres, seconds, radians; None without a collision."""
+    if scenario["collision"] is None:
+        return None
+    design = {name: scenario[name] for name in _DESIGN}
+    try:
+        contact = collision(dataset, scenario["token"])
+    except NotAvailableError:  # the two are never labelled together
+        contact = None
+    return {**design, **{name: None if contact is None else _plain(getattr(contact, name)) for name in _CONTACT}}
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON holds it: numbers with two decimals, None in place of NaN."""
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(each) for each in value]
+    if isinstance(value, float):
+        return None if math.isnan(value) else round(value, 2) + 0.0
+    return value
+
+
+def _frames(seconds: float | None) -> int | None:
+    return None if seconds is None else round(seconds / FRAME_PERIOD)
