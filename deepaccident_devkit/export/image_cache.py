@@ -34,7 +34,7 @@ from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image, encode_jpeg
 from deepaccident_devkit.tables.tokens import sample_data_token, sample_token
 from deepaccident_devkit.taxonomy import AgentName
-from deepaccident_devkit.text import choice, size_text
+from deepaccident_devkit.text import settle_choices, size_text
 from deepaccident_devkit.v2x.configurations import agents_of
 
 __all__ = ["CachedImages", "Codec", "ImageCache"]
@@ -72,7 +72,7 @@ class CachedImages(Format):
     def __post_init__(self) -> None:
         """Check the choices too."""
         super().__post_init__()
-        object.__setattr__(self, "codec", choice("codec", self.codec, get_args(Codec)))
+        settle_choices(self, {"codec": get_args(Codec)})
         if self.images.resize is None:
             raise ConfigError("images: a cache holds images of one size; give ImageConfig(resize=(height, width))")
 

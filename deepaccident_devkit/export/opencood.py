@@ -24,8 +24,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.export.bulk import Format, Output, Unit
+from deepaccident_devkit.export.format import Format, Output, Unit, some_of
 from deepaccident_devkit.export.sensor_files import sensor_files, stored_camera
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes
@@ -49,7 +48,7 @@ from deepaccident_devkit.taxonomy import (
     UNTRACKED_ID,
     VEHICLE_AGENTS,
 )
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
@@ -85,11 +84,8 @@ class OpenCood(Format):
     def __post_init__(self) -> None:
         """Check the choices."""
         super().__post_init__()
-        chosen = {choice("classes", each, CATEGORIES) for each in self.classes}
-        if not chosen:
-            raise ChoiceError(f"classes: expected some of {', '.join(CATEGORIES)}, found none")
-        object.__setattr__(self, "classes", tuple(each for each in CATEGORIES if each in chosen))
-        object.__setattr__(self, "ego", choice("ego", self.ego, VEHICLE_AGENTS))
+        settle_choices(self, {"ego": VEHICLE_AGENTS})
+        object.__setattr__(self, "classes", some_of("classes", self.classes, CATEGORIES))
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a scenario's folder, which appears when it is whole."""
@@ -335,7 +331,6 @@ def carla_six(pose: ArrayLike) -> FloatArray:
 
 
 _POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
-POINT_BYTES: Final = _POINT.itemsize
 
 
 def pcd_bytes(points: AnyArray) -> bytes:

@@ -26,7 +26,7 @@ from deepaccident_devkit.release.images import image_size, read_image_bytes
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CATEGORIES, CHANNELS, LIDAR
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ class WebDataset(Format):
     def __post_init__(self) -> None:
         """Check the choice and the size too."""
         super().__post_init__()
-        object.__setattr__(self, "frames", choice("frames", self.frames, get_args(Frames)))
+        settle_choices(self, {"frames": get_args(Frames)})
         if self.shard_size < 1:
             raise ConfigError(f"shard_size: expected a number of bytes from 1, found {self.shard_size}")
 

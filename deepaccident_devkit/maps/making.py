@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -157,7 +157,7 @@ def _unpacked(store: Store, key: str, town: str, resolution: float, _state: tupl
     if content is None:
         return None
     with open_zip(content) as archive:
-        arrays = {name: read_array(archive, name, "index") for name in (*_ARRAYS, "numbers")}
+        arrays: dict[str, Any] = {name: read_array(archive, name, "index") for name in (*_ARRAYS, "numbers")}
     numbers = dict(zip(_NUMBERS, arrays.pop("numbers").tolist(), strict=True))
     return TownMap(town=town, resolution=resolution, **arrays, **numbers)
 

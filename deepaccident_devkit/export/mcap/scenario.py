@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -60,39 +61,24 @@ from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
-class _Part(Protocol):
-    """Writes one kind of content."""
-
-    def write(self, moment: Moment, recording: Recording) -> None:
-        """Write this content of a moment."""
-        ...
-
-
-class Poses:
-    """Writes where the agents and their sensors are."""
-
-    def __init__(self, dataset: Dataset) -> None:
-        """Prepare the poses of a release."""
-        self._dataset = dataset
-
-    def write(self, moment: Moment, recording: Recording) -> None:
-        """Write world → agent → sensors in one message, and each agent's pose in a message of its own."""
-        transforms, poses = [], []
-        for agent, sample in moment.samples.items():
-            own = frame_id(agent, "ego")
-            there = transform_message("world", own, self._dataset.world_from(sample, "ego"), moment.index)
-            transforms.append(there)
-            transforms += [
-                transform_message(own, frame_id(agent, channel), self._dataset.ego_from(sample, channel), moment.index)
-                for channel in EXPORTED_CHANNELS
-            ]
-            poses.append((agent, there))
-        recording.write("/tf", FrameTransforms(transforms=transforms), moment.index)
-        for agent, there in poses:
-            message = PoseInFrame(timestamp=frame_timestamp(moment.index), frame_id="world")
-            message.pose.position.CopyFrom(there.translation)
-            message.pose.orientation.CopyFrom(there.rotation)
-            recording.write(f"/{agent}/pose", message, moment.index)
+def write_poses(dataset: Dataset, moment: Moment, recording: Recording) -> None:
+    """Write world → agent → sensors in one message, and each agent's pose in a message of its own."""
+    transforms, poses = [], []
+    for agent, sample in moment.samples.items():
+        own = frame_id(agent, "ego")
+        there = transform_message("world", own, dataset.world_from(sample, "ego"), moment.index)
+        transforms.append(there)
+        transforms += [
+            transform_message(own, frame_id(agent, channel), dataset.ego_from(sample, channel), moment.index)
+            for channel in EXPORTED_CHANNELS
+        ]
+        poses.append((agent, there))
+    recording.write("/tf", FrameTransforms(transforms=transforms), moment.index)
+    for agent, there in poses:
+        message = PoseInFrame(timestamp=frame_timestamp(moment.index), frame_id="world")
+        message.pose.position.CopyFrom(there.translation)
+        message.pose.orientation.CopyFrom(there.rotation)
+        recording.write(f"/{agent}/pose", message, moment.index)
 
 
 def write_scenario(
@@ -110,18 +96,19 @@ def write_scenario(
     agents = exported_agents(dataset, token, config.agents)
     moments = [moment_of(token, index, agents) for index in config.frame_numbers(record["num_frames"])]
     sensors = Sensors(dataset, config)
-    parts: list[_Part] = [Story(dataset, token), Poses(dataset), sensors]
+    parts: list[Callable[[Moment, Recording], None]]
+    parts = [Story(dataset, token).write, partial(write_poses, dataset), sensors.write]
     if config.labels:
-        parts.append(Actors(dataset, token))
+        parts.append(Actors(dataset, token).write)
     if config.motion_labels is not None:
-        parts.append(MotionMaps(dataset, token, label_config(config.motion_labels)))
+        parts.append(MotionMaps(dataset, token, label_config(config.motion_labels)).write)
     if prediction is not None:
-        parts.append(_predicted(prediction, moments, token))
+        parts.append(_predicted(prediction, moments, token).write)
     with replacing(path) as temporary, temporary.open("wb") as stream, Recording(stream) as recording:
         recording.add_metadata(METADATA, scenario_metadata(dataset, token))
         for moment in tqdm(moments, desc=path.name, disable=not progress, unit="frame"):
-            for part in parts:
-                part.write(moment, recording)
+            for write in parts:
+                write(moment, recording)
     sensors.tell_missing()
     return path
 

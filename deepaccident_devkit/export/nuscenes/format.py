@@ -28,7 +28,7 @@ from deepaccident_devkit.export.nuscenes.scenes import (
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.taxonomy import SPLITS
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.text import settle_choices
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
@@ -61,8 +61,7 @@ class NuScenes(Format):
     def __post_init__(self) -> None:
         """Check the choices."""
         super().__post_init__()
-        object.__setattr__(self, "van", choice("van", self.van, get_args(Van)))
-        object.__setattr__(self, "lidar_axes", choice("lidar_axes", self.lidar_axes, get_args(LidarAxes)))
+        settle_choices(self, {"van": get_args(Van), "lidar_axes": get_args(LidarAxes)})
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write the sensor files of a scenario, and keep its rows."""

@@ -31,7 +31,7 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS, AgentName
-from deepaccident_devkit.text import Word, choice, spelled
+from deepaccident_devkit.text import Word, choice, settle_choices, spelled
 from deepaccident_devkit.v2x.collisions import collision, labelled_pair
 from deepaccident_devkit.v2x.configurations import AGENT_SETS, agents_of, cooperating_agents
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -91,7 +91,7 @@ class Questions(ShortRepr, Format):
         """Check the choices too."""
         super().__post_init__()
         object.__setattr__(self, "observers", _observers(self.observers))
-        object.__setattr__(self, "seen", choice("seen", self.seen, get_args(Seen)))
+        settle_choices(self, {"seen": get_args(Seen)})
         object.__setattr__(self, "cameras", _names("cameras", self.cameras, CAMERAS))
         if not isinstance(self.window, WindowRules):
             raise ConfigError(f"window: expected WindowRules, found {type(self.window).__name__}")
@@ -206,7 +206,7 @@ def _pairs(
 ) -> Iterator[Pair]:
     """Question and truth of each window of a recording that is asked about."""
     scenario, ahead, rules = observed.dataset.scenario.get(observed.scenario), form.window.ahead, form.window
-    files = {
+    files: dict[tuple[str, str], dict[int, tuple[ReleasePath, int]]] = {
         (agent, camera): sensor_files(observed.dataset, observed.scenario, agent, camera)
         for agent, camera in product(observed.agents, form.cameras)
     }
