@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.errors import ConfigError, ExportError, MissingFileError, NotAvailableError
+from deepaccident_devkit.errors import ConfigError, ExportError, MissingFileError, NotAvailableError, ReleaseError
 from deepaccident_devkit.export.format import Format, Link, Output, Tally, Unit, flat_name
 from deepaccident_devkit.files import path_of, place_in, remove_in, remove_leftovers, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_record
@@ -207,7 +207,8 @@ def export_release(
     export, units = _Export(dataset, form, root, command), form.units(dataset, scenarios)
     if dry_run:
         left = [] if manifest.release else [unit for unit in units if not export.is_written(unit)]
-        return Exported(folder=root, written=len(left), kept=len(units) - len(left), tally=export.estimate(left))
+        tally = export.estimate(left, alone=len(left) == len(units))
+        return Exported(folder=root, written=len(left), kept=len(units) - len(left), tally=tally)
     form.check(dataset, root)
     folders = scenario_folders(dataset, scenarios)
     if absent := [token for token in scenarios if token not in folders]:
@@ -260,25 +261,46 @@ class _Export:
         """Whether there is a record that a unit was written, from whatever files."""
         return (self.parts(unit) / _DONE).exists()
 
-    def estimate(self, units: Sequence[Unit]) -> Tally:
-        """About how much units are, by the first scenario that has a sample; raises NotAvailableError if none has."""
-        scenarios = [token for unit in units for token in unit.scenarios]
+    def estimate(self, units: Sequence[Unit], *, alone: bool) -> Tally:
+        """About how much units are, by the first scenario that has a sample and can be read.
+
+        Args:
+            units: that are left.
+            alone: whether nothing else is in the folder yet.
+
+        Raises:
+            NotAvailableError: they are alone, and no scenario has a sample.
+            ExportError: the system's temporary folder cannot be written to.
+        """
+        scenarios, failed = [token for unit in units for token in unit.scenarios], False
         for token in scenarios:
-            with TemporaryDirectory() as folder:
-                output = Output(Path(folder, "out"), Path(folder, "parts"), self.form.link)
-                self.form.write(self.dataset, Unit(name="one", scenarios=(token,)), output)
-                tally, copies = output.tally, self.form.link == "copy"
-                measured = Path(folder, "" if copies else "parts").rglob("*")
-                size = sum(each.stat().st_size for each in measured if each.is_file()) + tally.bytes * (not copies)
+            try:
+                tally = self._tried(token)
+            except ReleaseError:  # the export itself lists such scenarios
+                failed = True
+                continue
+            except OSError as error:
+                raise ExportError(f"a scenario cannot be tried ({error}); make room there") from error
             if tally.samples:
                 count = len(scenarios)
                 linked = {way: number * count for way, number in tally.linked.items()}
-                return Tally(
-                    samples=tally.samples * count, files=tally.files * count, bytes=size * count, linked=linked
-                )
-        if scenarios:
+                files, size = tally.files * count, tally.bytes * count
+                return Tally(samples=tally.samples * count, files=files, bytes=size, linked=linked)
+        if alone and not failed:
             raise NotAvailableError(self.form.nothing)
         return Tally()
+
+    def _tried(self, scenario: str) -> Tally:
+        """The counts of a scenario that is written into a temporary folder; `bytes` are all that it takes."""
+        with TemporaryDirectory() as folder:
+            output = Output(Path(folder, "out"), Path(folder, "parts"), self.form.link)
+            self.form.write(self.dataset, Unit(name="one", scenarios=(scenario,)), output)
+            if self.form.link == "copy":
+                output.tally.bytes, measured = 0, Path(folder)
+            else:
+                measured = output.parts
+            output.tally.bytes += sum(each.stat().st_size for each in measured.rglob("*") if each.is_file())
+        return output.tally
 
     def state(self, folder: ScenarioFolder) -> dict[str, str | None]:
         """What is compared of a scenario: the hashes of its truth, and of the list of its sensor files."""

@@ -47,6 +47,9 @@ def test_the_rest_is_done(small: DeepAccident, tmp_path: Path, monkeypatch: pyte
         patch.setattr(TinyFormat, "write", write)
         with pytest.raises(SomeFailedError, match=rf"^{tmp_path}/out: 1 of 3 failed:\n  \S+: cloud.npz: is broken; re"):
             written(small, tmp_path / "out")
+        left = written(small, tmp_path / "out", dry_run=True)
+        assert (left.written, left.tally.samples) == (1, 0)
+        assert written(small, tmp_path / "other", dry_run=True).tally.samples > 0
     assert written(small, tmp_path / "out").written == 1
     written(small, tmp_path / "whole")
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
