@@ -71,15 +71,19 @@ def run_export(
     left = export_release(release, out, form, dry_run=True)
     if left.written:
         free = shutil.disk_usage(next(each for each in (left.folder, *left.folder.parents) if each.exists())).free
-        click.echo(f"about {left.tally.samples:,} samples: {_counts(left.tally, 'to write')}; {size_text(free)} free")
+        linked = sum(left.tally.linked.values())  # a temporary folder may take other links than this one
+        told = f"{_counts(left.tally, 'to write')}{f', {linked:,} files to link' if linked else ''}"
+        click.echo(f"about {left.tally.samples:,} samples: {told}; {size_text(free)} free")
         if left.tally.bytes > free:
             raise ExportError(f"{out}: there is too little room; choose another disk, or fewer scenarios or agents")
     if dry_run:
         return left
     done = export_release(release, out, form, **engine_of(options), progress=True)
     tally = done.tally
+    linked_text = "".join(f", {count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
     click.echo(
-        f"{done.folder}: {_counts(tally, 'written')}; {done.written} written now, {done.kept} were there already"
+        f"{done.folder}: {_counts(tally, 'written')}{linked_text}; {done.written} written now, {done.kept} were there "
+        "already"
     )
     for what, count in sorted(tally.left_out.items()):
         click.echo(f"left out: {count:,} {what}")
@@ -90,5 +94,4 @@ _WAYS = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
 
 
 def _counts(tally: Tally, done: str) -> str:
-    linked = "".join(f", {count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
-    return f"{f'{tally.files:,}' if tally.files else 'a few'} files {done} ({size_text(tally.bytes)}){linked}"
+    return f"{f'{tally.files:,}' if tally.files else 'a few'} files {done} ({size_text(tally.bytes)})"
