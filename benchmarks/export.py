@@ -50,8 +50,8 @@ def measure() -> list[Figure]:
 
 def ways(dataset: DeepAccident, form: Format) -> list[Format]:
     """The format with links, and if it has any, with copies."""
-    plan = export_release(dataset, dataset.dataroot.parent / "none", form, workers=1, dry_run=True).plan
-    return [form, replace(form, link="copy")] if plan.linked_files else [form]
+    told = export_release(dataset, dataset.dataroot.parent / "none", form, dry_run=True).tally
+    return [form, replace(form, link="copy")] if told.linked else [form]
 
 
 def exported(dataset: DeepAccident, form: Format) -> list[Figure]:

@@ -1,5 +1,6 @@
-"""What the verbs of `deepaccident export` on many scenarios share: options, the plan, the counts that they print."""
+"""What the verbs of `deepaccident export` on many scenarios share: options, the size, the counts that they print."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -15,7 +16,8 @@ from deepaccident_devkit.cli.options import (
     where_parameter,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.export.bulk import Exported, Format, Link, Plan, export_release
+from deepaccident_devkit.errors import ExportError
+from deepaccident_devkit.export.bulk import Exported, Format, Link, Tally, export_release
 from deepaccident_devkit.text import size_text
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
@@ -65,22 +67,23 @@ def run_export(
 ) -> Exported:
     """Export in a format with its `own` settings; says how much it will be, then what was written and left out."""
     form = kind(split=split, where=where, agents=agent_names(agents), link=link, **own)  # before the release is indexed
-    done = export_release(
-        DeepAccident(**options),
-        out,
-        form,
-        **engine_of(options),
-        progress=True,
-        dry_run=dry_run,
-        on_plan=_say_plan,
-    )
+    release = DeepAccident(**options)
+    left = export_release(release, out, form, dry_run=True)
+    if left.written:
+        free = shutil.disk_usage(next(each for each in (left.folder, *left.folder.parents) if each.exists())).free
+        linked = sum(left.tally.linked.values())  # a temporary folder may take other links than this one
+        told = f"{_counts(left.tally, 'to write')}{f', {linked:,} files to link' if linked else ''}"
+        click.echo(f"about {left.tally.samples:,} samples: {told}; {size_text(free)} free")
+        if left.tally.bytes > free:
+            raise ExportError(f"{out}: there is too little room; choose another disk, or fewer scenarios or agents")
     if dry_run:
-        return done
+        return left
+    done = export_release(release, out, form, **engine_of(options), progress=True)
     tally = done.tally
-    linked = ", ".join(f"{count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
+    linked_text = "".join(f", {count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
     click.echo(
-        f"{done.folder}: {tally.files:,} files written ({size_text(tally.bytes)})"
-        f"{f', {linked}' if linked else ''}; {done.written} written now, {done.kept} were there already"
+        f"{done.folder}: {_counts(tally, 'written')}{linked_text}; {done.written} written now, {done.kept} were there "
+        "already"
     )
     for what, count in sorted(tally.left_out.items()):
         click.echo(f"left out: {count:,} {what}")
@@ -90,10 +93,5 @@ def run_export(
 _WAYS = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
 
 
-def _say_plan(plan: Plan, free: int) -> None:
-    linked = f", {plan.linked_files:,} files to link ({size_text(plan.linked_bytes)})" if plan.linked_files else ""
-    click.echo(
-        f"{plan.samples:,} samples: {f'about {plan.files:,}' if plan.files else 'a few'} files to write "
-        f"({size_text(plan.bytes)}){linked}; "
-        f"{size_text(free)} free"
-    )
+def _counts(tally: Tally, done: str) -> str:
+    return f"{f'{tally.files:,}' if tally.files else 'a few'} files {done} ({size_text(tally.bytes)})"

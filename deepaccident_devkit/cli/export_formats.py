@@ -8,8 +8,7 @@ from deepaccident_devkit.cli.export_bulk import Verb, export_parameters, run_exp
 from deepaccident_devkit.cli.options import WordChoice, refuse_unused
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
-from deepaccident_devkit.export.nuscenes.boxes import Van
-from deepaccident_devkit.export.nuscenes.sensors import LidarAxes
+from deepaccident_devkit.export.nuscenes.scenes import LidarAxes, Van
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.released_infos import ReleasedInfos

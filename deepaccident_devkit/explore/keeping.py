@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import os
+import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from contextlib import suppress
-from pathlib import Path
 from typing import Final, Generic, TypeVar
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.files import is_writable_folder, place_in
-from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release.store.cache import FileCache
 
 Value = TypeVar("Value")
 _THUMBNAILS: Final = "thumbnails"
-_MOST_THUMBNAILS: Final = 200_000_000
-"""Bytes: those of the whole release take some 7 million."""
 
 
 class Kept(Generic[Value]):
@@ -68,24 +66,19 @@ class KeptFiles:
 
     def __init__(self, dataset: Dataset) -> None:
         """Take the release whose index they lie beside: they go when the tables are made again."""
-        folder = place_in(dataset.tables_folder, _THUMBNAILS, opened=True)
+        self.folder = place_in(dataset.tables_folder, _THUMBNAILS, opened=True)
         if not is_writable_folder(dataset.tables_folder):
-            folder = FileCache.of_user().folder.with_name(_THUMBNAILS)
-        self._files = FileCache(folder, _MOST_THUMBNAILS)
-
-    @property
-    def folder(self) -> Path:
-        """Where they lie."""
-        return self._files.folder
+            self.folder = FileCache.of_user().folder.with_name(_THUMBNAILS)
+        self._store = Store(self.folder, self.folder, "keeps thumbnails", IndexStoreError)
 
     def get(self, identity: str, name: str, make: Callable[[], bytes]) -> bytes:
         """The content of a file; `identity` tells it from all others. Raises what `make` raises."""
-        with suppress(OSError):
-            path = self._files.path_of(identity, name)
-            content = read_bytes(path, "image")
-            os.utime(path)  # who was not used the longest goes first
-            return content
+        digest = hashlib.blake2b(identity.encode(errors="surrogateescape"), digest_size=16).hexdigest()
+        place = f"{digest[:2]}/{digest[2:]}/{name}"
+        kept = self._store.kept(place, digest, "image")
+        if kept is not None:
+            return kept
         content = make()
         with suppress(OSError):  # no room, or a folder that may not be written to: it is made again the next time
-            self._files.put(self._files.path_of(identity, name), content)
+            self._store.keep(place, digest, content)
         return content

@@ -24,12 +24,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.errors import ExportError
-from deepaccident_devkit.export.bulk import Plan
-from deepaccident_devkit.export.bulk.manifest import Manifest
+from deepaccident_devkit.export.bulk import Manifest
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
-from deepaccident_devkit.export.nuscenes.names import CAMERA_CHANNELS, VERSION, sensor_path, token
-from deepaccident_devkit.export.nuscenes.sensors import TURNS
+from deepaccident_devkit.export.nuscenes.scenes import CAMERA_CHANNELS, TURNS, VERSION, sensor_path, token
 from deepaccident_devkit.export.sensor_files import stored_camera
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3
@@ -40,8 +38,7 @@ from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output, Unit
-    from deepaccident_devkit.export.nuscenes.boxes import Van
-    from deepaccident_devkit.export.nuscenes.scenes import Scene
+    from deepaccident_devkit.export.nuscenes.scenes import Scene, Van
 
 CLASSES: Final = (
     *("car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian"),
@@ -53,8 +50,6 @@ LABELS: Final = MappingProxyType({"car": 0, "truck": 1, "cyclist": 5, "motorcycl
 _SWEEPS: Final = 10
 """How many clouds before a keyframe an info names at most: one second."""
 _PART: Final = "infos.jsonl"
-_INFO_BYTES, _BOX_BYTES = 10000, 250
-"""Of an info without boxes, about, and of each box."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,24 +66,16 @@ class Mmdet3d(NuScenes):
             ExportError: there is none.
             ConfigError: its settings differ.
         """
-        if not Manifest.of(folder, NuScenes.name, {**self.settings(), "version": dataset.version}).complete:
+        if Manifest.of(folder, NuScenes, {**self.settings(), "version": dataset.version}).release is None:
             raise ExportError(
                 f"{folder}: holds no complete nuscenes export, whose files the infos name; write it there first, with "
                 "the same settings"
             )
 
-    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
-        """About how much the infos of a scenario are."""
-        total = Plan()
-        for scene in self.scenes(dataset, unit):
-            count = len(keyframes(scene.last))
-            boxes = dataset.sample.get(scene.sample(scene.last))["num_annotations"]
-            total += Plan(samples=count, bytes=count * (_INFO_BYTES + boxes * _BOX_BYTES))
-        return total
-
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Keep the infos of a scenario, a line each."""
         infos = [info for scene in self.scenes(dataset, unit) for info in _infos(scene, self, output)]
+        output.tally.samples += len(infos)
         write_bytes(output.parts / _PART, "".join(f"{json.dumps(info)}\n" for info in infos).encode())
 
     def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:

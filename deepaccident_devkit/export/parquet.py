@@ -12,7 +12,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
+from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.shards import README, SPLIT_NAMES, readme, shards
 from deepaccident_devkit.tables.columns import Key, Kind, Number, Vector
 from deepaccident_devkit.tables.record_tables import RecordTables
@@ -27,9 +27,6 @@ _ONCE: Final = ("sensor", "category")
 """Tables that are the same for all splits, and small."""
 _ONLY_FILE: Final = "all-00000-of-00001.parquet"
 _ORDER: Final = (*SPLIT_NAMES.values(), "all")
-_ROW_BYTES: Final[Mapping[str, int]] = {"sample_data": 100, "ego_pose": 150, "annotation": 120, "track": 130}
-_OTHER_ROW_BYTES: Final = 40
-"""Bytes a row in the files, at most about: synthetic tables repeat their numbers more often, and take a third."""
 _NOTES: Final = """\
 The tables refer to each other by tokens. The column `split` is that of the scenario: train, val, test, or null where
 it is unknown; the files of val are called validation. Tracks and instances are merged from all agents of the release.
@@ -71,12 +68,6 @@ class Parquet(Format):
             for number, group in enumerate(groups)
         ]
 
-    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
-        """By the numbers of rows."""
-        rows = RecordTables(dataset).rows(unit.scenarios, self.agents)
-        size = sum(len(found) * _ROW_BYTES.get(table, _OTHER_ROW_BYTES) for table, found in rows.items())
-        return Plan(samples=len(rows["sample"]), files=sum(len(found) > 0 for found in rows.values()), bytes=size)
-
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a shard of every table."""
         maker, split = RecordTables(dataset), dataset.scenario.get(unit.scenarios[0])["split"]
@@ -84,6 +75,7 @@ class Parquet(Format):
         for table, found in rows.items():
             if len(found):
                 _write(output, f"{table}/{unit.name}.parquet", _pieces(maker, table, found, split))
+        output.tally.samples += len(rows["sample"])
         absent = len(unit.scenarios) * len(self.agents) - len(rows["agent"])
         output.leave_out("agents of scenarios that are not in this release", absent)
         output.leave_out("samples of other agents", len(maker.rows(unit.scenarios)["sample"]) - len(rows["sample"]))

@@ -22,7 +22,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
+from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import read_bytes
@@ -43,8 +43,6 @@ _SPLITS: Final[Mapping[str, str]] = {
 """The splits that have a file, and the version that the converter writes into it."""
 _ENDING: Final = ".infos"
 _EMPTY: Final = "without_boxes.txt"
-_INFO_BYTES, _BOX_BYTES = 7500, 140
-"""Of an info's paths and matrices, about, and of each box."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,15 +95,6 @@ class ReleasedInfos(Format):
                 )
         return super().units(dataset, scenarios)
 
-    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
-        """About how much a scenario is."""
-        token = unit.scenarios[0]
-        if _fault(dataset, token):
-            return Plan()
-        count = len(_keyframes(dataset, token))
-        boxes = sum(sample["num_annotations"] for sample in dataset.samples_of(frame_token(token, 1)))
-        return Plan(samples=count * len(AGENTS), bytes=count * (len(AGENTS) * _INFO_BYTES + boxes * _BOX_BYTES))
-
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Make the infos of a scenario, an agent a part."""
         token = unit.scenarios[0]
@@ -119,6 +108,7 @@ class ReleasedInfos(Format):
         for agent in AGENTS:
             infos = list(_infos(folder, agent, _keyframes(dataset, token), self.root_prefix))
             boxless = [info["lidar_prefix"] for info in infos if not len(info["gt_boxes"])]
+            output.tally.samples += len(infos)
             if self.drop_empty:
                 infos = [info for info in infos if len(info["gt_boxes"])]
                 output.leave_out("infos without boxes", len(boxless))

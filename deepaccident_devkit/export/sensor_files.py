@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import PinholeCamera
-from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import image_size
 from deepaccident_devkit.release.layout import frame_sizes
 from deepaccident_devkit.release.store import ReleasePath
@@ -46,13 +43,3 @@ def stored_camera(dataset: Dataset, camera: str, file: tuple[ReleasePath, int] |
     """
     lens = dataset.camera(camera)
     return lens if file is None else lens.resized(*image_size(file[0]))
-
-
-def points_in(files: Mapping[int, tuple[ReleasePath, int]]) -> int:
-    """About how many points LiDAR files have together: as many in each as in the first.
-
-    Raises:
-        SensorFileError: that file cannot be read.
-    """
-    first = next(iter(files.values()), None)
-    return 0 if first is None else len(read_lidar(first[0], raw=True)) * len(files)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import re
 import tarfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,28 +15,130 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
 
+from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
+from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.keyframes import keyframes
-from deepaccident_devkit.export.sample_json import CAMERA_NAMES, JSON_FIELDS, JSON_TYPES, sample_json
-from deepaccident_devkit.export.sensor_files import points_in, sensor_files
+from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.export.shards import README, readme, shards
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import image_size, read_image_bytes
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, LIDAR
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CATEGORIES, CHANNELS, LIDAR
+from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
 
+CAMERA_NAMES: Final[Mapping[str, str]] = {
+    camera: re.sub(r"(?<=[a-z])(?=[A-Z])", "_", camera).lower() for camera in CAMERAS
+}
+"""Our channel → its name in shards: `Camera_FrontLeft` is `camera_front_left`."""
+
+_NUMBERS: Final = ["float64"]
+_ROWS: Final = [_NUMBERS]
+JSON_TYPES: Final[Mapping[str, Any]] = {
+    **dict.fromkeys(("token", "scenario", "agent"), "string"),
+    "frame": "int64",
+    "split": "string",
+    **dict.fromkeys(("timestamp", "time_to_end", "time_to_impact"), "float64"),
+    "velocity": _NUMBERS,
+    "world_from_ego": _ROWS,
+    "ego_from_lidar": _ROWS,
+    "cameras": {
+        name: {"ego_from_camera": _ROWS, "intrinsic": _ROWS, "width": "int64", "height": "int64"}
+        for name in CAMERA_NAMES.values()
+    },
+    "labelled": "bool",
+    "boxes": {
+        **dict.fromkeys(("center", "size", "velocity"), _ROWS),
+        "yaw": _NUMBERS,
+        "category": ["string"],
+        "actor_id": ["int64"],
+        "num_lidar_pts": ["int64"],
+        "camera_visible": ["bool"],
+        "is_collider": ["bool"],
+    },
+}
+"""Field → its type: a word, a list of one type, or fields of its own."""
+
+JSON_FIELDS: Final = """\
+| field | what |
+|---|---|
+| `token`, `scenario`, `agent`, `frame`, `split` | which sample it is; the split is null if unknown |
+| `timestamp`, `time_to_end`, `time_to_impact` | seconds since the first frame, until the last one, until the impact; \
+null without an impact |
+| `velocity` | of the agent over the ground, in world; null if unknown |
+| `world_from_ego`, `ego_from_lidar` | 4×4; `world_from_ego @ ego_from_lidar` maps LiDAR points to world |
+| `cameras` | of each camera `ego_from_camera` 4×4, `intrinsic` 3×3, and `width` and `height` of its image; \
+without an image those of calib |
+| `labelled` | whether there is a label; if not, there are no boxes |
+| `boxes` | columns with an entry a box: `center`, `size` (length, width, height), `yaw` and `velocity`, all in \
+the LiDAR frame, `category`, `actor_id` (−100 the agent itself, −1 untracked), `num_lidar_pts`, `camera_visible`, \
+`is_collider` |
+
+An unknown velocity of a box is null three times; `numpy.array(boxes["velocity"], dtype=float)` makes it NaN.
+"""
+
+
+def sample_json(dataset: Dataset, sample: str, sizes: Mapping[str, tuple[int, int]]) -> bytes:
+    """The JSON of a sample, given by its token; `sizes` has width and height of its images that are there.
+
+    Raises TokenError.
+    """
+    record = dataset.sample.get(sample)
+    frame = dataset.frame.get(record["frame_token"])
+    facts = {
+        "token": sample,
+        "scenario": record["scenario_token"],
+        "agent": record["agent"],
+        "frame": frame["index"],
+        "split": dataset.scenario.get(record["scenario_token"])["split"],
+        **{name: record[name] for name in ("timestamp", "time_to_end", "time_to_impact", "velocity")},
+        "world_from_ego": dataset.world_from(sample, "ego").matrix.tolist(),
+        "ego_from_lidar": dataset.ego_from(sample, LIDAR).matrix.tolist(),
+        "cameras": {name: _camera(dataset, sample, camera, sizes.get(camera)) for camera, name in CAMERA_NAMES.items()},
+        "labelled": record["labelled"],
+        "boxes": _boxes(dataset, sample),
+    }
+    return json.dumps(facts, allow_nan=False).encode()
+
+
+def _camera(dataset: Dataset, sample: str, channel: str, size: tuple[int, int] | None) -> dict[str, Any]:
+    calibrated = dataset.camera(sample, channel)
+    camera = calibrated if size is None else calibrated.resized(*size)
+    return {
+        "ego_from_camera": dataset.ego_from(sample, channel).matrix.tolist(),
+        "intrinsic": camera.intrinsic.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def _boxes(dataset: Dataset, sample: str) -> dict[str, Any]:
+    rows, columns = dataset.annotation_rows(sample), dataset.columns("annotation")
+    numbers = ("actor_id", "num_lidar_pts", "camera_visible", "is_collider")
+    return {
+        "center": columns["translation"][rows].tolist(),
+        "size": columns["size"][rows].tolist(),
+        "velocity": _nan_as_null(columns["velocity"][rows]),
+        "yaw": columns["yaw"][rows].tolist(),
+        "category": [CATEGORIES[code] for code in columns["category"][rows].tolist()],
+        **{name: columns[name][rows].tolist() for name in numbers},
+    }
+
+
+def _nan_as_null(rows: FloatArray) -> list[list[float | None]]:
+    """As lists; JSON has no NaN."""
+    return [[None if value != value else value for value in row] for row in rows.tolist()]  # noqa: PLR0124 - NaN
+
+
 Frames = Literal["every", "keyframes"]
 
-_POINT_BYTES: Final = 16
 _FACTS_BYTES: Final = 20_000
-"""Of a sample's JSON and of the headers of its files, about."""
+"""Of a sample's JSON and of the headers of its files, about; shards are divided by it."""
 _IN_SHARDS: Final = (*CAMERAS, LIDAR)
 _TYPES: Final[Mapping[str, Any]] = {
     **{f"{name}.jpg": "image" for name in CAMERA_NAMES.values()},
@@ -80,26 +184,18 @@ class WebDataset(Format):
     def __post_init__(self) -> None:
         """Check the choice and the size too."""
         super().__post_init__()
-        object.__setattr__(self, "frames", choice("frames", self.frames, get_args(Frames)))
+        settle_choices(self, {"frames": get_args(Frames)})
         if self.shard_size < 1:
             raise ConfigError(f"shard_size: expected a number of bytes from 1, found {self.shard_size}")
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
-        """A shard each, by the sizes of the first files: all would take minutes, and plan looks at them."""
+        """A shard each, by the sizes of the first files: all would take minutes."""
         sizes = {scenario: _Recording(dataset, scenario, self).quick_size() for scenario in scenarios}
         return [
             Unit(name=f"{split}-{number:06d}", scenarios=group)
             for split, groups in shards(dataset, sizes, self.shard_size).items()
             for number, group in enumerate(groups)
         ]
-
-    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
-        """By the sizes of the images and the number of points of each first cloud."""
-        total = Plan(files=1)
-        for scenario in unit.scenarios:
-            recording = _Recording(dataset, scenario, self)
-            total += Plan(samples=recording.samples, bytes=recording.size())
-        return total
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a shard, in the format of GNU tar: it has names of any length."""
@@ -109,7 +205,7 @@ class WebDataset(Format):
         ):
             for scenario in unit.scenarios:
                 recording = _Recording(dataset, scenario, self)
-                recording.count_left_out(output)
+                recording.count(output)
                 recording.write(archive)
 
     def finish(
@@ -163,18 +259,9 @@ class _Recording:
             size += path.stat().st_size * len(self._numbers) if path.is_file() else 0
         return size
 
-    def size(self) -> int:
-        """Bytes, as if all clouds of an agent had as many points as its first one."""
-        size = self.samples * _FACTS_BYTES
-        for (_, channel), files in self._files.items():
-            if channel in CAMERAS:
-                size += sum(each for _, each in files.values())
-            elif channel == LIDAR:
-                size += points_in(files) * _POINT_BYTES
-        return size
-
-    def count_left_out(self, output: Output) -> None:
-        """Count what is not written."""
+    def count(self, output: Output) -> None:
+        """Count the samples, and what is not written."""
+        output.tally.samples += self.samples
         absent = [agent for agent in self._wanted if agent not in self._here]
         counts = {channel: sum(len(self._files[agent, channel]) for agent in self._agents) for channel in CHANNELS}
         images = sum(counts[camera] for camera in CAMERAS)

@@ -1,7 +1,6 @@
 """Maps of towns: the ground that the BEV cameras of a town's recordings saw, laid into one raster."""
 
-from deepaccident_devkit.maps.config import TownMapConfig
-from deepaccident_devkit.maps.counting import GROUND_CLASSES
+from deepaccident_devkit.maps.counting import GROUND_CLASSES, TownMapConfig
 from deepaccident_devkit.maps.making import kept_town_map, town_map, towns_of
 from deepaccident_devkit.maps.polygons import Area
 from deepaccident_devkit.maps.town_map import TownMap

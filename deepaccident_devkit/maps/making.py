@@ -1,30 +1,51 @@
-"""`town_map`: the BEV cameras of a town's recordings, laid into one raster of the world."""
+"""`town_map`: the BEV cameras of a town's recordings, laid into one raster of the world.
+
+A map is kept in the folder of the tables, and goes when they are made again. Where nothing can be written, it is not.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
 from collections.abc import Iterable, Sequence
-from functools import partial
-from typing import TYPE_CHECKING
+from contextlib import suppress
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from deepaccident_devkit.archives import open_zip, read_array
 from deepaccident_devkit.arrays import IntArray, as_floats
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.maps.config import TownMapConfig
-from deepaccident_devkit.maps.counting import GROUND_CLASSES, Counts, Window, cells_around, count_scenario
+from deepaccident_devkit.errors import ChoiceError, IndexStoreError, NotAvailableError
+from deepaccident_devkit.files import place_in
+from deepaccident_devkit.maps.counting import (
+    GROUND_CLASSES,
+    Counts,
+    TownMapConfig,
+    Window,
+    cells_around,
+    count_scenario,
+    looks_of,
+)
 from deepaccident_devkit.maps.hidden import hidden_ground
-from deepaccident_devkit.maps.keeping import keep_map, map_path, read_map
-from deepaccident_devkit.maps.looks import looks_of
 from deepaccident_devkit.maps.town_map import TownMap, classes_of
-from deepaccident_devkit.parallel import Places, run_unordered
+from deepaccident_devkit.parallel import Places, Store, run_unordered
+from deepaccident_devkit.reading import limit_of
 from deepaccident_devkit.taxonomy import BEV_CAMERA
 from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 _DEFAULT = TownMapConfig()
+_FOLDER: Final = "town_maps"
+_FORMAT: Final = 2
+"""Counts up whenever the same pictures give another map, or the file's form changes."""
+_ARRAYS: Final = ("origin", "counts", "agents", "hidden")
+_NUMBERS: Final = ("scenarios", "looks", "missing", "damaged")
 
 
 def town_map(
@@ -33,9 +54,7 @@ def town_map(
     *,
     config: TownMapConfig = _DEFAULT,
     scenarios: Iterable[RowArgument] | None = None,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> TownMap:
     """Map a town's ground: what the BEV cameras of its recordings saw as road, road line, sidewalk or something else.
 
@@ -49,32 +68,21 @@ def town_map(
         config: its cells, and which pictures are read.
         scenarios: tokens or records of scenarios; those in the town are looked through. None for all of them. Give
             those of a split, if a model that reads the map must not know the others.
-        workers: processes; None chooses by the number of scenarios.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
-        ChoiceError: the release has no recording in this town, or `workers` is less than 1.
+        ChoiceError: the release has no recording in this town.
         TokenError: no such scenario.
         NotAvailableError: none of the scenarios is in the town, or has a readable file of a BEV camera.
-        WorkerError: a worker was killed, or cannot do the work.
     """
     town, rows = _scenarios_in(dataset, town, scenarios)
-    path = map_path(dataset, town, _tokens(dataset, rows), config)
-    kept = _kept(dataset, town, rows, config)
-    if kept is not None:
-        return kept
-    windows = run_unordered(
-        partial(count_scenario, dataset, config),
-        rows,
-        workers=workers,
-        executor=executor,
-        label=f"mapping {town}",
-        progress=progress,
-        places=Places(reads=dataset.places),
-    )
+    found = _read(dataset, town, rows, config)
+    if found is not None and (not found.missing or found.missing == _missing(dataset, rows, config)):
+        return found
+    work, places = partial(count_scenario, dataset, config), Places(reads=dataset.places)
+    windows = run_unordered(work, rows, label=f"mapping {town}", places=places, **how)
     made = _joined(dataset, town, rows, config, (window for _, window in windows))
-    keep_map(path, made)
+    _keep(dataset, _key(dataset, town, rows, config), made)
     return made
 
 
@@ -85,7 +93,7 @@ def kept_town_map(dataset: Dataset, town: str, *, config: TownMapConfig = _DEFAU
         ChoiceError: the release has no recording in this town.
     """
     town, rows = _scenarios_in(dataset, town, None)
-    return read_map(map_path(dataset, town, _tokens(dataset, rows), config), town, config.resolution)
+    return _read(dataset, town, rows, config)
 
 
 def towns_of(dataset: Dataset, scenarios: Iterable[RowArgument] | None = None) -> list[str]:
@@ -114,17 +122,53 @@ def _scenarios_in(dataset: Dataset, town: str, scenarios: Iterable[RowArgument] 
     return town, chosen
 
 
-def _tokens(dataset: Dataset, rows: Sequence[int]) -> list[str]:
-    return [dataset.scenario[row]["token"] for row in rows]
-
-
-def _kept(dataset: Dataset, town: str, rows: Sequence[int], config: TownMapConfig) -> TownMap | None:
-    """The kept map, unless the files that it was made from are no longer those that are there."""
-    found = read_map(map_path(dataset, town, _tokens(dataset, rows), config), town, config.resolution)
-    if found is None or not found.missing:
-        return found
+def _missing(dataset: Dataset, rows: Sequence[int], config: TownMapConfig) -> int:
+    """How many of the pictures that a map is made from are not there."""
     files = (path for row in rows for recording in looks_of(dataset, row, config) for path in recording.files(dataset))
-    return found if sum(not path.exists() for path in files) == found.missing else None
+    return sum(not path.exists() for path in files)
+
+
+def _key(dataset: Dataset, town: str, rows: Sequence[int], config: TownMapConfig) -> str:
+    """A digest of all that was asked for."""
+    text = repr((_FORMAT, town, tuple(dataset.scenario[row]["token"] for row in rows), config))
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def _store(dataset: Dataset) -> Store:
+    """Nobody locks it: two processes write the same map, one after the other."""
+    folder = place_in(dataset.tables_folder, _FOLDER, opened=True)
+    return Store(folder, folder, "keeps town maps", IndexStoreError)
+
+
+def _read(dataset: Dataset, town: str, rows: Sequence[int], config: TownMapConfig) -> TownMap | None:
+    """The map that is kept; None if there is none, or if its file is damaged."""
+    store, key = _store(dataset), _key(dataset, town, rows, config)
+    try:
+        state = store.path(key).stat()
+    except OSError:
+        return None
+    return _unpacked(store, key, town, config.resolution, (state.st_mtime_ns, state.st_size, state.st_ino))
+
+
+@lru_cache(maxsize=1)  # every picture of a video asks for the same one
+def _unpacked(store: Store, key: str, town: str, resolution: float, _state: tuple[int, ...]) -> TownMap | None:
+    """The map in a file; its state tells it from another that takes its place."""
+    content = store.kept(key, key, "index")
+    if content is None:
+        return None
+    with open_zip(content) as archive:
+        arrays: dict[str, Any] = {name: read_array(archive, name, "index") for name in (*_ARRAYS, "numbers")}
+    numbers = dict(zip(_NUMBERS, arrays.pop("numbers").tolist(), strict=True))
+    return TownMap(town=town, resolution=resolution, **arrays, **numbers)
+
+
+def _keep(dataset: Dataset, key: str, made: TownMap) -> None:
+    """Keep a map, if its file can be written and would be read again; the same map gives the same bytes."""
+    content, numbers = io.BytesIO(), np.array([getattr(made, name) for name in _NUMBERS], dtype=np.int64)
+    np.savez_compressed(content, **{name: getattr(made, name) for name in _ARRAYS}, numbers=numbers)
+    if made.counts.nbytes <= limit_of("index") and dataset.tables_folder.is_dir():
+        with suppress(OSError):  # a folder that may not be written to
+            _store(dataset).keep(key, key, content.getvalue())
 
 
 def _joined(

@@ -15,7 +15,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
-from deepaccident_devkit.export.nuscenes.names import CHANNEL_NAMES
+from deepaccident_devkit.export.nuscenes.scenes import CHANNEL_NAMES
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.torch import ImageConfig, RandomAugmentation, V2XConfig, V2XDataset
-from deepaccident_devkit.export.torch.augmentation import augmented_boxes, augmented_pose, augmented_six_vectors
+from deepaccident_devkit.export.torch.config import augmented_boxes, augmented_pose, augmented_six_vectors
 from deepaccident_devkit.geometry import BevGrid, Boxes, six_vectors
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels

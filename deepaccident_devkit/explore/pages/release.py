@@ -17,7 +17,7 @@ from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, part_of, picture, with_slash
 from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.maps import TownMap, TownMapConfig, kept_town_map, town_map, towns_of
-from deepaccident_devkit.maps.looks import looks_of
+from deepaccident_devkit.maps.counting import looks_of
 from deepaccident_devkit.overview import Overview, overview
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.ground import draw_whole_map

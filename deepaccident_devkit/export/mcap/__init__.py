@@ -63,7 +63,7 @@ def export_mcap(
     if target.is_dir():
         raise ChoiceError(f"path: expected a file, such as {target / 'accident.mcap'}, found the folder {target}")
     try:
-        from deepaccident_devkit.export.mcap.export import write_scenario
+        from deepaccident_devkit.export.mcap.scenario import write_scenario
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google"):
             raise

@@ -1,24 +1,171 @@
-"""Foxglove's messages from the devkit's own types: poses, colours, point clouds. `frame_id` names their frames."""
+"""An MCAP file being written on the timeline of a scenario, and Foxglove's messages from the devkit's own types.
+
+`Recording` writes messages frame by frame; a `Moment` is a frame of the agents that are exported. Boxes are scene
+entities (cubes and lines), and coloured points for viewers without these: rerun shows point clouds but no SceneUpdate,
+so every rendering is there again as points, on a topic that ends in `/points`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import IO, Any, Final
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.timestamp_pb2 import Timestamp
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
 
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray
-from deepaccident_devkit.export.mcap.recording import frame_timestamp
-from deepaccident_devkit.geometry import SE3, quaternions
-from deepaccident_devkit.taxonomy import LIDAR
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.export.mcap.config import EPOCH
+from deepaccident_devkit.geometry import SE3, Boxes, quaternions
+from deepaccident_devkit.render.boxes import EDGES
+from deepaccident_devkit.render.roles import recorders_of
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR
+from deepaccident_devkit.v2x.configurations import Agents, agents_of, cooperating_agents
+
+_FRAME_NANOSECONDS: Final = 100_000_000
+_SECOND_NANOSECONDS: Final = 1_000_000_000
+
+
+def frame_nanoseconds(index: int) -> int:
+    """The time of frame number `index` (from 1) on the file's timeline, nanoseconds."""
+    return EPOCH * _SECOND_NANOSECONDS + (index - 1) * _FRAME_NANOSECONDS
+
+
+def frame_timestamp(index: int) -> Any:
+    """The same as a protobuf Timestamp."""
+    seconds, nanos = divmod(frame_nanoseconds(index), _SECOND_NANOSECONDS)
+    return Timestamp(seconds=seconds, nanos=nanos)
+
+
+class Recording:
+    """Writes messages frame by frame; a topic and its schema are added with the first message of the topic.
+
+    Chunks are compressed (zstd), and chunks, messages and metadata are indexed, so that viewers can seek.
+    """
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        """Begin a file."""
+        self._writer = Writer(stream, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library=f"deepaccident_devkit {__version__}")
+        self._schemas: dict[str, int] = {}
+        self._topics: dict[str, int] = {}
+        self._sequence: dict[str, int] = {}
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write the indexes and the summary, if there was no error."""
+        if error is None:
+            self._writer.finish()
+
+    def write(self, topic: str, message: Any, index: int) -> None:
+        """Add a protobuf message of frame number `index` to a topic."""
+        if topic not in self._topics:
+            self._topics[topic] = self._writer.register_channel(
+                topic=topic, message_encoding="protobuf", schema_id=self._schema(message)
+            )
+        sequence = self._sequence.get(topic, 0)
+        self._sequence[topic] = sequence + 1
+        time = frame_nanoseconds(index)
+        self._writer.add_message(
+            channel_id=self._topics[topic],
+            log_time=time,
+            publish_time=time,
+            sequence=sequence,
+            data=message.SerializeToString(deterministic=True),
+        )
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        """Add a metadata record: names and their values."""
+        self._writer.add_metadata(name, values)
+
+    def _schema(self, message: Any) -> int:
+        name = message.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(
+                name=name,
+                encoding="protobuf",
+                data=build_file_descriptor_set(type(message)).SerializeToString(deterministic=True),
+            )
+        return self._schemas[name]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moment:
+    """A frame and its samples.
+
+    Attributes:
+        scenario: token.
+        index: frame number from 1.
+        samples: agent → sample token, in the order of `taxonomy.AGENTS`.
+    """
+
+    scenario: str
+    index: int
+    samples: Mapping[str, str]
+
+    @property
+    def first_sample(self) -> str:
+        """Token of the first agent's sample."""
+        return next(iter(self.samples.values()))
+
+
+def moment_of(scenario: str, index: int, agents: tuple[str, ...]) -> Moment:
+    """Frame number `index` of some agents."""
+    samples = {agent: sample_token(scenario, agent, index) for agent in agents}
+    return Moment(scenario=scenario, index=index, samples=samples)
+
+
+def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[str, ...]:
+    """The agents that an `agents=` argument means, in the order of `taxonomy.AGENTS`.
+
+    Raises:
+        ChoiceError: no such agent or configuration, or no agent is given.
+        NotAvailableError: an agent is not in this (partial) release of the scenario.
+    """
+    first = agents_of(dataset, scenario)[0]
+    chosen = cooperating_agents(dataset, sample_token(scenario, first, 1), agents)
+    return tuple(agent for agent in AGENTS if agent in chosen)
+
+
+class Roles:
+    """The colliding pair, the vehicles that record, and all others."""
+
+    def __init__(self, dataset: Dataset, scenario: str) -> None:
+        """Read the roles of a scenario from its meta."""
+        collision = dataset.get("scenario", scenario)["collision"]
+        self.pair: frozenset[int] = frozenset() if collision is None else frozenset(collision["ids"])
+        self.agents: Mapping[int, str] = recorders_of(dataset, scenario)
+
+    def role(self, actor: int) -> str:
+        """The role of an actor, such as `ego_vehicle, collides`; empty for most actors."""
+        words = [self.agents[actor]] if actor in self.agents else []
+        return ", ".join([*words, "collides"] if actor in self.pair else words)
+
 
 COLORED_POINT: Final = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
@@ -95,4 +242,121 @@ def cloud_message(points: AnyArray, frame: str, index: int) -> Any:
             for name in points.dtype.names or ()
         ],
         data=points.tobytes(),
+    )
+
+
+_NO_TURN: Final = np.array([1.0, 0.0, 0.0, 0.0])
+_FACE_ALPHA: Final = 0.4
+_LINE_PIXELS: Final = 2.0
+_TEXT_PIXELS: Final = 14.0
+_TEXT_ABOVE: Final = 0.6
+"""Metres from a box's top to its text."""
+POINT_SPACING: Final = 0.25
+"""Metres between the points of a rendered line."""
+
+
+def scene_update(entities: Sequence[Any], index: int) -> Any:
+    """A SceneUpdate that shows these entities and removes all others of its topic."""
+    everything = SceneEntityDeletion(timestamp=frame_timestamp(index), type=SceneEntityDeletion.ALL)
+    return SceneUpdate(deletions=[everything], entities=entities)
+
+
+def entity(name: str, frame: str, index: int, facts: Mapping[str, str], **primitives: Sequence[Any]) -> Any:
+    """A SceneEntity in a coordinate frame: its primitives, and facts that the viewer shows after a click on it."""
+    seconds = (index - 1) * FRAME_PERIOD
+    return SceneEntity(
+        timestamp=frame_timestamp(index),
+        frame_id=frame,
+        id=name,
+        frame_locked=False,
+        metadata=[KeyValuePair(key=key, value=value) for key, value in {**facts, "seconds": f"{seconds:.1f}"}.items()],
+        **primitives,
+    )
+
+
+def cube(boxes: Boxes, row: int, color: str) -> Any:
+    """One of some boxes as a transparent CubePrimitive."""
+    return CubePrimitive(
+        pose=pose(boxes.center[row], boxes.rotation[row]),
+        size=vector(boxes.size[row]),
+        color=color_message(color, _FACE_ALPHA),
+    )
+
+
+def lines(segments: FloatArray, color: str) -> Any:
+    """Segments (N, 2, 3) as a LinePrimitive, equally thick at all distances."""
+    return _line(LinePrimitive.LINE_LIST, segments.reshape(-1, 3), color)
+
+
+def strip(points: FloatArray, color: str) -> Any:
+    """A line through points (N, 3) as a LinePrimitive."""
+    return _line(LinePrimitive.LINE_STRIP, points, color)
+
+
+def label(text: str, place: FloatArray, color: str) -> Any:
+    """Words at a place (3,) as a TextPrimitive, equally large at all distances."""
+    return TextPrimitive(
+        pose=pose(place, _NO_TURN),
+        billboard=True,
+        font_size=_TEXT_PIXELS,
+        scale_invariant=True,
+        color=color_message(color),
+        text=text,
+    )
+
+
+def box_segments(boxes: Boxes) -> FloatArray:
+    """(N, 13, 2, 3): the twelve edges of each box and, on the floor, a line from its middle to its front."""
+    corners, floor = boxes.corners(), boxes.bottom_corners()
+    edges = corners[:, np.array(EDGES)]
+    front = np.stack([floor.mean(axis=1), floor[:, :2].mean(axis=1)], axis=1)
+    return np.concatenate([edges, front[:, None]], axis=1)
+
+
+def above(boxes: Boxes, row: int) -> FloatArray:
+    """(3,) the place of a box's text."""
+    height = boxes.size[row, 2] / 2 + _TEXT_ABOVE
+    place: FloatArray = boxes.center[row] + np.array([0.0, 0.0, height])
+    return place
+
+
+def segment_points(segments: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
+    """Points (M,) of `COLORED_POINT` along segments (N, 2, 3), ends included."""
+    if not len(segments):
+        return np.zeros(0, dtype=COLORED_POINT)
+    lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+    counts = np.ceil(lengths / POINT_SPACING).astype(np.int64) + 1
+    which = np.repeat(np.arange(len(segments)), counts)
+    step = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = (step / np.maximum(counts - 1, 1)[which])[:, None]
+    return colored_points(segments[which, 0] * (1 - share) + segments[which, 1] * share, color, alpha)
+
+
+def strip_points(points: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
+    """Points of `COLORED_POINT` along a line through points (N, 3)."""
+    return segment_points(np.stack([points[:-1], points[1:]], axis=1), color, alpha)
+
+
+def colored_points(xyz: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
+    """Points (N, 3) as (N,) `COLORED_POINT` of one colour."""
+    points = np.zeros(len(xyz), dtype=COLORED_POINT)
+    points["x"], points["y"], points["z"] = xyz.T
+    points["red"], points["green"], points["blue"] = rgb(color).tolist()
+    points["alpha"] = round(255 * alpha)
+    return points
+
+
+def joined(parts: Sequence[AnyArray]) -> AnyArray:
+    """Points of several renderings in one array."""
+    return np.concatenate([np.zeros(0, dtype=COLORED_POINT), *parts])
+
+
+def _line(kind: int, points: FloatArray, color: str) -> Any:
+    return LinePrimitive(
+        type=kind,
+        pose=pose(np.zeros(3), _NO_TURN),
+        thickness=_LINE_PIXELS,
+        scale_invariant=True,
+        points=points3(points),
+        color=color_message(color),
     )

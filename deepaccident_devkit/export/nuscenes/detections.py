@@ -28,7 +28,7 @@ from deepaccident_devkit.evaluation.results.entries import (
 from deepaccident_devkit.evaluation.results.header import ContentError, at, shown
 from deepaccident_devkit.evaluation.results.records import FORMAT, BoxEntry
 from deepaccident_devkit.export.keyframes import KEY_STEP
-from deepaccident_devkit.export.nuscenes.names import token
+from deepaccident_devkit.export.nuscenes.scenes import token
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened

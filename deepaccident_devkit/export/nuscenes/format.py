@@ -1,29 +1,38 @@
-"""The nuScenes format: its settings, and what each scenario becomes."""
+"""The nuScenes format: its settings, what each scenario becomes, and the tables as files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, get_args
 
-from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
-from deepaccident_devkit.export.keyframes import keyframes
-from deepaccident_devkit.export.nuscenes.boxes import Van, box_rows
-from deepaccident_devkit.export.nuscenes.scenes import Scene, scenes_of
-from deepaccident_devkit.export.nuscenes.sensors import POINT_BYTES, LidarAxes, write_sensors
-from deepaccident_devkit.export.nuscenes.tables import write_part, write_tables
-from deepaccident_devkit.export.sensor_files import points_in
-from deepaccident_devkit.taxonomy import LIDAR
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.export.bulk import Format, Output, Unit
+from deepaccident_devkit.export.nuscenes.scenes import (
+    CATEGORIES,
+    CHANNEL_NAMES,
+    LIDAR_CHANNEL,
+    VERSION,
+    LidarAxes,
+    Row,
+    Rows,
+    Scene,
+    Van,
+    box_rows,
+    scenes_of,
+    token,
+    write_sensors,
+)
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.taxonomy import SPLITS
+from deepaccident_devkit.text import settle_choices
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
-
-_FILE_ROW_BYTES: Final = 580
-_BOX_ROW_BYTES: Final = 720
-_FRAME_ROW_BYTES: Final = 360
-"""JSON of a row, about."""
+    from deepaccident_devkit.export.bulk import Output
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +61,7 @@ class NuScenes(Format):
     def __post_init__(self) -> None:
         """Check the choices."""
         super().__post_init__()
-        object.__setattr__(self, "van", choice("van", self.van, get_args(Van)))
-        object.__setattr__(self, "lidar_axes", choice("lidar_axes", self.lidar_axes, get_args(LidarAxes)))
-
-    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
-        """About how much a scenario is, by the size of its first clouds."""
-        return sum((_plan_of(scene) for scene in self.scenes(dataset, unit)), Plan())
+        settle_choices(self, {"van": get_args(Van), "lidar_axes": get_args(LidarAxes)})
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write the sensor files of a scenario, and keep its rows."""
@@ -65,6 +69,7 @@ class NuScenes(Format):
         for scene in self.scenes(dataset, unit):
             files = write_sensors(scene, self.lidar_axes, output)
             rows.append({**scene.rows(), **files, **box_rows(scene, self.van, output)})
+            output.tally.samples += len(scene.frames)
             output.leave_out("frames between keyframes", scene.last - len(scene.frames))
         output.leave_out("agents of scenarios that are not in this release", len(self.agents) - len(rows))
         write_part(output.parts, rows)
@@ -86,15 +91,99 @@ class NuScenes(Format):
         ]
 
 
-def _plan_of(scene: Scene) -> Plan:
-    images = [size for channel, files in scene.files.items() if channel != LIDAR for _, size in files.values()]
-    clouds, frames = scene.files[LIDAR], len(scene.frames)
-    boxes = sum(scene.dataset.sample.get(scene.sample(number))["num_annotations"] for number in keyframes(scene.last))
-    rows = (len(images) + len(clouds)) * _FILE_ROW_BYTES + boxes * _BOX_ROW_BYTES + frames * _FRAME_ROW_BYTES
-    return Plan(
-        samples=frames,
-        files=len(clouds),
-        bytes=points_in(clouds) * POINT_BYTES + rows,
-        linked_files=len(images),
-        linked_bytes=sum(images),
+_OF_UNITS: Final = (
+    *("log", "scene", "sample", "sample_data", "ego_pose", "calibrated_sensor"),
+    *("instance", "sample_annotation"),
+)
+_ATTRIBUTES: Final = (
+    *("vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider"),
+    *("pedestrian.moving", "pedestrian.standing", "pedestrian.sitting_lying_down"),
+)
+_VISIBILITIES: Final = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
+
+
+def write_part(folder: Path, scenes: Sequence[Rows]) -> None:
+    """Keep the rows of a unit's scenes for `write_tables`, a row a line."""
+    for table in _OF_UNITS:
+        lines = "".join(f"{json.dumps(row)}\n" for rows in scenes for row in rows[table])
+        write_bytes(_part(folder, table), lines.encode())
+
+
+def write_tables(parts: Sequence[Path], output: Output) -> None:
+    """Write the 13 tables, `splits.json` and the masks of the maps, from what `write_part` left in these folders.
+
+    Only the rows of scenes and logs are in memory at once.
+    """
+    for table in _OF_UNITS:
+        _write_table(table, (line for folder in parts for line in _lines(folder, table)), output)
+    scenes, logs = (
+        [json.loads(line) for folder in parts for line in _lines(folder, each)] for each in ("scene", "log")
     )
+    for table, rows in {**_fixed_tables(), "map": _maps(logs)}.items():
+        _write_table(table, map(json.dumps, rows), output)
+    for row in _maps(logs):
+        output.write(row["filename"], _blank_mask())
+    splits: dict[str, list[str]] = {f"deepaccident_{split}": [] for split in SPLITS}
+    for row in scenes:
+        splits.setdefault(f"deepaccident_{row['split'] or 'unknown'}", []).append(row["name"])
+    output.write(f"{VERSION}/splits.json", json.dumps(splits, indent=1).encode())
+
+
+def _part(folder: Path, table: str) -> Path:
+    return folder / f"{table}.jsonl"
+
+
+def _lines(folder: Path, table: str) -> list[str]:
+    return read_bytes(_part(folder, table), "bundle").decode().splitlines()
+
+
+def _write_table(table: str, rows: Iterable[str], output: Output) -> None:
+    """Write a table of rows that are JSON, as they come."""
+    with output.file(f"{VERSION}/{table}.json") as path, path.open("w", encoding="utf-8") as file:
+        separator = "[\n"
+        for row in rows:
+            file.write(f"{separator}{row}")
+            separator = ",\n"
+        file.write("\n]" if separator == ",\n" else "[]")
+
+
+def _fixed_tables() -> dict[str, list[Row]]:
+    """The tables that are the same in every export."""
+    sensors = {name: "lidar" if name == LIDAR_CHANNEL else "camera" for name in CHANNEL_NAMES.values()}
+    return {
+        "sensor": [
+            {"token": token("sensor", name), "channel": name, "modality": kind} for name, kind in sensors.items()
+        ],
+        "category": [_word("category", name) for name in CATEGORIES.values()],
+        "attribute": [_word("attribute", name) for name in _ATTRIBUTES],
+        "visibility": [{"token": key, "level": level, "description": ""} for key, level in _VISIBILITIES.items()],
+    }
+
+
+def _word(table: str, name: str) -> Row:
+    return {"token": token(table, name), "name": name, "description": ""}
+
+
+def _maps(logs: Sequence[Row]) -> list[Row]:
+    """A map for each town, with all logs of the town: a reader stops at a log that is in no map."""
+    towns: dict[str, list[str]] = {}
+    for log in logs:
+        towns.setdefault(log["location"], []).append(log["token"])
+    return [
+        {
+            "token": token("map", town),
+            "log_tokens": tokens,
+            "category": "semantic_prior",
+            "filename": f"maps/{token('map', town)}.png",
+        }
+        for town, tokens in sorted(towns.items())
+    ]
+
+
+def _blank_mask() -> bytes:
+    """A map without roads: nuScenes' masks have no negative coordinates, CARLA's towns do."""
+    from PIL import Image
+
+    content = BytesIO()
+    Image.new("L", (1, 1)).save(content, "PNG")
+    return content.getvalue()

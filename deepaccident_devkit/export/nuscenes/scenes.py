@@ -1,21 +1,79 @@
-"""A scene, what one agent recorded of a scenario: its frames that are exported, its files, and its own rows."""
+"""A scene, what one agent recorded of a scenario, in nuScenes' words: its own rows, its boxes, its sensor files.
+
+mmdet3d's infos refer to the same files by the same names. All names follow from the release alone, so that exports of
+parts agree with one of the whole.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
 
 from deepaccident_devkit.export.keyframes import keyframe_after, keyframes
-from deepaccident_devkit.export.nuscenes.names import CHANNEL_NAMES, scene_name, timestamp, token
-from deepaccident_devkit.export.sensor_files import sensor_files
+from deepaccident_devkit.export.sensor_files import sensor_files, stored_camera
+from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.tables.tokens import agent_token, sample_token
+from deepaccident_devkit.tables.tokens import agent_token, sample_data_token, sample_token
+from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, LIDAR, OWN_ACTOR_ID, STATIC_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
+    from deepaccident_devkit.export.bulk import Output
+    from deepaccident_devkit.geometry import PinholeCamera
+
+VERSION: Final = "v1.0-deepaccident"
+LIDAR_CHANNEL: Final = "LIDAR_TOP"
+CAMERA_CHANNELS: Final = MappingProxyType(
+    dict(
+        zip(
+            CAMERAS,
+            ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"),
+            strict=True,
+        )
+    )
+)
+"""Our camera → nuScenes' channel."""
+CHANNEL_NAMES: Final = MappingProxyType({**CAMERA_CHANNELS, LIDAR: LIDAR_CHANNEL})
+ENDINGS: Final = MappingProxyType({**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "pcd.bin"})
+_EPOCH: Final = 1_600_000_000_000_000
+_HOUR: Final = 3_600_000_000
+_PERIOD: Final = 100_000
+
+
+def token(kind: str, *parts: object) -> str:
+    """A token of 32 hexadecimal digits for a row of a table, from what it is."""
+    return hashlib.md5("/".join(map(str, (kind, *parts))).encode(), usedforsecurity=False).hexdigest()
+
+
+def scene_name(scenario: str, agent: str) -> str:
+    """A scene is what one agent recorded of a scenario, given by its token: `<type>-<scenario>-<agent>`."""
+    return f"{scenario.replace('/', '-')}-{agent}"
+
+
+def timestamp(scenario_row: int, agent: str, number: int) -> int:
+    """Microseconds of a frame; the devkit of nuScenes sorts scenes by their first one, so no two are the same.
+
+    Args:
+        scenario_row: of the scenario table, which gets an hour of its own.
+        agent: who recorded it; agents are a microsecond apart.
+        number: of the frame, from 1.
+    """
+    return _EPOCH + (scenario_row + 1) * _HOUR + number * _PERIOD + AGENTS.index(agent)
+
+
+def sensor_path(scene: str, channel: str, stamp: int, *, key: bool) -> str:
+    """The path of a sensor file below the folder; `channel` is ours."""
+    name = CHANNEL_NAMES[channel]
+    return f"{'samples' if key else 'sweeps'}/{name}/{scene}__{name}__{stamp}.{ENDINGS[channel]}"
+
 
 Row = dict[str, Any]
 Rows = Mapping[str, Sequence[Row]]
@@ -141,3 +199,190 @@ def linked(rows: list[Row]) -> list[Row]:
     for row, before, after in zip(rows, tokens, tokens[2:], strict=False):
         row["prev"], row["next"] = before, after
     return rows
+
+
+Van = Literal["car", "truck"]
+CATEGORIES: Final = MappingProxyType(
+    {
+        "car": "vehicle.car",
+        "truck": "vehicle.truck",
+        "motorcycle": "vehicle.motorcycle",
+        "cyclist": "vehicle.bicycle",
+        "pedestrian": "human.pedestrian.adult",
+    }
+)
+"""Our class → nuScenes' category; vans are said to be one of the first two."""
+_SEEN: Final = MappingProxyType({True: "4", False: "1"})
+"""Whether a camera of the agent sees a box → nuScenes' visibility; the levels between cannot be known."""
+_MOVING: Final = 0.2
+"""m/s, above which an actor moves."""
+
+
+def box_rows(scene: Scene, van: Van, output: Output) -> Rows:
+    """The rows of `instance` and `sample_annotation`: an actor has an instance of its own in each scene.
+
+    The agent's own row is left out, as nuScenes does not annotate the ego. An untracked row is an instance by itself,
+    and so is one whose id stands in its label already.
+    """
+    rows: list[Row] = []
+    tracks: dict[str, list[Row]] = {}
+    for number in range(1, scene.last + 1):
+        sample = scene.dataset.sample.get(scene.sample(number))
+        if not scene.is_key(number):
+            output.leave_out("boxes between keyframes, which readers interpolate", sample["num_annotations"])
+            continue
+        output.leave_out("labels that are not in this release", not sample["labelled"])
+        for row in _annotations(scene, number, output):
+            rows.append(row)
+            tracks.setdefault(row["instance_token"], []).append(row)
+    for track in tracks.values():
+        linked(track)
+    return {"instance": [_instance(track, van) for track in tracks.values()], "sample_annotation": rows}
+
+
+def _annotations(scene: Scene, number: int, output: Output) -> Iterator[Row]:
+    """The row of each box of a keyframe, without the boxes before and after it."""
+    sample = scene.sample(number)
+    boxes = scene.dataset.boxes(sample)
+    derived = scene.dataset.boxes(sample, velocity="derived").velocity
+    velocity = np.where(np.isnan(derived), boxes.velocity, derived)  # an untracked actor has the label's alone
+    speed = np.hypot(velocity[:, 0], velocity[:, 1]).tolist()
+    seen = {OWN_ACTOR_ID}
+    for index, (actor, category) in enumerate(zip(boxes.actor_id.tolist(), boxes.category_names, strict=True)):
+        if actor == OWN_ACTOR_ID:
+            output.leave_out("boxes of the recording agents themselves")
+            continue
+        own = token("sample_annotation", sample, boxes.row.item(index))
+        alone = actor == UNTRACKED_ID or actor in seen
+        output.leave_out("tracks of untracked boxes (each is an instance of its own)", alone)
+        seen.add(actor)
+        length, width, height = boxes.size[index].tolist()
+        yield {
+            "token": own,
+            "sample_token": token("sample", sample),
+            "instance_token": token("instance", *((own,) if alone else (scene.scenario, scene.agent, actor))),
+            "visibility_token": _SEEN[boxes.camera_visible.item(index)],
+            "attribute_tokens": [token("attribute", name) for name in _attributes(category, actor, speed[index])],
+            "translation": boxes.center[index].tolist(),
+            "size": [width, length, height],
+            "rotation": boxes.rotation[index].tolist(),
+            "num_lidar_pts": boxes.num_lidar_pts.item(index),
+            "num_radar_pts": 0,
+            "actor_id": actor,
+            "category_deepaccident": category,
+        }
+
+
+def _attributes(category: str, actor: int, speed: float) -> list[str]:
+    """The word of nuScenes for what an actor of our class does, as a list; none where an unknown speed would decide."""
+    if category in ("motorcycle", "cyclist"):
+        return ["cycle.with_rider"]
+    if category != "pedestrian" and actor >= STATIC_ACTOR_ID:
+        return ["vehicle.parked"]
+    if np.isnan(speed):
+        return []
+    if category == "pedestrian":
+        return ["pedestrian.moving" if speed > _MOVING else "pedestrian.standing"]
+    return ["vehicle.moving" if speed > _MOVING else "vehicle.stopped"]
+
+
+def _instance(rows: list[Row], van: Van) -> Row:
+    """The row of an actor in a scene; its class is that of its first box."""
+    category = rows[0]["category_deepaccident"]
+    return {
+        "token": rows[0]["instance_token"],
+        "category_token": token("category", CATEGORIES[van if category == "van" else category]),
+        "nbr_annotations": len(rows),
+        "first_annotation_token": rows[0]["token"],
+        "last_annotation_token": rows[-1]["token"],
+        "actor_id": rows[0]["actor_id"],
+        "category_deepaccident": category,
+    }
+
+
+LidarAxes = Literal["ego", "nuscenes"]
+TURNS: Final = {
+    "ego": np.eye(3),
+    "nuscenes": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+}
+"""Axes → what turns points with x forward and y left into them; nuScenes' LiDAR has x right and y forward."""
+
+
+def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
+    """Write the clouds of a scene, link its images, and return the rows of `sample_data` and `calibrated_sensor`.
+
+    Files that are missing in a partial release have rows too, as those of a partial nuScenes download: evaluations look
+    up every keyframe's `LIDAR_TOP`, but open no cloud. A missing image has the size of the camera's first one.
+
+    Raises:
+        SensorFileError: a file cannot be read.
+    """
+    data: list[Row] = []
+    calibrated: dict[str, Row] = {}
+    for channel, files in scene.files.items():
+        rows, any_file = [], next(iter(files.values()), None)
+        for number in scene.frames:
+            source = sample_data_token(scene.sample(number), channel)
+            record = scene.dataset.sample_data.get(source)
+            lens = None if channel == LIDAR else stored_camera(scene.dataset, source, files.get(number, any_file))
+            sensor = record["calibrated_sensor_token"]
+            if lens is not None and (lens.width, lens.height) != (record["width"], record["height"]):
+                sensor = f"{sensor} {lens.width} x {lens.height}"  # with a K of its own
+            if sensor not in calibrated:
+                calibrated[sensor] = _calibrated_row(scene, record["calibrated_sensor_token"], sensor, lens, axes)
+            path = sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
+            rows.append(_data_row(scene, number, channel, sensor, path, lens))
+            if number not in files:
+                continue
+            if channel == LIDAR:
+                output.write(path, _cloud(files[number][0], axes))
+            else:
+                output.link(files[number][0], path)
+        data += linked(rows)
+        what = "point clouds" if channel == LIDAR else "images"
+        output.leave_out(f"{what} that are not in this release (the tables name them)", len(rows) - len(files))
+    bev = sensor_files(scene.dataset, scene.scenario, scene.agent, BEV_CAMERA)
+    output.leave_out("files of the BEV camera", len(bev))
+    return {"sample_data": data, "calibrated_sensor": list(calibrated.values())}
+
+
+def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, lens: PinholeCamera | None) -> Row:
+    sample = scene.sample(number)
+    return {
+        "token": token("sample_data", sample, channel),
+        "sample_token": token("sample", scene.key_of(number)),
+        "ego_pose_token": token("ego_pose", sample),
+        "calibrated_sensor_token": token("calibrated_sensor", sensor),
+        "timestamp": scene.stamp(number),
+        "fileformat": ENDINGS[channel].removesuffix(".bin"),
+        "is_key_frame": scene.is_key(number),
+        "height": 0 if lens is None else lens.height,
+        "width": 0 if lens is None else lens.width,
+        "filename": path,
+    }
+
+
+def _calibrated_row(scene: Scene, source: str, name: str, lens: PinholeCamera | None, axes: LidarAxes) -> Row:
+    """The row of our calibrated sensor `source`, whose token is made of `name`; a camera has the K of its images."""
+    record = scene.dataset.calibrated_sensor.get(source)
+    rotation, intrinsic = record["rotation"], []
+    if lens is None:
+        rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ TURNS[axes].T).tolist()
+    else:
+        intrinsic = lens.intrinsic.tolist()
+    return {
+        "token": token("calibrated_sensor", name),
+        "sensor_token": token("sensor", CHANNEL_NAMES[record["sensor_token"]]),
+        "translation": record["translation"],
+        "rotation": rotation,
+        "camera_intrinsic": intrinsic,
+    }
+
+
+def _cloud(path: ReleasePath, axes: LidarAxes) -> bytes:
+    """The content of a `.pcd.bin`: x, y, z, intensity, ring (0), in the LiDAR's frame with these axes."""
+    cloud = read_lidar(path)
+    points = np.zeros((len(cloud), 5), dtype="<f4")
+    points[:, :3] = cloud.xyz @ TURNS[axes].T
+    points[:, 3] = cloud.intensity
+    return points.tobytes()

@@ -1,4 +1,4 @@
-"""What a set of agents observed in a recording: actors that they see, and themselves; nothing of the future.
+"""What a question shows of a window: what some agents observed, under neutral names, and nothing of the future.
 
 A moment depends on the labels and the poses of that moment alone: speeds are those of its labels, since displacements
 would need a moment after it.
@@ -6,21 +6,123 @@ would need a moment after it.
 
 from __future__ import annotations
 
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, checked_number, checked_whole
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.export.keyframes import KEY_STEP
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.tables.tokens import agent_token, sample_token
-from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
 from deepaccident_devkit.v2x.cooperation import cooperative_view
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset, Visible
-    from deepaccident_devkit.export.questions.windows import Window
+
+_FRAMES_A_SECOND = round(1 / FRAME_PERIOD)
+_SAME = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """The moments of one question, as numbers of recorded frames.
+
+    Attributes:
+        frames: ascending; the last one is the present.
+    """
+
+    frames: tuple[int, ...]
+
+    @property
+    def present(self) -> int:
+        """The frame from which the question looks ahead."""
+        return self.frames[-1]
+
+    @property
+    def times(self) -> list[float]:
+        """Seconds of each moment relative to the present, from the earliest to 0.0."""
+        return [round((frame - self.present) * FRAME_PERIOD, 1) + 0.0 for frame in self.frames]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowRules:
+    """Which windows a recording has.
+
+    Presents are counted back from the last frame, as the samples of evaluations are; the last frame itself, which in an
+    accident is the impact, is none. The rule is the same for recordings with and without an accident.
+
+    Attributes:
+        observe: seconds before the present, a whole number of steps of `rate`; 0 for the present alone.
+        rate: moments a second of a window: 1, 2, 5 or 10.
+        ahead: whole seconds that are asked about.
+        stride: seconds from one window of a recording to the next, a multiple of 0.5.
+        partial_past: whether there are also windows that begin before the recording, of whose moments only the recorded
+            ones count. Their number then tells how long the recording has run.
+        most: windows of a recording at most, drawn by the seed; None for all.
+
+    Raises:
+        ConfigError: a value that this cannot be.
+    """
+
+    observe: float = 5.0
+    rate: int = 2
+    ahead: int = 3
+    stride: float = 1.0
+    partial_past: bool = False
+    most: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        rate = checked_whole("rate", self.rate, "moments a second", ConfigError)
+        if rate < 1 or _FRAMES_A_SECOND % rate:
+            raise ConfigError(f"rate: expected 1, 2, 5 or 10 moments a second, found {self.rate!r}")
+        _check_steps("observe", self.observe, 1 / rate, least=0)
+        _check_steps("stride", self.stride, KEY_STEP * FRAME_PERIOD, least=1)
+        for name in ("ahead", "most"):
+            value = getattr(self, name)
+            if value is None and name == "most":
+                continue
+            if checked_whole(name, value, "a whole number from 1", ConfigError) < 1:
+                raise ConfigError(f"{name}: expected a whole number from 1, found {value!r}")
+
+    def windows(self, last: int, drawn: str, seed: str) -> list[Window]:
+        """The windows of a recording of frames 1 to `last`, in the order of time.
+
+        Args:
+            last: number of the last frame.
+            drawn: what names the recording; with `seed` it decides which windows are drawn where `most` are wanted.
+            seed: any text.
+        """
+        step, stride = _FRAMES_A_SECOND // self.rate, round(self.stride / FRAME_PERIOD)
+        past = round(self.observe / FRAME_PERIOD)
+        presents = [number for number in range(last - stride, 0, -stride) if self.partial_past or number > past]
+        if self.most is not None:
+            presents = sorted(presents, key=lambda number: digest(seed, "window", drawn, str(number)))[: self.most]
+        return [
+            Window(frames=tuple(frame for frame in range(present - past, present + 1, step) if frame > 0))
+            for present in sorted(presents)
+        ]
+
+
+def digest(seed: str, *words: str) -> str:
+    """Sixteen hexadecimal digits for some words, which tell nothing about these without the seed."""
+    key = hashlib.blake2b(seed.encode(), digest_size=32).digest()
+    return hashlib.blake2b("\0".join(words).encode(), key=key, digest_size=8).hexdigest()
+
+
+def _check_steps(name: str, value: float, step: float, *, least: int) -> None:
+    seconds = checked_number(name, value, "a number of seconds", ConfigError)
+    steps = seconds / step
+    if not math.isfinite(steps) or steps < least - _SAME or abs(steps - round(steps)) > _SAME:
+        raise ConfigError(f"{name}: expected seconds from {least * step:g} in steps of {step:g}, found {value!r}")
+
 
 Seen = Literal["released", "camera", "annotated"]
 _VISIBLE: Final[dict[Seen, Visible | None]] = {"released": "released", "camera": "camera", "annotated": None}
@@ -145,3 +247,131 @@ class Observations:
 
     def _row(self, agent: AgentName, frame: int) -> int:
         return self.dataset.getind("sample", sample_token(self.scenario, agent, frame))
+
+
+EGO: Final = "ego"
+_PLACES: Final = 2
+_ANGLES: Final = 3
+"""Decimals of metres and metres a second, and of radians."""
+CONDITIONS: Final = ("weather", "time_of_day", "road_type")
+"""Facts of the meta file that stand in a question: the others say, or hint at, how the recording ends."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Names:
+    """Whom the neutral names of a question mean.
+
+    Attributes:
+        observers: name → agent.
+        actors: name → actor id, observers that have one among them.
+        last_seen: actor id → seconds relative to the present at which the set last observed it.
+    """
+
+    observers: Mapping[str, AgentName]
+    actors: Mapping[str, int]
+    last_seen: Mapping[int, float]
+
+    def of_actor(self, actor: int) -> str | None:
+        """The name of an actor; None if the question does not show it."""
+        return next((name for name, each in self.actors.items() if each == actor), None)
+
+
+def names_of(
+    seen: SeenRows, paths: Sequence[AgentPath], own_ids: Mapping[AgentName, int | None], times: Sequence[float]
+) -> Names:
+    """Name those that a question shows: nothing but what was observed decides the names.
+
+    The partners have numbers by their distance from the ego at the present. The actors have numbers by the moment at
+    which they were first seen, then by their distance from the ego at that moment.
+    """
+    ego = paths[0].pose
+    partners = sorted(
+        (path for path in paths[1:] if path.agent != INFRASTRUCTURE),
+        key=lambda path: (float(np.linalg.norm(path.pose[-1, :2])), *path.pose[-1].tolist()),
+    )
+    observers: dict[str, AgentName] = {EGO: paths[0].agent}
+    observers |= {f"partner_{number}": path.agent for number, path in enumerate(partners, start=1)}
+    if any(path.agent == INFRASTRUCTURE for path in paths[1:]):
+        observers[INFRASTRUCTURE] = INFRASTRUCTURE
+    ids = seen.boxes.actor_id
+    place = seen.boxes.center[:, :2]
+    apart = np.linalg.norm(place - ego[seen.moment, :2], axis=1)
+    order = np.lexsort((place[:, 1], place[:, 0], apart, seen.moment))
+    first_seen = dict.fromkeys(ids[order].tolist())
+    named = {f"a{number}": actor for number, actor in enumerate(first_seen, start=1)}
+    members = {name: own_ids[agent] for name, agent in observers.items()}
+    own = {name: actor for name, actor in members.items() if actor is not None}
+    last = {actor: times[moment] for actor, moment in zip(ids.tolist(), seen.moment.tolist(), strict=True)}
+    return Names(observers=observers, actors={**own, **named}, last_seen={**last, **dict.fromkeys(own.values(), 0.0)})
+
+
+def question_facts(
+    seen: SeenRows, paths: Sequence[AgentPath], names: Names, window: Window, scenario: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What a question says, but its id, what it asks, and pictures.
+
+    Args:
+        seen: the actors.
+        paths: of the agents.
+        names: of all of them.
+        window: the moments.
+        scenario: its record, of which only `CONDITIONS` are taken.
+    """
+    of_agent = {path.agent: path for path in paths}
+    of_name = {agent: name for name, agent in names.observers.items()}
+    sets = {bits: [of_name[agent] for agent in _agents_in(bits, of_name)] for bits in np.unique(seen.seen_by).tolist()}
+    members = set(names.observers)
+    return {
+        "moments": window.times,
+        "conditions": {name: scenario[name] for name in CONDITIONS},
+        "observers": [_observer(name, of_agent[agent]) for name, agent in names.observers.items()],
+        "actors": [
+            _actor(name, np.flatnonzero(seen.boxes.actor_id == actor), seen, window.times, sets)
+            for name, actor in names.actors.items()
+            if name not in members
+        ],
+    }
+
+
+def _agents_in(bits: int, of_name: Mapping[AgentName, str]) -> list[AgentName]:
+    """The agents of a bit mask, in the order of their names in the question."""
+    return [agent for agent in of_name if bits >> AGENTS.index(agent) & 1]
+
+
+def _observer(name: str, path: AgentPath) -> dict[str, Any]:
+    return {
+        "name": name,
+        "kind": INFRASTRUCTURE if path.agent == INFRASTRUCTURE else "vehicle",
+        "class": path.category,
+        "size": None if path.size is None else _rounded(np.array(path.size), _PLACES),
+        "position": _rounded(path.pose[:, :2], _PLACES),
+        "heading": _rounded(path.pose[:, 2], _ANGLES),
+        "speed": _known(path.speed),
+    }
+
+
+def _actor(
+    name: str, rows: IntArray, seen: SeenRows, times: Sequence[float], sets: Mapping[int, list[str]]
+) -> dict[str, Any]:
+    """An actor at the moments at which it was seen; class and size are those of the last one."""
+    boxes = seen.boxes
+    return {
+        "name": name,
+        "class": boxes.category_names[rows[-1]],
+        "size": _rounded(boxes.size[rows[-1]], _PLACES),
+        "time": [times[moment] for moment in seen.moment[rows].tolist()],
+        "position": _rounded(boxes.center[rows, :2], _PLACES),
+        "heading": _rounded(boxes.yaw[rows], _ANGLES),
+        "speed": _known(seen.speed[rows]),
+        "seen_by": [sets[bits] for bits in seen.seen_by[rows].tolist()],
+    }
+
+
+def _rounded(values: FloatArray, decimals: int) -> Any:
+    """Lists of numbers without a sign on zero."""
+    return (np.round(values, decimals) + 0.0).tolist()
+
+
+def _known(values: FloatArray) -> list[float | None]:
+    """Numbers, None in place of NaN."""
+    return [None if value != value else value for value in _rounded(values, _PLACES)]  # noqa: PLR0124 - NaN

@@ -27,9 +27,8 @@ except ModuleNotFoundError as error:
 
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.torch.all_egos import AllEgosDataset
-from deepaccident_devkit.export.torch.augmentation import RandomAugmentation
 from deepaccident_devkit.export.torch.collate import collate, collate_all_egos, collate_fusion
-from deepaccident_devkit.export.torch.config import V2XConfig
+from deepaccident_devkit.export.torch.config import RandomAugmentation, V2XConfig
 from deepaccident_devkit.export.torch.dataset import V2XDataset
 from deepaccident_devkit.export.torch.distributed import EvaluationSampler, merged_evaluator
 

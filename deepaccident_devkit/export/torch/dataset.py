@@ -15,9 +15,8 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.torch import sensor_data
-from deepaccident_devkit.export.torch.augmentation import augmented_boxes, augmented_six_vectors
 from deepaccident_devkit.export.torch.collate import V2XItem
-from deepaccident_devkit.export.torch.config import V2XConfig
+from deepaccident_devkit.export.torch.config import V2XConfig, augmented_boxes, augmented_six_vectors
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.tables.tokens import agent_token

@@ -13,8 +13,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.images import ImageConfig
-from deepaccident_devkit.export.torch.augmentation import augmented_points, augmented_pose
-from deepaccident_devkit.export.torch.config import V2XConfig
+from deepaccident_devkit.export.torch.config import V2XConfig, augmented_points, augmented_pose
 from deepaccident_devkit.motion import Augmentation
 from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.tables.tokens import sample_token

@@ -16,7 +16,7 @@ from deepaccident_devkit.evaluation.metrics.detection import detection_truth
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.results.entries import detection_entries
 from deepaccident_devkit.export.nuscenes.detections import OTHER_CLASSES, results_from_nuscenes
-from deepaccident_devkit.export.nuscenes.names import token
+from deepaccident_devkit.export.nuscenes.scenes import token
 
 OURS = {"car": "car", "truck": "truck", "bicycle": "cyclist", "motorcycle": "motorcycle", "pedestrian": "pedestrian"}
 

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from strategies import matrices
 
 from deepaccident_devkit.export.keyframes import KEY_STEP, keyframe_after, keyframes
-from deepaccident_devkit.export.poses import carla_six
+from deepaccident_devkit.export.opencood import carla_six
 from deepaccident_devkit.geometry.handedness import flip_pose
 
 DEGREES = st.floats(-179.9, 179.9)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.maps import TownMapConfig
-from deepaccident_devkit.maps.looks import chosen_frames, looks_of
+from deepaccident_devkit.maps.counting import chosen_frames, looks_of
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA
 
 

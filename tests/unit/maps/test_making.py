@@ -11,7 +11,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
-from deepaccident_devkit.maps import GROUND_CLASSES, TownMap, TownMapConfig, kept_town_map, making, town_map, towns_of
+from deepaccident_devkit.maps import TownMap, TownMapConfig, kept_town_map, making, town_map, towns_of
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA
@@ -99,26 +99,19 @@ def test_each_picture_counts_once_and_each_agent_of_a_scenario_once(mapped: Town
         assert edge.any()
 
 
+@pytest.mark.parametrize("workers", [pytest.param(2, marks=pytest.mark.slow), None])
 def test_neither_the_order_of_scenarios_nor_the_executor_changes_anything(
-    bev_release: DeepAccident, town: str, mapped: TownMap
+    bev_release: DeepAccident, town: str, mapped: TownMap, workers: int | None
 ) -> None:
-    tokens = bev_release.field2token("scenario", "town", town)
-    place = making.map_path(bev_release, town, tokens, TownMapConfig())
-    first = place.read_bytes()
-    place.unlink()
+    before = {path: path.read_bytes() for path in bev_release.tables_folder.glob("town_maps/kept/*")}
+    for path in before:
+        path.unlink()
+    tokens = [*reversed(bev_release.field2token("scenario", "town", town))]
     with ThreadPoolExecutor(2) as pool:
-        again = town_map(bev_release, town, scenarios=[*reversed(tokens)], executor=pool)
-    assert same(again, mapped)
-    assert place.read_bytes() == first
-
-
-@pytest.mark.slow
-def test_two_workers_make_the_same_bytes(bev_release: DeepAccident, town: str, mapped: TownMap) -> None:
-    place = making.map_path(bev_release, town, bev_release.field2token("scenario", "town", town), TownMapConfig())
-    first = place.read_bytes()
-    place.unlink()
-    assert same(town_map(bev_release, town, workers=2), mapped)
-    assert place.read_bytes() == first
+        how = {"workers": workers} if workers else {"executor": pool}
+        assert same(town_map(bev_release, town, scenarios=tokens, **how), mapped)
+    (place,) = bev_release.tables_folder.glob("town_maps/kept/*")
+    assert place.read_bytes() == before[place]
 
 
 def test_the_facade_has_it_and_a_town_may_be_written_in_small_letters(
@@ -202,21 +195,13 @@ def test_a_map_of_some_scenarios_is_another_one(bev_release: DeepAccident, town:
     assert same(town_map(bev_release, town), mapped)
 
 
-def test_a_damaged_kept_map_is_made_again(
-    own_bev_release: DeepAccident, town: str, mapped: TownMap, caplog: pytest.LogCaptureFixture
-) -> None:
-    place = making.map_path(
-        own_bev_release, town, own_bev_release.field2token("scenario", "town", town), TownMapConfig()
-    )
-    planes = dict.fromkeys((*GROUND_CLASSES, "agents", "hidden", "origin", "numbers"), np.zeros(3))
-    for damage in (b"", b"PK", None):
-        if damage is None:
-            np.savez_compressed(place, **planes)
-        else:
-            place.write_bytes(damage)
-        caplog.clear()
+def test_a_damaged_kept_map_is_made_again(own_bev_release: DeepAccident, town: str, mapped: TownMap) -> None:
+    town_map(own_bev_release, town, workers=1)
+    (place,) = own_bev_release.tables_folder.glob("town_maps/kept/*")
+    for damage in (b"", b"PK", place.read_bytes()[:-1]):
+        place.write_bytes(damage)
+        assert kept_town_map(own_bev_release, town) is None
         assert same(town_map(own_bev_release, town, workers=1), mapped)
-        assert "the kept map cannot be used" in caplog.text
 
 
 def test_where_nothing_can_be_written_a_map_is_made_and_not_kept(
@@ -225,6 +210,6 @@ def test_where_nothing_can_be_written_a_map_is_made_and_not_kept(
     def refused(path: Path, content: bytes) -> None:
         raise PermissionError(path)
 
-    monkeypatch.setattr("deepaccident_devkit.maps.keeping.write_bytes", refused)
+    monkeypatch.setattr("deepaccident_devkit.parallel.store.write_bytes", refused)
     assert same(town_map(own_bev_release, town, workers=1), mapped)
     assert kept_town_map(own_bev_release, town) is None

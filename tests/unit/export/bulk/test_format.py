@@ -1,7 +1,5 @@
-"""Settings of a format, plans, and the names that scenarios get."""
+"""Settings of a format, and the names that scenarios get."""
 
-import pickle
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,11 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_format import TinyFormat
 
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.export.bulk import Plan, flat_name
-from deepaccident_devkit.export.bulk.run import _Work
-from deepaccident_devkit.export.bulk.unfinished import Unfinished
+from deepaccident_devkit.export.bulk import flat_name
 
 TYPE = "type1_subtype1_accident"
 TOKENS = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="/\0"), min_size=1, max_size=250)
@@ -47,17 +42,6 @@ def test_one_agent_or_filter_may_stand_alone() -> None:
 def test_a_wrong_choice_is_refused_before_a_release_is_opened(options: dict[str, Any], words: str) -> None:
     with pytest.raises(ChoiceError, match=words):
         TinyFormat(**options)
-
-
-def test_plans_add_up() -> None:
-    one = Plan(samples=1, files=2, bytes=3, linked_files=4, linked_bytes=5)
-    assert one + one == Plan(samples=2, files=4, bytes=6, linked_files=8, linked_bytes=10)
-
-
-def test_what_goes_to_workers_is_small(small: DeepAccident, tmp_path: Path) -> None:
-    """A release has 691 scenarios, and each job has it all."""
-    work = _Work(small, TinyFormat(), Unfinished(tmp_path, "tiny"))
-    assert len(pickle.dumps(work.write)) < 3000
 
 
 class TestNames:

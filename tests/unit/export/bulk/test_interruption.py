@@ -16,8 +16,9 @@ from tiny_format import TinyFormat
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.bulk.unfinished import Unfinished
+from deepaccident_devkit.parallel import Store
 
 pytestmark = pytest.mark.slow
 
@@ -122,7 +123,8 @@ def test_processes_share_an_export(small_root: Path, tmp_path: Path, whole: dict
     script = "import sys, tiny_format; tiny_format.export_tiny(sys.argv[1], sys.argv[2], 1)"
     command = [sys.executable, "-c", script, str(small_root), str(tmp_path / "out")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    with Unfinished(tmp_path / "out", "tiny", "another command").store.shared():
+    out = tmp_path / "out"
+    with Store(out / ".deepaccident-parts", out, "writes an export", ExportError, "another command").shared():
         processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) for _ in range(2)]
         for process in processes:
             assert process.stderr

@@ -5,37 +5,30 @@ import os
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from tiny_format import KilledFormat, TinyFormat
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import (
-    ChoiceError,
     ConfigError,
     ExportError,
     MissingFileError,
     NotAvailableError,
     WorkerError,
 )
-from deepaccident_devkit.export.bulk import Exported, Plan, export_release, manifest, run
+from deepaccident_devkit.export.bulk import Exported, Tally, export_release
 from deepaccident_devkit.files import temporary_of, temporary_path
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.taxonomy import AGENTS
 
 SCENARIOS, PICTURES = 3, 18
 MANIFEST = "tiny.manifest.json"
-
-
-class Usage(NamedTuple):
-    """As of `shutil.disk_usage`."""
-
-    total: int
-    used: int
-    free: int
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
@@ -95,18 +88,15 @@ def remove_scenario(root: Path, token: str) -> None:
 
 
 def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
-    plans: list[tuple[Plan, int]] = []
-    done = written(small, tmp_path / "deep" / "out", on_plan=lambda plan, free: plans.append((plan, free)))
+    done = written(small, tmp_path / "deep" / "out")
     there = {name for name, content in contents(done.folder).items() if content is not None}
     files = {name for name in there if not name.startswith(".deepaccident-parts/")}
     assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 1
     assert {MANIFEST, "counts.json"} < files
-    assert plans == [(done.plan, plans[0][1])]
-    assert plans[0][1] > 0
-    assert (done.plan.samples, done.plan.files, done.plan.linked_files) == (PICTURES, 9, PICTURES)
-    assert (done.written, done.kept, done.tally.files) == (SCENARIOS, 0, SCENARIOS * 5 + 1)
+    assert (done.written, done.kept, done.tally.samples) == (SCENARIOS, 0, PICTURES)
+    assert done.tally.files == SCENARIOS * 5 + 1
     told = json.loads((done.folder / MANIFEST).read_bytes())
-    assert told["written"] == done.tally.as_dict()
+    assert told["written"] == asdict(done.tally)
     assert told["written"]["left_out"] == {"clouds": PICTURES, "maps": 1}
     assert told["written"]["bytes"] == sum(
         (done.folder / name).stat().st_size for name in files - {MANIFEST} if not name.endswith(".jpg")
@@ -151,7 +141,7 @@ def test_a_complete_export_is_kept_as_it_is(small: DeepAccident, tmp_path: Path)
     first = written(small, tmp_path / "out")
     before = states(first.folder)
     again = written(small, tmp_path / "out")
-    assert (again.written, again.kept, again.tally, again.plan) == (0, SCENARIOS, first.tally, first.plan)
+    assert (again.written, again.kept, again.tally) == (0, SCENARIOS, first.tally)
     assert states(first.folder) == before
 
 
@@ -161,10 +151,23 @@ def test_another_way_of_links_is_the_same_export(small: DeepAccident, tmp_path: 
 
 
 def test_a_dry_run_writes_nothing(small: DeepAccident, tmp_path: Path) -> None:
-    plans: list[Plan] = []
-    done = written(small, tmp_path / "out", dry_run=True, on_plan=lambda plan, _: plans.append(plan))
-    assert (plans, done.written, done.kept, done.tally.files) == ([done.plan], 0, 0, 0)
+    done = written(small, tmp_path / "out", dry_run=True)
+    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (SCENARIOS, 0, PICTURES, 5 * SCENARIOS)
+    assert sum(done.tally.linked.values()) == PICTURES
+    copies = written(small, tmp_path / "out", TinyFormat(link="copy"), dry_run=True)
+    assert copies.tally.linked == {"copy": PICTURES}
+    pictures = sum(path.stat().st_size for path in small.dataroot.glob("*/*/Camera_Front/*/*.jpg"))
+    assert copies.tally.bytes == pytest.approx(done.tally.bytes + pictures, rel=0.1)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_dry_run_counts_what_is_left(small: DeepAccident, tmp_path: Path) -> None:
+    stopped(small, tmp_path / "out", 2)
+    done = written(small, tmp_path / "out", dry_run=True)
+    assert (done.written, done.kept, done.tally.samples) == (1, 2, PICTURES // 3)
+    written(small, tmp_path / "out")
+    done = written(small, tmp_path / "out", dry_run=True)
+    assert (done.written, done.kept, done.tally.samples) == (0, SCENARIOS, 0)
 
 
 @pytest.mark.parametrize(
@@ -218,10 +221,7 @@ def test_an_empty_path_is_refused(small: DeepAccident) -> None:
         export_release(small, "", TinyFormat())
 
 
-def test_a_place_that_cannot_be_written_to(
-    small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, 1 << 30))  # the system says none for /proc
+def test_a_place_that_cannot_be_written_to(small: DeepAccident, tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"/proc/out: cannot be written .*; make room there, or choose"):
         written(small, Path("/proc/out"))
     (tmp_path / ".deepaccident-parts" / ".lock").mkdir(parents=True)
@@ -236,7 +236,7 @@ def test_an_export_beside_another(small: DeepAccident, tmp_path: Path, monkeypat
 
     out = written(small, tmp_path / "out").folder
     before = contents(out)
-    monkeypatch.setattr(Beside, "write", lambda *_: None)
+    monkeypatch.setattr(Beside, "write", lambda *given: given[-1].tally.add(Tally(samples=1)))
     monkeypatch.setattr(Beside, "finish", lambda *_: None)
     written(small, out, Beside())
     new = contents(out).keys() - before.keys()
@@ -308,20 +308,6 @@ class TestRelease:
             path.unlink()
         assert written(reopened(changing), tmp_path / "out", TinyFormat(agents=("other_vehicle",))).written == 0
 
-    def test_an_export_of_an_earlier_version_is_kept_and_told(
-        self, changing: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        out = written(reopened(changing), tmp_path / "out").folder
-        told = json.loads((out / MANIFEST).read_bytes())
-        for state in told["release"]["scenarios"].values():
-            del state["sensors"]
-        (out / MANIFEST).write_text(json.dumps(told))
-        shutil.rmtree(out / ".deepaccident-parts")
-        before = states(out)
-        assert written(reopened(changing), out).kept == SCENARIOS
-        assert states(out) == before
-        assert "did not note the sensor files; whether some have come or gone since is unknown" in caplog.text
-
     def test_parts_that_went_are_made_again_with_the_rest(self, changing: Path, tmp_path: Path) -> None:
         out = written(reopened(changing), tmp_path / "out").folder
         shutil.rmtree(out / ".deepaccident-parts")
@@ -373,7 +359,7 @@ def test_another_devkits_units_are_written_again(
     small: DeepAccident, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("deepaccident_devkit.export.bulk.unfinished.__version__", "0.0.1")
+        patch.setattr("deepaccident_devkit.export.bulk.__version__", "0.0.1")
         stopped(small, tmp_path / "out", 2)
     done = written(small, tmp_path / "out")
     assert (done.written, contents(done.folder)) == (SCENARIOS, contents(whole))
@@ -405,49 +391,23 @@ class TestSelection:
         assert not (tmp_path / "out").exists()
 
 
-class TestRoom:
-    def test_too_little_is_refused_before_anything_is_written(
-        self, small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        need = written(small, tmp_path / "out", dry_run=True).plan
-        monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, need.bytes))
-        with pytest.raises(ExportError, match=r"the export needs about 0.0 GB, and 0.0 GB are free; choose another"):
-            written(small, tmp_path / "copies", TinyFormat(link="copy"))
-        monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, need.bytes - 1))
-        with pytest.raises(ExportError, match="the export needs about"):
+@pytest.mark.parametrize("after", [0, 7, 14])
+def test_a_disk_that_is_full_amid_writing(
+    small: DeepAccident, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
+) -> None:
+    with monkeypatch.context() as patch:
+        write, left = Path.write_bytes, iter(range(after))
+
+        def filled(path: Path, content: bytes) -> int:
+            if next(left, None) is None:
+                raise OSError(28, "No space left on device", str(path))
+            return write(path, content)
+
+        patch.setattr(Path, "write_bytes", filled)
+        with pytest.raises(ExportError, match=r"cannot be written \(.*No space left.*make room there, or choose"):
             written(small, tmp_path / "out")
-        assert not list(tmp_path.iterdir())
-
-    @pytest.mark.parametrize("link", ["hard", "copy"])
-    def test_only_what_is_left_counts(
-        self, small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: Any
-    ) -> None:
-        form = TinyFormat(link=link)
-        plan = written(small, tmp_path / "out", form, dry_run=True).plan
-        stopped(small, tmp_path / "out", 2, form)
-        need = (plan.bytes + (plan.linked_bytes if link == "copy" else 0)) // 2
-        monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, need))
-        assert written(small, tmp_path / "out", form).kept == 2
-        monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, 0))
-        assert written(small, tmp_path / "out", form).kept == 3
-
-    @pytest.mark.parametrize("after", [0, 7, 14])
-    def test_a_disk_that_is_full_amid_writing(
-        self, small: DeepAccident, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
-    ) -> None:
-        with monkeypatch.context() as patch:
-            write, left = Path.write_bytes, iter(range(after))
-
-            def filled(path: Path, content: bytes) -> int:
-                if next(left, None) is None:
-                    raise OSError(28, "No space left on device", str(path))
-                return write(path, content)
-
-            patch.setattr(Path, "write_bytes", filled)
-            with pytest.raises(ExportError, match=r"cannot be written \(.*No space left.*make room there, or choose"):
-                written(small, tmp_path / "out")
-        assert not [name for name in contents(tmp_path / "out") if temporary_of(Path(name).name)]
-        assert contents(written(small, tmp_path / "out").folder) == contents(whole)
+    assert not [name for name in contents(tmp_path / "out") if temporary_of(Path(name).name)]
+    assert contents(written(small, tmp_path / "out").folder) == contents(whole)
 
 
 class TestDamage:
@@ -468,7 +428,7 @@ class TestDamage:
             ("release", {"fingerprint": "a", "scenarios": {"b": 3}}),
             ("release", {"fingerprint": "a", "scenarios": ["b"]}),
             ("release", {"scenarios": {}}),
-            ("written", {}),
+            ("written", 3),
             ("written", {"files": "x", "bytes": 0, "linked": {}, "left_out": {}}),
             ("written", {"files": "INFINITE", "bytes": 0, "linked": {}, "left_out": {}}),
         ],
@@ -499,7 +459,7 @@ class TestDamage:
             record.unlink()
             os.mkfifo(record)
         else:
-            record.write_text(text.replace("$", manifest.__version__))
+            record.write_text(text.replace("$", __version__))
         done = written(small, tmp_path / "out")
         assert (done.written, contents(done.folder)) == (2, contents(whole))
 
@@ -524,9 +484,3 @@ class TestDamage:
         for journal in (tmp_path / "out" / ".deepaccident-parts" / "tiny").glob("*.paths"):
             shutil.copy(journal, journal.with_name(f"{journal.name.removesuffix('.paths')} (1).paths"))
         assert contents(written(small, tmp_path / "out").folder) == contents(whole)
-
-
-def test_wrong_workers_make_no_folder(small: DeepAccident, tmp_path: Path) -> None:
-    with pytest.raises(ChoiceError, match="workers: expected a number of at least 1"):
-        written(small, tmp_path / "out", workers=0)
-    assert not list(tmp_path.iterdir())

@@ -1,5 +1,6 @@
 """Exports that several processes write: their bytes, failed scenarios, workers that were taken for lost."""
 
+import json
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -12,9 +13,6 @@ from tiny_format import TinyFormat
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ReleaseError, SomeFailedError
 from deepaccident_devkit.export.bulk import Exported, export_release
-from deepaccident_devkit.export.bulk.manifest import Manifest
-from deepaccident_devkit.export.bulk.run import _Work
-from deepaccident_devkit.export.bulk.unfinished import Unfinished
 from deepaccident_devkit.selection import find
 
 SCENARIOS = 3
@@ -49,6 +47,9 @@ def test_the_rest_is_done(small: DeepAccident, tmp_path: Path, monkeypatch: pyte
         patch.setattr(TinyFormat, "write", write)
         with pytest.raises(SomeFailedError, match=rf"^{tmp_path}/out: 1 of 3 failed:\n  \S+: cloud.npz: is broken; re"):
             written(small, tmp_path / "out")
+        left = written(small, tmp_path / "out", dry_run=True)
+        assert (left.written, left.tally.samples) == (1, 0)
+        assert written(small, tmp_path / "other", dry_run=True).tally.samples > 0
     assert written(small, tmp_path / "out").written == 1
     written(small, tmp_path / "whole")
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
@@ -58,26 +59,22 @@ def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
     small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a scheduler that died: the next call neither takes its half-written files away nor writes beside it."""
-    whole, begun, go_on = TinyFormat.write, threading.Event(), threading.Event()
+    whole, begun, go_on, first = TinyFormat.write, threading.Event(), threading.Event(), iter([True])
 
     def write(self: TinyFormat, dataset: Any, unit: Any, output: Any) -> None:
-        with output.whole_folder(f"folders/{unit.name}") as folder:
-            folder.write("names.json", b"half")
-            begun.set()
-            assert go_on.wait(20)
-        output.tally.files, output.tally.bytes = 0, 0
+        if next(first, False):
+            with output.whole_folder(f"folders/{unit.name}") as folder:
+                folder.write("names.json", b"half")
+                begun.set()
+                assert go_on.wait(20)
+            output.tally.files, output.tally.bytes = 0, 0
         whole(self, dataset, unit, output)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(TinyFormat, "write", write)
-        form, unit = TinyFormat(), TinyFormat().units(small, [find(small)[0]["token"]])[0]
-        unfinished = Unfinished(tmp_path / "out", "tiny")
-        Manifest(name="tiny", settings={**form.settings(), "version": small.version}).write(unfinished.root)
-        lost = threading.Thread(
-            target=unfinished.store.run, args=(_Work(small, form, unfinished).write, {unit.name: (unit, ())})
-        )
-        lost.start()
-        assert begun.wait(20)
+    monkeypatch.setattr(TinyFormat, "write", write)
+    lost = threading.Thread(target=written, args=(small, tmp_path / "out"))
+    lost.start()
+    assert begun.wait(20)
+    (tmp_path / "out" / ".deepaccident-parts" / ".making").unlink()  # of a caller that is dead
     again = threading.Thread(target=written, args=(small, tmp_path / "out"))
     again.start()
     time.sleep(0.3)
@@ -91,11 +88,11 @@ def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
 
 def test_what_another_host_left_of_a_unit_is_removed(small: DeepAccident, tmp_path: Path) -> None:
     written(small, tmp_path / "out")
-    unfinished = Unfinished(tmp_path / "out", "tiny")
-    unit = min(each.name.removesuffix(".paths") for each in unfinished.folder.glob("[!.]*.paths"))
-    unfinished.store.drop(f"tiny/{unit}/done")
-    settings = {**TinyFormat().settings(), "version": small.version}
-    Manifest(name="tiny", settings=settings).write(unfinished.root)
+    kept = tmp_path / "out" / ".deepaccident-parts" / "kept" / "tiny"
+    unit = min(each.name.removesuffix(".paths") for each in kept.glob("[!.]*.paths"))
+    (kept / unit / "done").unlink()
+    manifest = tmp_path / "out" / "tiny.manifest.json"
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "release": None}))
     left = tmp_path / "out" / "folders" / f".{unit[:50]}.0123abcd-77-99-1.tmp"
     left.mkdir()
     written(small, tmp_path / "out")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.questions import WindowRules
-from deepaccident_devkit.export.questions.windows import digest
+from deepaccident_devkit.export.questions.observed import digest
 
 
 def presents(rules: WindowRules, last: int) -> list[int]:
