@@ -6,16 +6,18 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from tiny import NAME, TYPE, write_tiny_release
 
 from deepaccident_devkit import DeepAccident, __version__
-from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.cli import deepaccident, verbs
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.splits import official_split
+from deepaccident_devkit.synth import SynthConfig
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -111,13 +113,60 @@ def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> N
     assert json.loads(run("info", own_release, "--json").stdout)["tables"]["annotation"] == before - 1
 
 
-def test_a_verb_does_not_wait_for_what_others_import() -> None:
-    code = (
-        "import sys; from deepaccident_devkit.cli import deepaccident; "
-        "deepaccident(['info', '--help'], standalone_mode=False); "
-        "sys.exit('deepaccident_devkit.evaluation' in sys.modules or 'deepaccident_devkit.render' in sys.modules)"
+def imported(*words: str) -> set[str]:
+    """The devkit's parts that a command imports, and NumPy."""
+    code = f"""if True:
+        import sys
+        from deepaccident_devkit.cli import deepaccident
+        deepaccident({words!r}, standalone_mode=False)
+        print("IMPORTED", *sys.modules)"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    names = done.stdout.rpartition("IMPORTED")[2].split()
+    return {name.removeprefix("deepaccident_devkit.") for name in names if name.startswith("deepaccident_devkit.")} | (
+        {"numpy"} & set(names)
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False).returncode == 0
+
+
+def test_a_verb_does_not_wait_for_what_others_import() -> None:
+    assert imported("info", "--help").isdisjoint({"evaluation", "render", "export", "safety"})
+    assert imported("--help").isdisjoint({"numpy", "cli.options", "deepaccident"})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mcap", "mmdet3d", "nuscenes", "opencood", "parquet", "questions", "webdataset"])
+def test_an_export_imports_its_own_format_alone(name: str) -> None:
+    shared = {"bulk", "keyframes", "poses", "sample_json", "sensor_files", "shards"}
+    own = {name} | ({"nuscenes", "released_infos"} if name == "mmdet3d" else set())
+    found = {each.split(".")[1] for each in imported("export", name, "--help") if each.startswith("export.")}
+    assert found <= shared | own
+    assert name == "mcap" or own <= found
+
+
+def test_options_that_few_need_stand_last() -> None:
+    for command in ("index", "predict", "export nuscenes", "render bev", "evaluate motion"):
+        options, advanced = CliRunner().invoke(deepaccident, [*command.split(), "--help"]).output.split("\nAdvanced:\n")
+        for name in ("--index-dir", "--scheduler", "--on-error"):
+            assert (name in options, name in advanced) == (False, True)
+        assert "--workers" in options
+
+
+def test_an_option_says_what_its_field_says() -> None:
+    @verbs.verb()
+    @verbs.field_option(SynthConfig, "unplanned")
+    @verbs.field_option(SynthConfig, "layout")
+    @verbs.field_option(SynthConfig, "exact")
+    @verbs.field_option(SynthConfig, "view", default="open")
+    def made(**options: object) -> None:
+        click.echo(json.dumps(options))
+
+    assert json.loads(CliRunner().invoke(made, ["--layout", "b"]).output) == {
+        "unplanned": 0.1, "layout": "B", "exact": False, "view": "open",
+    }  # fmt: skip
+    text = " ".join(CliRunner().invoke(made, ["--help"]).output.split())
+    assert (
+        "Share of accidents that differ from the design: with a pedestrian or a third vehicle. [default: 0.1]" in text
+    )
+    assert "Whether calib files are the same at each frame" in text
 
 
 @pytest.mark.slow
@@ -153,7 +202,7 @@ def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     assert read_split_file(tmp_path / "b.txt") == everything
     assert run("split", own_release, "--out", tmp_path / "d.txt", "--seed", 1).returncode == 2
     assert run("split", own_release, "--where", "split=train", "--out", tmp_path / "b").returncode == 2
-    for options in (("--seed", 3), ("--seed", 17), ("--released-skip",)):
+    for options in (("--seed", 3), ("--seed", 17)):
         refused = run("split", own_release, "--where", "split=train", "--out", tmp_path / "c.txt", *options)
         assert (refused.returncode, (tmp_path / "c.txt").exists()) == (2, False)
         assert (
@@ -272,17 +321,12 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
         (("--switch", "half_cell_shift=maybe"), "found 'half_cell_shift=maybe'"),
         (("--switch", "warp=exact"), "found 'warp=exact'"),
         (("--preset", "lift-splat"), "'lift-splat' is not one of"),
-        (("--orientation", "north"), "'north' is not one of"),
         (("--seen-by", "nobody"), "'nobody' is not one of"),
         (("--samples", "some"), "'some' is not one of"),
         (("--workers", "0"), "0 is not in the range"),
         (("--split", "tset"), "error: split: expected one of train, val, test, train_mini, val_mini, found 'tset'"),
         (("--split", "mine.txt"), "error: mine.txt: "),
         (("--names", "lss"), "'lss' is not one of 'fiery', 'beverse', 'deepaccident'"),
-        (
-            ("--names", "fiery", "--orientation", "fiery"),
-            "--orientation changes nothing with --names: the code",
-        ),
         (("--out", ""), "error: expected a folder of motion labels, found an empty path; give '.' for the current one"),
         (("--out", "/proc/nowhere"), "cannot be written"),
     ],

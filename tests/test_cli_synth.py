@@ -109,10 +109,10 @@ def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch
 def test_a_scenario_file_and_designs_exclude_each_other(tmp_path, made, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(design_text(1), encoding="utf-8")
-    CliRunner().invoke(synth, [str(tmp_path), "--spec", "mine.yaml"])
+    CliRunner().invoke(synth, [str(tmp_path), "--design", "mine.yaml"])
     assert made == [SynthConfig(frames=None, spec=Path("mine.yaml"))]
-    result = CliRunner().invoke(synth, [str(tmp_path), "--spec", "mine.yaml", "--design", "1"])
-    assert "a release is made of a scenario file or of designs" in str(result.exception)
+    result = CliRunner().invoke(synth, [str(tmp_path), "--design", "mine.yaml", "--design", "1"])
+    assert "give one scenario file, or numbers of designs" in result.output
 
 
 def test_a_design_that_is_not_there_is_a_usage_error(tmp_path):
@@ -122,7 +122,7 @@ def test_a_design_that_is_not_there_is_a_usage_error(tmp_path):
 
 
 def test_designs_are_listed_without_a_folder():
-    result = CliRunner().invoke(synth, ["--list-designs"])
+    result = CliRunner().invoke(synth, ["--show-design", "all"])
     assert result.exit_code == 0
     assert "3  unprotected left turn" in result.output
 
@@ -148,7 +148,7 @@ def mine(tmp_path, monkeypatch) -> Path:
 
 @pytest.mark.slow
 def test_a_file_is_checked_and_nothing_is_written(mine):
-    result = CliRunner().invoke(synth, ["--spec", "mine.yaml", "--check"])
+    result = CliRunner().invoke(synth, ["--design", "mine.yaml", "--check"])
     assert result.exit_code == 0, result.output
     assert re.search(
         r"mine.yaml: can be simulated; one draw of it, with seed 0:\n"
@@ -165,10 +165,10 @@ def test_a_file_is_checked_and_nothing_is_written(mine):
 
 def test_a_file_that_is_no_scenario_has_exit_status_1(mine):
     mine.write_text(MINE.replace("van", "cyclist"), encoding="utf-8")
-    result = CliRunner().invoke(synth, ["--spec", "mine.yaml", "--check"])
+    result = CliRunner().invoke(synth, ["--design", "mine.yaml", "--check"])
     assert result.exit_code == 1
     assert "error: mine.yaml:4: actors[1].category: the role other cannot be a cyclist" in result.stderr
-    result = CliRunner().invoke(synth, ["--spec", "your.yaml", "--check"])
+    result = CliRunner().invoke(synth, ["--design", "your.yaml", "--check"])
     assert (result.exit_code, "your.yaml: no such file" in result.stderr) == (1, True)
 
 
@@ -176,8 +176,8 @@ def test_a_file_that_is_no_scenario_has_exit_status_1(mine):
     ("words", "sentence"),
     [
         ([], "Missing argument 'OUT'"),
-        (["--check"], "--check needs the scenario file: --spec FILE"),
-        (["out", "--spec", "mine.yaml", "--check"], "--check writes nothing; leave out out"),
+        (["--check"], "--check needs a scenario file: --design FILE"),
+        (["out", "--design", "mine.yaml", "--check"], "--check writes nothing; leave out out"),
     ],
 )
 def test_words_that_are_missing_or_too_many_are_usage_errors(mine, words, sentence):
@@ -192,10 +192,10 @@ def test_how_to_see_an_accident_is_the_last_line(mine, made):
 
     picture = "deepaccident render accident out{} --out countdown.png"
     assert last() == "or:   " + picture.format("")
-    assert last("--spec", "mine.yaml", "--sensors", "none") == "or:   " + picture.format(" --layers boxes")
+    assert last("--design", "mine.yaml", "--sensors", "none") == "or:   " + picture.format(" --layers boxes")
     assert last("--sensors", "cameras") == "or:   " + picture.format("")
     mine.write_text(MINE.replace("meet: {offset: 0}", ""), encoding="utf-8")
-    assert last("--spec", "mine.yaml") == "next: deepaccident info out"
+    assert last("--design", "mine.yaml") == "next: deepaccident info out"
 
 
 def test_a_design_is_shown_as_a_file_to_begin_with():
@@ -208,5 +208,5 @@ def test_a_design_is_shown_as_a_file_to_begin_with():
 def test_help_names_every_option():
     text = CliRunner().invoke(synth, ["--help"]).output
     named = {option for parameter in synth.params for option in parameter.opts if option.startswith("--")}
-    assert len(named) == 19
+    assert len(named) == 15
     assert all(option in text for option in named)

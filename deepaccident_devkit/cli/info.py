@@ -8,6 +8,7 @@ import click
 from deepaccident_devkit.cli.options import (
     engine_of,
     index_check_parameter,
+    json_parameter,
     refuse_unused,
     release_parameters,
     say_report,
@@ -15,6 +16,7 @@ from deepaccident_devkit.cli.options import (
     where_parameter,
     write_report,
 )
+from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.selection.fields import fields_text
@@ -28,7 +30,7 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
         context.exit()
 
 
-@click.command()
+@verb()
 @release_parameters
 @where_parameter
 @click.option(
@@ -55,7 +57,7 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     "Nothing is changed.",
 )
 @index_check_parameter
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
+@json_parameter
 def info(
     where: tuple[str, ...],
     statistics: bool,
