@@ -1,7 +1,6 @@
 """`deepaccident demo`: what it makes, where it refuses to, and whether its reader can see the crash coming."""
 
 import importlib
-import io
 import re
 import shlex
 from dataclasses import replace
@@ -116,17 +115,6 @@ def test_an_interrupted_demo_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
         demo._make_release(tmp_path, 1, bar)
     assert len(DeepAccident(dataroot=tmp_path / "release", verbose=False).scenario) == 2
     assert set(recorded.values()) <= set(times(tmp_path / "release").values())
-
-
-def test_one_bar_names_all_steps_and_ends_full() -> None:
-    shown = io.StringIO()
-    with tqdm(total=sum(demo._STEPS.values()), bar_format=demo._BAR, file=shown, mininterval=0) as bar:
-        for name, seconds in demo._STEPS.items():
-            with demo._step(bar, name):
-                bar.update(seconds / 3)
-    names = re.findall(r"\r(\w+) ", shown.getvalue())
-    assert list(dict.fromkeys(names)) == list(demo._STEPS)
-    assert "replay     100%|" in shown.getvalue()
 
 
 @pytest.mark.slow

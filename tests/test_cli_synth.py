@@ -203,10 +203,3 @@ def test_a_design_is_shown_as_a_file_to_begin_with():
     assert result.exit_code == 0
     assert result.output == design_text(9)
     assert parse_spec(result.output).design == 9
-
-
-def test_help_names_every_option():
-    text = CliRunner().invoke(synth, ["--help"]).output
-    named = {option for parameter in synth.params for option in parameter.opts if option.startswith("--")}
-    assert len(named) == 15
-    assert all(option in text for option in named)

@@ -22,7 +22,9 @@ from deepaccident_devkit.cli.options import (
     json_parameter,
     on_error_parameter,
     refuse_unused,
+    release_of,
     release_parameters,
+    switches_of,
     version_parameter,
 )
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, together, verb
@@ -52,7 +54,6 @@ from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
-from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
 from deepaccident_devkit.render.evaluation import save_report
@@ -65,7 +66,6 @@ _HELP = {
     "detection": "Evaluate detected boxes: AP and errors.",
     "warning": "Evaluate warnings: how early they come before accidents, and how often an alarm is false.",
 }
-_RELEASE = ("dataroot", "version", "index_dir", "on_error")
 _OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
 _selection_parameters = together(
     click.option(
@@ -174,7 +174,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @json_parameter
     def evaluated(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
         setup = EvaluationSetup(
-            task=task, protocol=protocol, switches=_switches_of(switches), horizon=options["horizon"]
+            task=task, protocol=protocol, switches=switches_of(switches), horizon=options["horizon"]
         )
         _evaluate(setup, results, **options)
 
@@ -187,7 +187,7 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
     if out is not None:
         checked_target(out, overwrite=options["overwrite"])  # before the release is indexed
     opened = read_results(results)
-    dataset = DeepAccident(**{name: options[name] for name in _RELEASE}, **engine_of(options))
+    dataset = DeepAccident(**release_of(options), **engine_of(options))
     selection = _selection_of(setup, options)
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
@@ -266,20 +266,6 @@ def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleS
         scope=options["scope"],
         agents=None if agents == AGENTS else agents,
     )
-
-
-def _switches_of(texts: tuple[str, ...]) -> dict[str, Any]:
-    """The names and values of repeated --switch NAME=VALUE; a value that is no JSON stays a text."""
-    switches: dict[str, Any] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not (name and equals):
-            raise click.BadParameter(f"--switch: expected NAME=VALUE, found {text!r}")
-        try:
-            switches[name] = parsed_json(value.encode())
-        except ValueError:
-            switches[name] = value
-    return switches
 
 
 @verb()

@@ -10,6 +10,7 @@ from deepaccident_devkit.cli.options import (
     agents_parameter,
     engine_of,
     release_parameters,
+    switches_of,
 )
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -101,13 +102,10 @@ def _config(options: dict[str, Any]) -> MotionLabelConfig:
     return replace(config, protocol=_switched(config.rules, switches)) if switches else config
 
 
-def _switched(rules: LabelProtocol, switches: tuple[str, ...]) -> LabelProtocol:
-    changes: dict[str, Any] = {}
-    for text in switches:
-        name, _, value = text.partition("=")
-        value = value.lower()
-        if name not in slip_names() or value not in ("yes", "no"):
+def _switched(rules: LabelProtocol, texts: tuple[str, ...]) -> LabelProtocol:
+    switches = switches_of(texts)
+    for name, value in switches.items():
+        if name not in slip_names() or not isinstance(value, bool):
             names = ", ".join(slip_names())
-            raise click.BadParameter(f"--switch: expected NAME=yes or NAME=no, NAME one of {names}; found {text!r}")
-        changes[name] = value == "yes"
-    return replace(rules, **changes)
+            raise click.BadParameter(f"--switch: expected yes or no for one of {names}; found {name}={value}")
+    return replace(rules, **switches)

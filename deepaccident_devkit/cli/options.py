@@ -12,12 +12,14 @@ from click.core import ParameterSource
 
 from deepaccident_devkit.cli.verbs import Function, WordChoice, advanced, field_option, together
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.parallel import cluster_executor
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
 from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE, Link
 
 _ALL = ("all", AVAILABLE)
+_WORDS = {"yes": "true", "no": "false"}
 LINK_OPTIONS = ("latency", "pose_noise", "packet_loss", "seed")
 """Their names as parameters of a verb."""
 
@@ -129,6 +131,25 @@ release_parameters = together(dataroot_argument, release_options)
 def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
     """Of a verb's options, those that say what it runs on."""
     return {name: options[name] for name in ("workers", "executor")}
+
+
+def release_of(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a verb's options, those that say which release is opened, and how."""
+    return {name: options[name] for name in ("dataroot", "version", "index_dir", "on_error")}
+
+
+def switches_of(texts: Sequence[str]) -> dict[str, Any]:
+    """The names and values of repeated --switch NAME=VALUE; a value that is neither yes, no nor JSON stays a text."""
+    switches: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise click.BadParameter(f"--switch: expected NAME=VALUE, found {text!r}")
+        try:
+            switches[name] = parsed_json(_WORDS.get(value.lower(), value).encode())
+        except ValueError:
+            switches[name] = value
+    return switches
 
 
 def write_report(report: Any, folder: Path | None, name: str) -> list[Path]:

@@ -17,6 +17,7 @@ from deepaccident_devkit.cli.options import (
     model_parameters,
     names_or_configuration,
     refuse_unused,
+    release_of,
     release_parameters,
     samples_parameter,
     scope_parameter,
@@ -32,7 +33,6 @@ from deepaccident_devkit.motion.sample_lists import no_samples_text
 from deepaccident_devkit.v2x import Link
 
 _ALONE = "single"
-_RELEASE = ("dataroot", "version", "index_dir", "on_error")
 _RELEASED_HORIZON = Baseline().horizon
 _EXAMPLES = """\b
 Examples:
@@ -95,7 +95,7 @@ def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, ou
     folder = writable_folder(out)
     released = chosen.horizon == _RELEASED_HORIZON and options["scope"] == "accident"
     engine = engine_of(options)
-    dataset = DeepAccident(**{name: options[name] for name in _RELEASE}, **engine)
+    dataset = DeepAccident(**release_of(options), **engine)
     tokens = _samples(dataset, purpose, "released" if released else "paper", chosen.horizon, options)
     for task in get_args(ResultsTask):
         if task in options["tasks"] or "all" in options["tasks"]:
@@ -115,7 +115,7 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
 
     device = checked_device(options["device"])
     network = load_model(Path(model)).to(device)
-    dataset = DeepAccident(**{name: options[name] for name in _RELEASE})
+    dataset = DeepAccident(**release_of(options))
     tokens = _samples(dataset, purpose, "paper", network.config.horizon, options)
     config = PredictConfig(
         agents=agents or "all",

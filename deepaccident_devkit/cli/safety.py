@@ -106,7 +106,8 @@ _OF_TOPIC: Final = {
     "kind",
     "--seen",
     "kind",
-    help="Of lead-time: what an observation is. points: the agent's label counts 5 LiDAR points in the actor's box. "
+    help="Of lead-time: what an observation is. points: the agent's label counts at least "
+    f"{ObservationRule().least_points} LiDAR points in the actor's box. "
     "released: the visibility rule of the released code. annotated: the label has the actor, hidden or not.",
 )
 @click.option(

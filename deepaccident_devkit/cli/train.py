@@ -11,6 +11,7 @@ from deepaccident_devkit.cli.options import (
     model_parameters,
     names_or_configuration,
     reader_parameters,
+    release_of,
     use_threads_sparingly,
 )
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, verb
@@ -87,7 +88,7 @@ def train(weights: Path | None, **options: Any) -> None:
         **{**{name: options[name] for name in _TRAINING}, "validation": None if validation == "none" else validation},
     )
     choice = ModelChoice(**{name: options[name] for name in _CHOICE})
-    dataset = DeepAccident(**{name: options[name] for name in ("dataroot", "version", "index_dir", "on_error")})
+    dataset = DeepAccident(**release_of(options))
     best = train_model(
         dataset,
         options["out"],
