@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import NotAvailableError, ResultsError
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.splits import save_selection
 from deepaccident_devkit.v2x import Link
@@ -24,18 +24,8 @@ def run(*arguments: object) -> str:
 
 
 def test_predict_writes_all_tasks_of_the_samples_that_are_evaluated(da_motion: DeepAccident, tmp_path: Path) -> None:
-    text = run(
-        "constant_velocity",
-        da_motion.dataroot,
-        "--split",
-        "train",
-        "--agents",
-        "all",
-        "--workers",
-        1,
-        "--out",
-        tmp_path,
-    )
+    words = ("constant_velocity", da_motion.dataroot, *["--split", "train", "--agents", "all", "--workers", "1"])
+    text = run(*words, "--out", tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["accident.json", "detection.json", "motion"]
     for name in ("motion", "accident.json", "detection.json"):
         results = read_results(tmp_path / name)
@@ -104,3 +94,10 @@ def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, t
     assert run(*words).count("which were there already") == 3
     with pytest.raises(ResultsError, match=r"accident\.json: is there already; choose another path, or remove it"):
         run(*words, "--task", "accident", "--agents", "all")
+
+
+def test_a_model_that_is_not_there_is_named() -> None:
+    with pytest.raises(
+        ChoiceError, match=r"MODEL.*: expected one of constant_velocity, .*did you mean 'constant_velocity'"
+    ):
+        run("constant_velocty", "release", "--out", "out")

@@ -46,41 +46,32 @@ def test_bad_image_size_is_a_usage_error(tmp_path, size):
     assert "expected width x height such as 480x270" in result.output
 
 
-def test_every_option_reaches_the_configuration(tmp_path, made):
-    words = "--scenarios 6 --frames 12 --size 64x36 --layout B --seed 7 --sensors none --unlabelled-test --view open"
-    result = CliRunner().invoke(
-        synth, [str(tmp_path), *words.split(), "--unplanned", "0.5", "--design", "3", "--design", "9"]
-    )
+@pytest.mark.parametrize(
+    ("words", "config"),
+    [
+        ("", {}),
+        (
+            "--scenarios 6 --frames 12 --size 64x36 --layout B",
+            {"scenarios": 6, "frames": 12, "image_size": (64, 36), "layout": "B"},
+        ),
+        (
+            "--seed 7 --unlabelled-test --view open --unplanned 0.5",
+            {"seed": 7, "unlabelled_test": True, "view": "open", "unplanned": 0.5},
+        ),
+        ("--design 3 --design 9", {"designs": (3, 9)}),
+        ("--design ./3", {"spec": Path("3")}),
+        ("--sensors Cameras", {"sensors": "cameras"}),
+        ("--sensors none", {"sensors": False}),
+        ("--for-released-code", {"for_released_code": True}),
+        ("--for-released-code --size 1600x900 --layout A", {"for_released_code": True, "image_size": (1600, 900)}),
+    ],
+)
+def test_every_option_reaches_the_configuration(tmp_path, made, monkeypatch, words, config):
+    monkeypatch.chdir(tmp_path)
+    Path("3").write_text(design_text(1), encoding="utf-8")
+    result = CliRunner().invoke(synth, ["out", *words.split()])
     assert result.exit_code == 0, result.output
-    assert made == [
-        SynthConfig(
-            scenarios=6,
-            frames=12,
-            image_size=(64, 36),
-            layout="B",
-            seed=7,
-            sensors=False,
-            unlabelled_test=True,
-            view="open",
-            unplanned=0.5,
-            designs=(3, 9),
-        )
-    ]
-
-
-def test_sensors_are_chosen_by_a_word(tmp_path, made):
-    for word in ("all", "Cameras", "none"):
-        assert CliRunner().invoke(synth, [str(tmp_path), "--sensors", word]).exit_code == 0
-    assert [config.sensors for config in made] == ["all", "cameras", "none"]
-
-
-def test_a_release_for_the_released_code_is_asked_for_by_one_word(tmp_path, made):
-    CliRunner().invoke(synth, [str(tmp_path), "--for-released-code"])
-    CliRunner().invoke(synth, [str(tmp_path), "--for-released-code", "--size", "1600x900", "--layout", "A"])
-    assert made == [
-        SynthConfig(frames=None, for_released_code=True),
-        SynthConfig(frames=None, for_released_code=True, image_size=(1600, 900)),
-    ]
+    assert made == [SynthConfig(**{"frames": None, **config})]
 
 
 @pytest.mark.parametrize(
@@ -106,19 +97,17 @@ def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch
     assert made == [SynthConfig(frames=None, sensors=False)]
 
 
-def test_a_scenario_file_and_designs_exclude_each_other(tmp_path, made, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("mine.yaml").write_text(design_text(1), encoding="utf-8")
-    CliRunner().invoke(synth, [str(tmp_path), "--design", "mine.yaml"])
-    assert made == [SynthConfig(frames=None, spec=Path("mine.yaml"))]
-    result = CliRunner().invoke(synth, [str(tmp_path), "--design", "mine.yaml", "--design", "1"])
-    assert "give one scenario file, or numbers of designs" in result.output
-
-
-def test_a_design_that_is_not_there_is_a_usage_error(tmp_path):
-    result = CliRunner().invoke(synth, [str(tmp_path), "--design", "13"])
-    assert result.exit_code == 2
-    assert "13 is not in the range 1<=x<=12" in result.output
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--design mine.yaml --design 1", "give one scenario file, or numbers of designs"),
+        ("--design 13", "13 is not in the range 1<=x<=12"),
+        ("--show-design none", "'none' is not a valid integer"),
+    ],
+)
+def test_designs_that_are_not_there_are_usage_errors(tmp_path, words, told):
+    result = CliRunner().invoke(synth, [str(tmp_path), *words.split()])
+    assert (result.exit_code, told in result.output) == (2, True), result.output
 
 
 def test_designs_are_listed_without_a_folder():

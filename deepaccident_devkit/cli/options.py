@@ -113,8 +113,8 @@ def engine_parameters(run_verb: Function) -> Function:
     def run(*arguments: Any, scheduler: str | None, **options: Any) -> Any:
         if scheduler is not None:
             refuse_unused("with a scheduler, which has workers of its own", "workers")
-        in_file = (scheduler or "").endswith(".json")
-        with cluster_executor(*(None, Path(str(scheduler))) if in_file else (scheduler,)) as executor:
+        file = Path(scheduler) if scheduler is not None and scheduler.endswith(".json") else None
+        with cluster_executor(None if file else scheduler, file) as executor:
             if executor is not None:  # workers have working folders of their own
                 options = {name: each.absolute() if isinstance(each, Path) else each for name, each in options.items()}
             return run_verb(*arguments, executor=executor, **options)

@@ -30,6 +30,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.motion.sample_lists import no_samples_text
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Link
 
 _ALONE = "single"
@@ -76,6 +77,8 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
     Or a baseline, which needs no training: `constant_velocity` or `constant_turn_rate` say how actors go on that some
     agents see. The files motion/, accident.json and detection.json are what `deepaccident evaluate` takes.
     """
+    if not Path(model).exists():  # before PyTorch is asked for
+        model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, "tiny"))
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
     seed, link = options["seed"], link_of(options)

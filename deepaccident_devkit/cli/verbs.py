@@ -65,10 +65,10 @@ class Verb(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, and then the advanced ones."""
+        options = [each for each in self.get_params(ctx) if isinstance(each, click.Option)]
         for heading, kind in (("Options", False), ("Advanced", True)):
-            options = [each for each in self.get_params(ctx) if isinstance(each, click.Option)]
-            shown = (each for each in options if isinstance(each, Advanced) is kind)
-            if rows := [row for each in shown if (row := each.get_help_record(ctx))]:
+            records = (each.get_help_record(ctx) for each in options if isinstance(each, Advanced) is kind)
+            if rows := [record for record in records if record is not None]:
                 with formatter.section(heading):
                     formatter.write_dl(rows)
 

@@ -43,7 +43,7 @@ CASES = [
     ("split release --overwrite", "--overwrite changes nothing without --out"),
     ("synth out --design mine.yaml --unplanned 0.5", "--unplanned changes nothing with a scenario file or --view"),
     ("synth --design mine.yaml --check --layout B", "--layout changes nothing with --check"),
-    ("predict runs/all release --out out --horizon 3", "--horizon changes nothing with a trained model"),
+    ("predict tiny release --out out --horizon 3", "--horizon changes nothing with a trained model"),
     (BASELINE + " --device cpu", "--device changes nothing with a baseline"),
     ("results pyproject.toml release --out out --method me", "--method changes nothing without --truth"),
     ("safety twins release --replays 3", "--replays changes nothing with twins"),
