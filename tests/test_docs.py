@@ -235,7 +235,7 @@ def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(in_lab
     script = loaded_script("docs/make_safety_page.py")
     (in_labels_demo / script.RELEASE).symlink_to(in_labels_demo / "deepaccident_demo" / "release")
     there = (DOCS / "safety.md").read_text(encoding="utf-8")
-    page = re.sub(r"^    deepaccident (synth|baseline|evaluate) .*$", "", there, flags=re.MULTILINE)
+    page = re.sub(r"^    deepaccident (synth|predict|evaluate) .*$", "", there, flags=re.MULTILINE)
     now = script.with_outputs(page)
     outputs = [re.findall(r"^<!-- output -->\n(.*?)^<!-- end", text, re.MULTILINE | re.DOTALL) for text in (there, now)]
     assert len(outputs[0]) == 8
