@@ -150,6 +150,7 @@ def imported(*words: str) -> set[str]:
 
 def test_a_verb_does_not_wait_for_what_others_import() -> None:
     assert imported("info", "--help").isdisjoint({"evaluation", "render", "export", "safety"})
+    assert imported("evaluate", "motion", "--help").isdisjoint({"render", "cli.evaluate_bundles", "export"})
     assert imported("--help").isdisjoint({"numpy", "cli.options", "deepaccident"})
 
 

@@ -11,7 +11,6 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.evaluate_bundles import compare, resamples_parameter, verify
 from deepaccident_devkit.cli.options import (
     DATAROOT,
     PATH,
@@ -27,11 +26,12 @@ from deepaccident_devkit.cli.options import (
     switches_of,
     version_parameter,
 )
-from deepaccident_devkit.cli.verbs import WordChoice, advanced, together, verb
+from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field_option, together, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING, attribute_name
+from deepaccident_devkit.evaluation.metrics.intervals import MOST_RESAMPLES
 from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
@@ -56,7 +56,6 @@ from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, Evaluatio
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
-from deepaccident_devkit.render.evaluation import save_report
 from deepaccident_devkit.taxonomy import AGENTS
 
 _FINDINGS_STATUS = 1
@@ -65,6 +64,12 @@ _HELP = {
     "accident": "Evaluate predicted accidents: APA, and the errors in who, where and when.",
     "detection": "Evaluate detected boxes: AP and errors.",
     "warning": "Evaluate warnings: how early they come before accidents, and how often an alarm is false.",
+}
+_LINES = {
+    **_HELP,
+    "check": "Check every entry of a results file.",
+    "compare": "Compare two evaluations, and test the differences.",
+    "verify": "Repeat an evaluation and list all differences.",
 }
 _OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
 _selection_parameters = together(
@@ -88,11 +93,6 @@ _selection_parameters = together(
     agents_parameter,
     click.option("--horizon", default=2.0, show_default=True, help="How many seconds the predictions look ahead."),
 )
-
-
-@click.group()
-def evaluate() -> None:
-    """Evaluate results files; check and compare evaluations."""
 
 
 _WARNING = together(
@@ -164,7 +164,7 @@ def _task_verb(task: TaskName) -> click.Command:
         help="Also give the numbers for each value of this attribute; you can repeat this option. One of "
         f"{', '.join(ATTRIBUTES)}.",
     )
-    @resamples_parameter
+    @field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
     @click.option(
         "--sanity", is_flag=True, help="Look for classic mistakes: mirrored axes, another frame, swapped classes, …"
     )
@@ -222,6 +222,8 @@ def _written(
     if options["sanity"]:
         run, text = _with_sanity(run, dataset, results, options)
     if options["out"] is not None:
+        from deepaccident_devkit.render.evaluation import save_report
+
         report = partial(save_report, run, dataset=dataset, results=results)
         kept = {name: options[name] for name in ("include_results", "overwrite")}
         save_run(run, options["out"], **kept, extras=[report])
@@ -302,7 +304,16 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
         sys.exit(_FINDINGS_STATUS)
 
 
-for name in get_args(TaskName):
-    evaluate.add_command(_task_verb(name))
-for command in (check, verify, compare):
-    evaluate.add_command(command)
+def _verb(name: Any) -> click.Command:
+    if name in _HELP:
+        return _task_verb(name)
+    if name == "check":
+        return check
+    from deepaccident_devkit.cli.evaluate_bundles import compare, verify  # one renders, and so imports matplotlib
+
+    return compare if name == "compare" else verify
+
+
+@click.group(cls=LazyVerbs, verbs=_LINES, load=_verb)
+def evaluate() -> None:
+    """Evaluate results files; check and compare evaluations."""

@@ -32,7 +32,6 @@ from deepaccident_devkit.taxonomy import OnError
 _FINDINGS_STATUS = 1
 _KINDS = (".csv", ".json", *PICTURE_SUFFIXES)
 _DPI = 130
-resamples_parameter = field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
 
 
 @verb()
@@ -76,7 +75,7 @@ def verify(
 @click.argument("a", type=PATH)
 @click.argument("b", type=PATH)
 @click.option("--common", is_flag=True, help="Compare only the samples that both evaluations have.")
-@resamples_parameter
+@field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
 @click.option(
     "--out",
     multiple=True,

@@ -147,6 +147,8 @@ def safety(topic: str, where: tuple[str, ...], out: str | None, as_json: bool, *
         refuse_unused("with a scenario", "where")
     if topic == "report" and out is None:
         raise click.UsageError("Missing option '--out': the folder of the page.")
+    if topic == "describe" and out is not None and Path(out).is_dir():
+        raise click.BadParameter(f"--out: {out} is a folder; give a file, such as {out}/stories.jsonl")
     target = None if out is None else Path(out) if topic == "describe" else writable_folder(out)
     dataset, engine = DeepAccident(**options), engine_of(options)
     chosen = dataset.find(*where) if where else None

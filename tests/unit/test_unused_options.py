@@ -46,6 +46,8 @@ CASES = [
     ("predict tiny release --out out --horizon 3", "--horizon changes nothing with a trained model"),
     (BASELINE + " --device cpu", "--device changes nothing with a baseline"),
     ("results pyproject.toml release --out out --method me", "--method changes nothing without --truth"),
+    ("results pyproject.toml release --truth pyproject.toml --out out", "give DATAROOT for detections of a nuScenes"),
+    ("safety describe release --out .", "--out: . is a folder; give a file, such as ./stories.jsonl"),
     ("safety twins release --replays 3", "--replays changes nothing with twins"),
     ("safety report release --json", "--json changes nothing with report"),
     ("info release --out out", "--out changes nothing without --statistics"),
