@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import indent
 
 import click
 
@@ -161,8 +162,7 @@ def _section(command: click.Command, path: tuple[str, ...], parent: click.Group 
         ]
     lines += _tables(options)
     if command.epilog:
-        lines += [f"    {line}".rstrip() for line in inspect.cleandoc(command.epilog).replace("\b\n", "").splitlines()]
-        lines += [""]
+        lines += [_plain(command.epilog), ""]
     return "\n".join(lines)
 
 
@@ -208,7 +208,9 @@ def _meaning(option: click.Option) -> str:
 
 
 def _plain(text: str | None) -> str:
-    return inspect.cleandoc(text or "")
+    """A help text; what click does not wrap is a block."""
+    parts = inspect.cleandoc(text or "").split("\n\n")
+    return "\n\n".join(indent(each[2:], "    ") if each.startswith("\b\n") else each for each in parts)
 
 
 if __name__ == "__main__":
