@@ -20,8 +20,6 @@ from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE, Link
 
 _ALL = ("all", AVAILABLE)
 _WORDS = {"yes": "true", "no": "false"}
-LINK_OPTIONS = ("latency", "pose_noise", "packet_loss", "seed")
-"""Their names as parameters of a verb."""
 
 
 class DatarootParameter(click.Path):
@@ -78,21 +76,6 @@ channels_parameter = click.option(
     multiple=True,
     metavar="NAME[,NAME…]",
     help="Only these sensors, such as Camera_Front or lidar01.  [default: all]",
-)
-samples_parameter = click.option(
-    "--samples",
-    "purpose",
-    type=WordChoice(["evaluate", "all"]),
-    default="evaluate",
-    show_default=True,
-    help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
-)
-scope_parameter = click.option(
-    "--scope",
-    type=WordChoice(["accident", "all"]),
-    default="accident",
-    show_default=True,
-    help="Accident scenarios only, or all scenarios.",
 )
 model_parameters = together(
     click.option(
@@ -202,7 +185,7 @@ def names_or_configuration(given: Sequence[str]) -> str | list[str] | None:
 
 
 def link_parameters(latency: float = 0.0, pose_noise: float = 0.0) -> Callable[[Function], Function]:
-    """Options for what happens to partners' data, with these defaults (`link_of` reads them)."""
+    """Options for what happens to partners' data, with these defaults."""
     return together(
         field_option(Link, "latency", default=latency),
         field_option(Link, "pose_noise", default=pose_noise, type=float),
@@ -210,15 +193,6 @@ def link_parameters(latency: float = 0.0, pose_noise: float = 0.0) -> Callable[[
 
 
 seed_parameter = click.option("--seed", default=0, show_default=True, help="Seed of all that is drawn.")
-
-
-def link_of(options: dict[str, Any]) -> Link | None:
-    """Take the link's options out of a verb's; None if nothing happens to the partners' data."""
-    chosen = {name: options.pop(name) for name in LINK_OPTIONS if name in options}
-    noise = chosen.pop("pose_noise") or None  # noise with a mean of 0 m would still have a spread
-    if not (chosen["latency"] or noise or chosen.get("packet_loss")):
-        return None
-    return Link(pose_noise=noise, **chosen)
 
 
 def use_threads_sparingly() -> None:

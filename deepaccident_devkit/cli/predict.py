@@ -8,19 +8,15 @@ import click
 from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, predict_results
 from deepaccident_devkit.baselines.predict_results import is_predicted
 from deepaccident_devkit.cli.options import (
-    LINK_OPTIONS,
     PATH,
     cooperating_parameter,
     engine_of,
-    link_of,
     link_parameters,
     model_parameters,
     names_or_configuration,
     refuse_unused,
     release_of,
     release_parameters,
-    samples_parameter,
-    scope_parameter,
     seed_parameter,
     use_threads_sparingly,
 )
@@ -34,6 +30,8 @@ from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Link
 
 _ALONE = "single"
+_LINK = ("latency", "pose_noise", "packet_loss", "seed")
+"""Their names as parameters of a verb."""
 _RELEASED_HORIZON = Baseline().horizon
 _EXAMPLES = """\b
 Examples:
@@ -66,8 +64,21 @@ Examples:
 @link_parameters()
 @field_option(Link, "packet_loss")
 @seed_parameter
-@samples_parameter
-@scope_parameter
+@click.option(
+    "--samples",
+    "purpose",
+    type=WordChoice(["evaluate", "all"]),
+    default="evaluate",
+    show_default=True,
+    help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
+)
+@click.option(
+    "--scope",
+    type=WordChoice(["accident", "all"]),
+    default="accident",
+    show_default=True,
+    help="Accident scenarios only, or all scenarios.",
+)
 @model_parameters
 @click.option("--out", required=True, type=PATH, metavar="DIR", help="Folder to write into.")
 def predict(model: str, purpose: Any, **options: Any) -> None:
@@ -81,7 +92,7 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
         model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, "tiny"))
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
-    seed, link = options["seed"], link_of(options)
+    seed, link = options["seed"], _link_of(options)
     agents = names_or_configuration(options.pop("agents"))
     predicted = _by_baseline if model in MOTION_MODELS else _by_network
     predicted(model, purpose, agents=agents, link=link, seed=seed, **options)
@@ -91,7 +102,7 @@ def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, ou
     refuse_unused("with a baseline", "device", "images_cache")
     agents = agents or _ALONE
     if agents == _ALONE:
-        refuse_unused("with --agents single, which has no partners", *LINK_OPTIONS)
+        refuse_unused("with --agents single, which has no partners", *_LINK)
     if link is None or not (link.pose_noise or link.packet_loss):
         refuse_unused("without --pose-noise or --packet-loss", "seed")
     chosen = Baseline(agents=agents, model=model, link=link, horizon=options["horizon"])
@@ -112,7 +123,7 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
     refuse_unused("with a trained model, which predicts all tasks as far as it was trained", "tasks", "horizon")
     refuse_unused("with a trained model, which runs on this machine", "scheduler")
     if agents == _ALONE:
-        refuse_unused("with --agents single, which has no partners", *(name for name in LINK_OPTIONS if name != "seed"))
+        refuse_unused("with --agents single, which has no partners", *(name for name in _LINK if name != "seed"))
     use_threads_sparingly()
     from deepaccident_devkit.model import PredictConfig, checked_device, load_model, predict_results
 
@@ -139,3 +150,12 @@ def _samples(dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, op
     if not tokens:
         raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
     return tokens
+
+
+def _link_of(options: dict[str, Any]) -> Link | None:
+    """Take the link's options out of the verb's; None if nothing happens to the partners' data."""
+    chosen = {name: options.pop(name) for name in _LINK}
+    noise = chosen.pop("pose_noise") or None  # noise with a mean of 0 m would still have a spread
+    if not (chosen["latency"] or noise or chosen["packet_loss"]):
+        return None
+    return Link(pose_noise=noise, **chosen)
