@@ -18,7 +18,7 @@ from unittest import mock
 
 from benchmarks.measure import best_of, one_core
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.export.bulk import export_release, run
+from deepaccident_devkit.export import bulk
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.parallel import cluster_executor, run_batch
 from deepaccident_devkit.parallel.pool import own_workers
@@ -119,8 +119,10 @@ def exported(dataset: DeepAccident, executor: Executor | None) -> tuple[float, f
         return results[0]
 
     form = OpenCood(without_clouds=True)  # the release has labels alone
-    with TemporaryDirectory(dir=dataset.dataroot.parent) as folder, mock.patch.object(run, "run_batch", timed):
-        seconds = best_of(1, lambda: export_release(dataset, Path(folder) / "out", form, workers=1, executor=executor))
+    with TemporaryDirectory(dir=dataset.dataroot.parent) as folder, mock.patch.object(bulk, "run_batch", timed):
+        seconds = best_of(
+            1, lambda: bulk.export_release(dataset, Path(folder) / "out", form, workers=1, executor=executor)
+        )
     inside, handed = map(sum, zip(*batches, strict=True))
     return seconds, seconds - inside, handed
 

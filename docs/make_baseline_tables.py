@@ -1,6 +1,6 @@
 """Make the tables of docs/baselines.md: `python docs/make_baseline_tables.py [FOLDER]`, from a checkout; some minutes.
 
-All numbers are of the functions of `deepaccident baseline predict`, `evaluate` and `evaluate compare`. FOLDER keeps the
+All numbers are of the functions of `deepaccident predict`, `evaluate` and `evaluate compare`. FOLDER keeps the
 releases and predictions, so that an interrupted call goes on.
 """
 

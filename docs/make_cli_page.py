@@ -3,11 +3,13 @@
 import inspect
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import indent
 
 import click
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.cli.verbs import Advanced
 
 PAGE = Path(__file__).parent / "cli.md"
 WORDS_A_MINUTE = 200
@@ -32,7 +34,8 @@ same text in the terminal.
 | `deepaccident render VIEW DATAROOT --out FILE` | Renders a picture of the first accident, or of a row that you name. |
 | `deepaccident render replay DATAROOT --out replay.html` | Writes one accident as a web page that plays it. |
 | `deepaccident labels DATAROOT --split train --out FOLDER` | Writes the motion labels of a split into files. |
-| `deepaccident baseline predict DATAROOT --out FOLDER` | Writes predictions that need no trained model. |
+| `deepaccident predict constant_velocity DATAROOT --out FOLDER` | Writes predictions of a baseline, or of a trained \
+model. |
 | `deepaccident evaluate motion DATAROOT --results R --out DIR` | Evaluates predictions. `motion` can be `accident`, \
 `detection` or `warning`. |
 | `deepaccident evaluate verify DIR --dataroot DATAROOT` | Repeats an evaluation and lists all differences. |
@@ -73,7 +76,7 @@ _SHARED = {parameter.name for parameter in _release.params}
 
 def page() -> str:
     """The page's text."""
-    release = "\n".join(_table(_rows(_options(_release))))
+    release = "\n".join(_tables(_options(_release)))
     commands = "\n".join(_section(*each) for each in _commands(deepaccident, ("deepaccident",)))
     text = _HEAD.replace("{release}", release) + commands
     return text.replace("{minutes}", str(max(1, round(len(text.split()) / WORDS_A_MINUTE))))
@@ -108,13 +111,21 @@ def _alike(group: click.Group) -> dict[str, click.Command]:
     return {name: each for name, each in commands.items() if each and _on_release(each) and name not in _UNLIKE}
 
 
-def _common(group: click.Group) -> list[str]:
-    """The rows that all of these commands have; none if they are few."""
-    alike = [_rows(_options(command)) for command in _alike(group).values()]
+def _common(group: click.Group) -> list[click.Option]:
+    """The options that all of these commands have; none if they are few."""
+    alike = [_options(command) for command in _alike(group).values()]
     if len(alike) < _ALIKE:
         return []
-    release = _rows(_options(_release))
-    return [row for row in alike[0] if row not in release and all(row in rows for rows in alike)]
+    return [each for each in _without(alike[0], _options(_release)) if all(_is_in(each, options) for options in alike)]
+
+
+def _is_in(option: click.Option, options: list[click.Option]) -> bool:
+    """Whether one of some options has the same row."""
+    return _row(option) in map(_row, options)
+
+
+def _without(options: list[click.Option], others: list[click.Option]) -> list[click.Option]:
+    return [each for each in options if not _is_in(each, others)]
 
 
 def _with_release(group: click.Group) -> str:
@@ -135,24 +146,23 @@ def _section(command: click.Command, path: tuple[str, ...], parent: click.Group 
         names = [f"[`{name}`](#{'-'.join((*path, name))})" for name in command.list_commands(context)]
         lines += [f"Commands below it: {', '.join(names)}.", ""]
         if common := _common(command):
-            lines += [f"{_with_release(command)} have these options in common:", "", *_table(common)]
+            lines += [f"{_with_release(command)} have these options in common:", "", *_tables(common)]
     if only_group:
         return "\n".join(lines)
-    rows = _rows(_options(command))
+    options = _options(command)
     if _on_release(command):
-        rows = [row for row in rows if row not in _rows(_options(_release))]
+        options = _without(options, _options(_release))
         also = ""
         if parent is not None and path[-1] not in _UNLIKE and (common := _common(parent)):
-            rows = [row for row in rows if row not in common]
+            options = _without(options, common)
             also = f", those of [{' '.join(path[:-1])}](#{'-'.join(path[:-1])})"
         lines += [
-            f"It has the [options of a release](#options-of-a-release){also}{', and these:' if rows else '.'}",
+            f"It has the [options of a release](#options-of-a-release){also}{', and these:' if options else '.'}",
             "",
         ]
-    lines += _table(rows)
+    lines += _tables(options)
     if command.epilog:
-        lines += [f"    {line}".rstrip() for line in inspect.cleandoc(command.epilog).replace("\b\n", "").splitlines()]
-        lines += [""]
+        lines += [_plain(command.epilog), ""]
     return "\n".join(lines)
 
 
@@ -161,13 +171,17 @@ def _argument(argument: click.Argument) -> str:
     return name if argument.required or name.startswith("[") else f"[{name}]"
 
 
-def _rows(options: list[click.Option]) -> list[str]:
-    """A table row an option."""
-    return [f"| {_name(option)} | {_meaning(option)} |" for option in options]
+def _row(option: click.Option) -> str:
+    return f"| {_name(option)} | {_meaning(option)} |"
 
 
-def _table(rows: list[str]) -> list[str]:
-    return ["| option | what it does |", "|---|---|", *rows, ""] if rows else []
+def _tables(options: list[click.Option]) -> list[str]:
+    """A row an option; the advanced ones in a table of their own."""
+    lines = []
+    for heading, kind in (("option", False), ("advanced option", True)):
+        if rows := [_row(each) for each in options if isinstance(each, Advanced) is kind]:
+            lines += [f"| {heading} | what it does |", "|---|---|", *rows, ""]
+    return lines
 
 
 def _name(option: click.Option) -> str:
@@ -194,7 +208,9 @@ def _meaning(option: click.Option) -> str:
 
 
 def _plain(text: str | None) -> str:
-    return inspect.cleandoc(text or "")
+    """A help text; what click does not wrap is a block."""
+    parts = inspect.cleandoc(text or "").split("\n\n")
+    return "\n\n".join(indent(each[2:], "    ") if each.startswith("\b\n") else each for each in parts)
 
 
 if __name__ == "__main__":

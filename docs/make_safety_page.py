@@ -102,10 +102,11 @@ def one_story(text: str) -> str:
 
 
 def paragraph(begin: str) -> Callable[[str], str]:
-    """A function that takes the lines from the one that begins so to the next empty one."""
+    """A function that takes the lines from the one that begins so, or from the first, to the next empty one."""
 
     def found(text: str) -> str:
-        [first, *rest] = dropwhile(lambda line: not line.startswith(begin), text.splitlines())
+        lines = text.splitlines()
+        first, *rest = [*dropwhile(lambda line: not line.startswith(begin), lines)] or lines
         return "\n".join([first, *takewhile(str.strip, rest)])
 
     return found
@@ -115,11 +116,11 @@ CUTS: dict[str, Callable[[str], str]] = {
     "lead-time": fewer_rows,
     "twins": fewer_rows,
     "describe": one_story,
+    "--statistics": paragraph("least TTC"),
     "info": paragraph("selected"),
-    "stats": paragraph("least TTC"),
     "warning": paragraph("prevented accidents"),
 }
-"""Verb → what the page shows of its output; of others all."""
+"""Verb or option → what the page shows of its output; of others all."""
 
 
 def keep(source: Path, picture: Path) -> None:

@@ -22,8 +22,8 @@ meet: {actors: [ego, other]}
 weather: [SoftRain, HardRain]
 ```
 
-    deepaccident synth --spec mine.yaml --check               # what happens in it; a few seconds, nothing is written
-    deepaccident synth OUT --spec mine.yaml --scenarios 8     # four accidents and their normal twins
+    deepaccident synth --design mine.yaml --check             # what happens in it; a few seconds, nothing is written
+    deepaccident synth OUT --design mine.yaml --scenarios 8   # four accidents and their normal twins
 
 Each pair is another draw from the file. In Python:
 
@@ -86,13 +86,13 @@ Files are read with PyYAML's safe loader, without tags and aliases. Numbers are 
 `--check` prints who hits whom, when, how fast and with which sides, for the first pair that `synth` would make. Its
 exit status is 1 if the file gives no scenario. To see it:
 
-    deepaccident synth OUT --spec mine.yaml --scenarios 2 --sensors none
+    deepaccident synth OUT --design mine.yaml --scenarios 2 --sensors none
     deepaccident render accident OUT --layers boxes --out countdown.png
 
 The picture shows the boxes at four moments, in the agents' cameras and from above. Both commands together take about 20
 seconds on two cores. With camera images it takes about a minute for the last 25 frames of one accident:
 
-    deepaccident synth OUT --spec mine.yaml --scenarios 1 --frames 25
+    deepaccident synth OUT --design mine.yaml --scenarios 1 --frames 25
     deepaccident render accident OUT --out countdown.png
 
 ## Four to begin with
@@ -155,7 +155,7 @@ weather: Cloudy
 
 ![The twelve designs, from above and 0.7 s before the impact](images/designs.jpg)
 
-    deepaccident synth --list-designs
+    deepaccident synth --show-design all
     deepaccident synth --show-design 3 > mine.yaml             # a file to begin with
     deepaccident synth OUT --design 3 --design 9               # only these
 

@@ -28,7 +28,7 @@ It reads the files and needs no index. Each finding says what is wrong, where, h
 
 - **error**: the scenario cannot be indexed, or what it says cannot be true.
 - **warning**: probably wrong. The scenario can be opened.
-- **note**: worth knowing; shown with `--notes`.
+- **note**: worth knowing; shown with `--all`.
 
 Exit status: 0 if there are at most notes and known findings, 1 if there are errors or other warnings, 2 if the release
 cannot be looked at.

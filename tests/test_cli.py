@@ -1,21 +1,25 @@
 """The command line, end to end: the verbs on real folders, their grammar, their errors."""
 
 import json
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from tiny import NAME, TYPE, write_tiny_release
 
 from deepaccident_devkit import DeepAccident, __version__
-from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.cli import deepaccident, verbs
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.splits import official_split
+from deepaccident_devkit.synth import SynthConfig
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -71,19 +75,38 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
     assert "WARNING: left out" in skipped.stderr
 
 
-@pytest.mark.parametrize("verb", ["info", "index", "labels", "split"])
-def test_every_verb_on_a_release_has_the_same_grammar(verb: str) -> None:
-    text = CliRunner().invoke(deepaccident, [verb, "--help"]).output
-    assert "DATAROOT" in text
-    for option in ("--version", "--index-dir", "--workers", "--on-error"):
-        assert option in text
+def commands(group: click.Group, *words: str) -> Iterator[tuple[str, ...]]:
+    """The words of all commands below a group, and of the group itself."""
+    yield words
+    for name in group.list_commands(click.Context(group)):
+        command = group.get_command(click.Context(group), name)
+        assert command is not None
+        yield from commands(command, *words, name) if isinstance(command, click.Group) else [(*words, name)]
 
 
-def test_help_names_the_verbs_and_wrong_usage_is_status_2() -> None:
+OF_FILES = ("--version", "--workers", "--scheduler")
+NOT_OF_ALL = {"validate": OF_FILES, "train": (), "explore": (), "results": ()}
+"""Verb on a release → the options of a release that it has; those that are left out run in one process, say."""
+
+
+@pytest.mark.slow
+def test_all_verbs_have_one_grammar_and_a_help_that_says_everything() -> None:
+    for words in commands(deepaccident):
+        text = CliRunner().invoke(deepaccident, [*words, "--help"]).output
+        options, _, advanced = text.partition("\nAdvanced:\n")
+        assert not re.search(r"^  (-\w, )?--[\w-]+( [A-Z]+)?$(?!\n {4})", text, re.MULTILINE), (
+            "an option without a help"
+        )
+        for name in ("--index-dir", "--scheduler", "--on-error"):
+            assert f"  {name} " not in options
+        if " DATAROOT" in text.splitlines()[0]:
+            for name in NOT_OF_ALL.get(words[-1], (*OF_FILES, "--index-dir", "--on-error")):
+                assert f"  {name} " in (options if name in OF_FILES[:2] else advanced), words
+    assert len({words[0] for words in commands(deepaccident) if words}) == 16
+
+
+def test_wrong_usage_is_status_2() -> None:
     runner = CliRunner()
-    text = runner.invoke(deepaccident, ["--help"]).output
-    for verb in ("demo", "synth", "index", "info", "labels", "split"):
-        assert verb in text
     assert runner.invoke(deepaccident, ["info"]).exit_code == 2
     assert runner.invoke(deepaccident, ["dance"]).exit_code == 2
     assert runner.invoke(deepaccident, ["--version"]).output == f"deepaccident, version {__version__}\n"
@@ -111,13 +134,53 @@ def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> N
     assert json.loads(run("info", own_release, "--json").stdout)["tables"]["annotation"] == before - 1
 
 
-def test_a_verb_does_not_wait_for_what_others_import() -> None:
-    code = (
-        "import sys; from deepaccident_devkit.cli import deepaccident; "
-        "deepaccident(['info', '--help'], standalone_mode=False); "
-        "sys.exit('deepaccident_devkit.evaluation' in sys.modules or 'deepaccident_devkit.render' in sys.modules)"
+def imported(*words: str) -> set[str]:
+    """The devkit's parts that a command imports, and NumPy."""
+    code = f"""if True:
+        import sys
+        from deepaccident_devkit.cli import deepaccident
+        deepaccident({words!r}, standalone_mode=False)
+        print("IMPORTED", *sys.modules)"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    names = done.stdout.rpartition("IMPORTED")[2].split()
+    return {name.removeprefix("deepaccident_devkit.") for name in names if name.startswith("deepaccident_devkit.")} | (
+        {"numpy"} & set(names)
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False).returncode == 0
+
+
+def test_a_verb_does_not_wait_for_what_others_import() -> None:
+    assert imported("info", "--help").isdisjoint({"evaluation", "render", "export", "safety"})
+    assert imported("evaluate", "motion", "--help").isdisjoint({"render", "cli.evaluate_bundles", "export"})
+    assert imported("--help").isdisjoint({"numpy", "cli.options", "deepaccident"})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mcap", "mmdet3d", "nuscenes", "opencood", "parquet", "questions", "webdataset"])
+def test_an_export_imports_its_own_format_alone(name: str) -> None:
+    shared = {"bulk", "keyframes", "poses", "sample_json", "sensor_files", "shards"}
+    own = {name} | ({"nuscenes", "released_infos"} if name == "mmdet3d" else set())
+    found = {each.split(".")[1] for each in imported("export", name, "--help") if each.startswith("export.")}
+    assert found <= shared | own
+    assert name == "mcap" or own <= found
+
+
+def test_an_option_says_what_its_field_says() -> None:
+    @verbs.verb()
+    @verbs.field_option(SynthConfig, "unplanned")
+    @verbs.field_option(SynthConfig, "layout")
+    @verbs.field_option(SynthConfig, "exact")
+    @verbs.field_option(SynthConfig, "view", default="open")
+    def made(**options: object) -> None:
+        click.echo(json.dumps(options))
+
+    assert json.loads(CliRunner().invoke(made, ["--layout", "b"]).output) == {
+        "unplanned": 0.1, "layout": "B", "exact": False, "view": "open",
+    }  # fmt: skip
+    text = " ".join(CliRunner().invoke(made, ["--help"]).output.split())
+    assert (
+        "Share of accidents that differ from the design: with a pedestrian or a third vehicle. [default: 0.1]" in text
+    )
+    assert "Whether calib files are the same at each frame" in text
 
 
 @pytest.mark.slow
@@ -153,7 +216,7 @@ def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     assert read_split_file(tmp_path / "b.txt") == everything
     assert run("split", own_release, "--out", tmp_path / "d.txt", "--seed", 1).returncode == 2
     assert run("split", own_release, "--where", "split=train", "--out", tmp_path / "b").returncode == 2
-    for options in (("--seed", 3), ("--seed", 17), ("--released-skip",)):
+    for options in (("--seed", 3), ("--seed", 17)):
         refused = run("split", own_release, "--where", "split=train", "--out", tmp_path / "c.txt", *options)
         assert (refused.returncode, (tmp_path / "c.txt").exists()) == (2, False)
         assert (
@@ -268,21 +331,16 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
         ),
         (("--agents", ""), "found ''"),
         (("--agents", "ego_vehicle,"), "found ''"),
-        (("--switch", "half_cell_shift"), "--switch: expected NAME=yes or NAME=no, NAME one of own_box_moved_twice,"),
-        (("--switch", "half_cell_shift=maybe"), "found 'half_cell_shift=maybe'"),
-        (("--switch", "warp=exact"), "found 'warp=exact'"),
+        (("--switch", "half_cell_shift"), "--switch: expected NAME=VALUE, found 'half_cell_shift'"),
+        (("--switch", "half_cell_shift=maybe"), "--switch: expected yes or no for one of own_box_moved_twice,"),
+        (("--switch", "warp=exact"), "found warp=exact"),
         (("--preset", "lift-splat"), "'lift-splat' is not one of"),
-        (("--orientation", "north"), "'north' is not one of"),
         (("--seen-by", "nobody"), "'nobody' is not one of"),
         (("--samples", "some"), "'some' is not one of"),
         (("--workers", "0"), "0 is not in the range"),
         (("--split", "tset"), "error: split: expected one of train, val, test, train_mini, val_mini, found 'tset'"),
         (("--split", "mine.txt"), "error: mine.txt: "),
         (("--names", "lss"), "'lss' is not one of 'fiery', 'beverse', 'deepaccident'"),
-        (
-            ("--names", "fiery", "--orientation", "fiery"),
-            "--orientation changes nothing with --names: the code",
-        ),
         (("--out", ""), "error: expected a folder of motion labels, found an empty path; give '.' for the current one"),
         (("--out", "/proc/nowhere"), "cannot be written"),
     ],
@@ -327,8 +385,9 @@ def test_labels_of_what_has_none(tmp_path: Path) -> None:
 
 
 def test_a_verb_that_is_nearly_written_is_named() -> None:
-    result = CliRunner().invoke(deepaccident, ["rendr", "out"])
-    assert result.exit_code == 2
-    assert "No such command 'rendr'. Did you mean 'render'?" in result.output
-    result = CliRunner().invoke(deepaccident, ["xyz"])
-    assert (result.exit_code, "No such command 'xyz'.\n" in result.output) == (2, True)
+    for word, told in {
+        "rendr": "No such command 'rendr'. Did you mean 'render'?",
+        "xyz": "No such command 'xyz'.\n",
+    }.items():
+        result = CliRunner().invoke(deepaccident, [word, "out"])
+        assert (result.exit_code, told in result.output) == (2, True)

@@ -38,7 +38,9 @@ def folder(release: Path) -> Path:
     folder = release.parent
     deepaccident("labels", release, "--split", "train", "--samples", "evaluate", "--out", folder / "labels")
     for agents in ("single", "all"):
-        deepaccident("baseline", "predict", release, "--split", "train", "--agents", agents, "--out", folder / agents)
+        deepaccident(
+            "predict", "constant_velocity", release, "--split", "train", "--agents", agents, "--out", folder / agents
+        )
     return folder
 
 

@@ -1,7 +1,6 @@
 """`deepaccident demo`: what it makes, where it refuses to, and whether its reader can see the crash coming."""
 
 import importlib
-import io
 import re
 import shlex
 from dataclasses import replace
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from report_page import page_of
-from tqdm import tqdm
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -90,43 +88,6 @@ def test_a_folder_of_somebody_else_is_refused(name: str, tmp_path: Path) -> None
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "0.0.1\n")]
     with pytest.raises(ConfigError, match=f"{name}: exists, and was not made"):
         run("demo", str(tmp_path / name))
-
-
-@pytest.mark.slow
-def test_an_interrupted_demo_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demo, "_RELEASE", replace(demo._RELEASE, frames=8, sensors=False))
-    shares: list[float] = []
-
-    def stopped(share: float) -> None:
-        shares.append(share)
-        if len(shares) == 2:
-            raise KeyboardInterrupt
-
-    with tqdm(disable=True) as bar:
-        monkeypatch.setattr(bar, "update", stopped)
-        demo._claim(tmp_path)
-        with pytest.raises(KeyboardInterrupt):
-            demo._make_release(tmp_path, 1, bar)
-    assert sum(shares) == demo._STEPS["recording"]
-    assert not (tmp_path / "release").exists()
-    recorded = times(tmp_path / ".release.unfinished" / "parts")
-    assert recorded
-    with tqdm(disable=True) as bar:
-        demo._claim(tmp_path)
-        demo._make_release(tmp_path, 1, bar)
-    assert len(DeepAccident(dataroot=tmp_path / "release", verbose=False).scenario) == 2
-    assert set(recorded.values()) <= set(times(tmp_path / "release").values())
-
-
-def test_one_bar_names_all_steps_and_ends_full() -> None:
-    shown = io.StringIO()
-    with tqdm(total=sum(demo._STEPS.values()), bar_format=demo._BAR, file=shown, mininterval=0) as bar:
-        for name, seconds in demo._STEPS.items():
-            with demo._step(bar, name):
-                bar.update(seconds / 3)
-    names = re.findall(r"\r(\w+) ", shown.getvalue())
-    assert list(dict.fromkeys(names)) == list(demo._STEPS)
-    assert "replay     100%|" in shown.getvalue()
 
 
 @pytest.mark.slow

@@ -380,20 +380,6 @@ class TestRefused:
             evaluate("accident", tmp_path / "no release", "--results", accidents, "--out", tmp_path)
 
 
-def test_tasks_have_the_grammar_of_all_verbs_on_a_release() -> None:
-    for name in ("motion", "accident", "detection", "warning"):
-        text = evaluate(name, "--help").output
-        for word in ("DATAROOT", "--version", "--index-dir", "--workers", "--on-error", "--results", "--protocol"):
-            assert word in text
-    assert "[clean|field]" in evaluate("warning", "--help").output
-
-
-def test_the_group_names_its_verbs() -> None:
-    text = evaluate("--help").output
-    for name in ("motion", "accident", "detection", "warning", "check", "verify", "compare"):
-        assert f"  {name} " in text
-
-
 def test_an_operating_point_from_another_split(
     da_motion: DeepAccident, accidents: Path, bundle: Path, folder: Path
 ) -> None:

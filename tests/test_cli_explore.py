@@ -55,7 +55,9 @@ def test_the_printed_address_opens_the_pages_until_ctrl_c(da: DeepAccident) -> N
             assert (found.status, "root:" in found.body) == (404, False)
         assert ask(place.port, "/", cookie, host="evil.example").status == 400
         assert ask(place.port, "/", cookie, ("Origin", "http://evil.example")).status == 403
-        other = CliRunner().invoke(deepaccident, ["explore", str(da.dataroot), "--no-open", "--port", str(place.port)])
+        other = CliRunner().invoke(
+            deepaccident, ["explore", str(da.dataroot), "--no-open", "--address", str(place.port)]
+        )
         assert str(place.port) in str(other.exception)
         start = time.monotonic()
         process.send_signal(signal.SIGINT)

@@ -81,7 +81,7 @@ def leftovers(folder: Path) -> list[str]:
 def results(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The accidents that the baseline foresees in `da_motion`."""
     out = tmp_path_factory.mktemp("results")
-    words = ["baseline", "predict", da_motion.dataroot, "--task", "accident", *IN_TRAIN, "--out", out]
+    words = ["predict", "constant_velocity", da_motion.dataroot, "--task", "accident", *IN_TRAIN, "--out", out]
     done = CliRunner().invoke(deepaccident, [*map(str, words), "--workers", "1"], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     return out / "accident.json"
@@ -96,7 +96,7 @@ WORDS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
     "labels": lambda root, out, _: ("labels", root, "--split", "train", "--samples", "all", "--out", out),
     "synth": lambda _, out, __: ("synth", out / "made", "--scenarios", 2, "--frames", 8, "--size", "64x36"),
     "demo": lambda _, out, __: ("demo", out / "demo"),
-    "baseline": lambda root, out, _: ("baseline", "predict", root, *IN_TRAIN, "--out", out),
+    "predict": lambda root, out, _: ("predict", "constant_velocity", root, *IN_TRAIN, "--out", out),
     "evaluate": lambda root, out, results: (
         *("evaluate", "accident", root, *IN_TRAIN, "--results", results, "--protocol", "boxes", "--out", out / "run"),
     ),

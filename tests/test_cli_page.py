@@ -16,10 +16,3 @@ def script() -> ModuleType:
 
 def test_the_page_is_up_to_date(script: ModuleType) -> None:
     assert script.PAGE.read_text(encoding="utf-8") == script.page(), "run: python docs/make_cli_page.py"
-
-
-def test_every_command_and_option_has_a_help_text(script: ModuleType) -> None:
-    lines = script.page().splitlines()
-    assert [line for line in lines if line.startswith("|") and line.endswith("|  |")] == []
-    for command in ("info", "index", "evaluate motion", "evaluate compare", "render bev", "export mcap"):
-        assert sum(line.lstrip("# ") == f"deepaccident {command}" for line in lines) == 1

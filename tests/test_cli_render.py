@@ -263,10 +263,3 @@ def test_pictures_of_all_kinds_have_the_same_bytes_each_time(
         assert contents[0] == contents[1]
     with pytest.raises(ChoiceError, match=r"path: expected a file that ends in \.png"):
         save_picture(ax, tmp_path / "a.bmp")
-
-
-@pytest.mark.parametrize("verb", [*_PICTURES, "video"])
-def test_the_verbs_have_the_grammar_of_all_others(verb: str) -> None:
-    text = run(verb, "--help")
-    for word in ("DATAROOT", "--version", "--index-dir", "--workers", "--on-error", "--out", "--size"):
-        assert word in text

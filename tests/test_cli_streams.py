@@ -91,7 +91,7 @@ WRITING: dict[str, Callable[[Any, Path, Path], tuple[object, ...]]] = {
     "describe": lambda root, _, out: ("safety", "describe", root, "--out", out / "told.jsonl", "--workers", 1),
     "render": lambda root, _, out: ("render", "bev", root, "--frame-range", "1..2", "--out", out),
     "parquet": lambda root, _, out: ("export", "parquet", root, "--out", out, "--workers", 1),
-    "predict": lambda root, _, out: ("baseline", "predict", root, *IN_TRAIN[:4], "--out", out, "--workers", 1),
+    "predict": lambda root, _, out: ("predict", "constant_velocity", root, *IN_TRAIN[:4], "--out", out, "--workers", 1),
 }
 """Verb that writes and prints → its words, for a release, results and a folder."""
 PRINTED_BEFORE = ("render", "parquet", "predict")

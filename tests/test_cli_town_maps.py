@@ -49,17 +49,12 @@ def test_a_file_for_each_town_that_has_a_map(root: Path, tmp_path: Path) -> None
     assert len(json.loads(path.read_text(encoding="utf-8"))["features"]) > 1
 
 
-def test_one_town_as_json_with_cells_of_ones_own(root: Path, tmp_path: Path) -> None:
+def test_one_town_as_json(root: Path, tmp_path: Path) -> None:
     seen, unseen = towns(root)
-    fine, coarse = (
-        json.loads(run(root, "--out", tmp_path, "--town", seen, "--json", *more).stdout)[seen]
-        for more in ((), ("--resolution", 1))
-    )
-    assert fine["path"] == coarse["path"] == str(tmp_path / f"{seen}.geojson")
-    assert (fine["scenarios"], fine["looks"], fine["missing"], fine["damaged"]) == (2, 20, 0, 0)
-    assert fine["drivable_square_metres"] == pytest.approx(coarse["drivable_square_metres"], rel=0.02)
-    assert fine["drivable_square_metres"] != coarse["drivable_square_metres"]
-    failed = run(root, "--out", tmp_path, "--town", unseen)
+    told = json.loads(run(root, "--out", tmp_path, "--where", f"town={seen}", "--json").stdout)[seen]
+    assert told["path"] == str(tmp_path / f"{seen}.geojson")
+    assert (told["scenarios"], told["looks"], told["missing"], told["damaged"]) == (2, 20, 0, 0)
+    failed = run(root, "--out", tmp_path, "--where", f"town={unseen}")
     assert isinstance(failed.exception, NotAvailableError)
 
 

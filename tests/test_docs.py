@@ -77,11 +77,11 @@ NOT_RUN = {
     "predict ": "likewise",
     "evaluate motion training_data": "of what predict makes; likewise",
     "evaluate motion DATAROOT --results results/motion ": "likewise",
-    "baseline predict DATAROOT --split": "docs/make_safety_page.py has them, and tests/test_cli_baseline.py their like",
-    "baseline predict hidden_release": "docs/make_baseline_tables.py has it and the next one",
+    "predict constant_velocity DATAROOT --split": "tests/test_cli_predict.py has their like",
+    "predict constant_velocity hidden_release": "docs/make_baseline_tables.py has it and the next one",
     "evaluate motion hidden_release": "likewise",
     "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
-    "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
+    "results ": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
     "explore ": "tests/browser/test_explore.py has it; it runs until Ctrl-C",
 }
@@ -235,7 +235,7 @@ def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(in_lab
     script = loaded_script("docs/make_safety_page.py")
     (in_labels_demo / script.RELEASE).symlink_to(in_labels_demo / "deepaccident_demo" / "release")
     there = (DOCS / "safety.md").read_text(encoding="utf-8")
-    page = re.sub(r"^    deepaccident (synth|baseline|evaluate) .*$", "", there, flags=re.MULTILINE)
+    page = re.sub(r"^    deepaccident (synth|predict|evaluate) .*$", "", there, flags=re.MULTILINE)
     now = script.with_outputs(page)
     outputs = [re.findall(r"^<!-- output -->\n(.*?)^<!-- end", text, re.MULTILINE | re.DOTALL) for text in (there, now)]
     assert len(outputs[0]) == 8

@@ -27,14 +27,14 @@ from pathlib import Path
 from typing import Any
 
 RELEASES = {
-    "labelled": ["--scenarios", "6", "--frames", "35", "--no-sensors", "--seed", "977"],
-    "sensors": ["--scenarios", "2", "--frames", "11", "--image-size", "32x18", "--seed", "978"],
+    "labelled": ["--scenarios", "6", "--frames", "35", "--sensors", "none", "--seed", "977"],
+    "sensors": ["--scenarios", "2", "--frames", "11", "--size", "32x18", "--seed", "978"],
 }
 """Name → how `synth` makes it: one with pasts and futures, and a small one with all sensors."""
-GENERATED = ["--scenarios", "2", "--frames", "2", "--image-size", "48x27", "--seed", "979", "--layout", "B"]
+GENERATED = ["--scenarios", "2", "--frames", "2", "--size", "48x27", "--seed", "979", "--layout", "B"]
 """How each checkout makes a release of its own, all of whose files are compared."""
 EXPORTS = {
-    "cache": ("sensors", ["cache", "--resize", "16x9", "--where", "length=1..1000"]),
+    "cache": ("sensors", ["cache", "--size", "16x9", "--where", "length=1..1000"]),
     "labels": ("labelled", ["labels", "--samples", "all", "--split"]),
     "labels of beverse": ("labelled", ["labels", "--samples", "evaluate", "--names", "beverse", "--split"]),
     "mcap": ("sensors", ["export", "mcap", "--motion-labels", "deepaccident"]),

@@ -6,23 +6,27 @@ SIGTERM, 141 if the reader of the output went away.
 
 import logging
 import os
+import platform
+import re
 import sys
+from importlib import import_module
+from typing import Final
 
 import click
 
-from deepaccident_devkit.cli.groups import ModuleVerbs
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.cli.interruption import run_interruptibly
 from deepaccident_devkit.cli.streams import lasting_streams
+from deepaccident_devkit.cli.verbs import LazyVerbs
 from deepaccident_devkit.errors import DeepAccidentError, SomeFailedError
 
 _ERROR_STATUS = 2
 _FINDINGS_STATUS = 1
 _OF_DASK = ("distributed", "tornado", "asyncio")
 """Loggers of its parts."""
-
-
-_VERBS = {
-    "baseline": "Predict without a trained model: actors keep their motion.",
+_DEVELOPERS: Final = re.compile(r"extra == .(test|lint|docs)\b")
+"""Requirements for work on the devkit itself."""
+_VERBS: Final = {
     "cache": "Write resized images for training.",
     "demo": "Make a small synthetic release, and a page on it.",
     "evaluate": "Evaluate results files; check and compare evaluations.",
@@ -31,7 +35,7 @@ _VERBS = {
     "index": "Make, update or remove the index of a release.",
     "info": "Print what a release holds, its statistics, its index.",
     "labels": "Write motion labels.",
-    "predict": "Predict with a trained model.",
+    "predict": "Predict with a trained model, or with a baseline.",
     "render": "Render pictures, videos and replays.",
     "results": "Make results files of those of other tools.",
     "safety": "Look into accidents: who saw it first, when it was too late.",
@@ -43,9 +47,9 @@ _VERBS = {
 
 
 @click.group(
-    cls=ModuleVerbs,
-    package=__name__,
+    cls=LazyVerbs,
     verbs=_VERBS,
+    load=lambda name: getattr(import_module(f"{__name__}.{name}"), name),
     invoke_without_command=True,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
@@ -56,12 +60,28 @@ _VERBS = {
 def deepaccident(context: click.Context, version: bool, every: bool) -> None:
     """Tools for the DeepAccident V2X accident dataset."""
     if version:
-        from deepaccident_devkit.cli.versions import version_text  # here: it takes longer to import than all the rest
-
-        click.echo(version_text(every=every))
+        click.echo(_versions() if every else f"deepaccident, version {__version__}")
         context.exit()
     if every:
         raise click.UsageError("--all needs --version")
+
+
+def _versions() -> str:
+    """What a report of a bug needs: the versions of the devkit, Python, the system and each library of any extra."""
+    from importlib.metadata import PackageNotFoundError, requires, version  # here: it takes longer than all the rest
+
+    from deepaccident_devkit.text import columns_text
+
+    def installed(name: str) -> str:
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            return "not installed"
+
+    users = [each for each in requires("deepaccident_devkit") or () if not _DEVELOPERS.search(each)]
+    names = sorted({match.group().lower() for each in users if (match := re.match(r"[\w.-]+", each))})
+    rows = [("deepaccident", __version__), ("Python", platform.python_version()), ("system", platform.platform())]
+    return columns_text([*rows, *((name, installed(name)) for name in names)])
 
 
 def main() -> None:

@@ -1,14 +1,15 @@
 """`deepaccident cache`: resized images for training, in a folder."""
 
 import re
-from typing import Any, get_args
+from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.export_bulk import bulk_parameters, run_export
-from deepaccident_devkit.cli.options import WordChoice, pixel_size
-from deepaccident_devkit.export.image_cache import CachedImages, Codec
-from deepaccident_devkit.export.images import Decoding, ImageConfig
+from deepaccident_devkit.cli.export import bulk_parameters, run_export
+from deepaccident_devkit.cli.options import channels_parameter, pixel_size, words_of
+from deepaccident_devkit.cli.verbs import advanced, field_option, verb
+from deepaccident_devkit.export.image_cache import CachedImages
+from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.taxonomy import CAMERAS
 
 
@@ -25,8 +26,8 @@ def _part(context: click.Context, parameter: click.Parameter, value: str | None)
     return top, left, height, width
 
 
-@click.command(short_help="Write resized images for training.")
-@bulk_parameters
+@verb()
+@bulk_parameters()
 @click.option(
     "--size",
     "resize",
@@ -38,27 +39,15 @@ def _part(context: click.Context, parameter: click.Parameter, value: str | None)
 @click.option(
     "--crop", callback=_part, metavar="LEFT,TOP,WIDTH,HEIGHT", help="Part of the resized image to keep.  [default: all]"
 )
-@click.option("--cameras", multiple=True, metavar="NAME[,NAME…]", help="Only these cameras.  [default: all]")
-@click.option(
-    "--decode",
-    type=WordChoice(get_args(Decoding)),
-    default="full",
-    show_default=True,
-    help="scaled: three times as fast, with slightly other pixels.",
-)
-@click.option(
-    "--codec",
-    type=WordChoice(get_args(Codec)),
-    default="raw",
-    show_default=True,
-    help="raw: the pixels. jpeg: less room, more time to read, and other pixels.",
-)
+@channels_parameter
+@field_option(ImageConfig, "decode", option=advanced)
+@field_option(CachedImages, "codec", option=advanced)
 def cache(
     resize: tuple[int, int],
     crop: tuple[int, int, int, int] | None,
-    cameras: tuple[str, ...],
-    decode: Decoding,
-    codec: Codec,
+    channels: tuple[str, ...],
+    decode: Any,
+    codec: Any,
     **options: Any,
 ) -> None:
     """Write the resized images of scenarios of the release in DATAROOT, for V2XConfig(images_cache=FOLDER).
@@ -66,6 +55,6 @@ def cache(
     Give --split or --where: all images at 704x256 take 0.9 TB as raw pixels. --dry-run says how much yours take. If a
     run is interrupted, the same command continues it.
     """
-    names = tuple(name for text in cameras for name in text.split(","))
-    images = ImageConfig(resize=resize[::-1], crop=crop, cameras=names or CAMERAS, decode=decode)
+    names = tuple(words_of(channels)) or CAMERAS
+    images = ImageConfig(resize=resize[::-1], crop=crop, cameras=names, decode=decode)
     run_export(CachedImages, {"images": images, "codec": codec}, **options)

@@ -16,7 +16,8 @@ from tqdm import tqdm
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.baselines import Baseline, predict_results
-from deepaccident_devkit.cli.options import use_threads_sparingly
+from deepaccident_devkit.cli.options import PATH, use_threads_sparingly, workers_parameter
+from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
@@ -114,9 +115,9 @@ class NextStep:
     command: str
 
 
-@click.command()
-@click.argument("out", type=click.Path(path_type=Path), default="deepaccident_demo")
-@click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
+@verb()
+@click.argument("out", type=PATH, default="deepaccident_demo")
+@workers_parameter
 def demo(out: Path, workers: int | None) -> None:
     """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does with it.
 
@@ -304,7 +305,7 @@ def _next_steps(out: Path) -> tuple[NextStep, ...]:
         NextStep("Check its files, as you would check your download:", f"deepaccident validate {root} --deep"),
         NextStep(
             "Let five agents predict together:",
-            f"deepaccident baseline predict {root} {of_both} --task accident --agents all --out {five}",
+            f"deepaccident predict constant_velocity {root} {of_both} --task accident --agents all --out {five}",
         ),
         NextStep(
             "Evaluate that, and compare it with the report:",
@@ -312,6 +313,6 @@ def _next_steps(out: Path) -> tuple[NextStep, ...]:
         ),
         NextStep(
             "Edit the scenario file of the accident, such as its weather, and see what happens in it:",
-            f"deepaccident synth --spec {scenario} --check",
+            f"deepaccident synth --design {scenario} --check",
         ),
     )

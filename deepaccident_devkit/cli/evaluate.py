@@ -1,7 +1,8 @@
-"""`deepaccident evaluate motion|accident|detection|warning`: the metrics of a results file, on a release."""
+"""`deepaccident evaluate`: the metrics of a results file on a release, and a check of the file."""
 
 import json
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -10,84 +11,112 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.evaluate_bundles import check, compare, verify
-from deepaccident_devkit.cli.evaluate_options import (
-    resamples_parameter,
-    selection_of,
-    selection_parameters,
-    switches_of,
-)
 from deepaccident_devkit.cli.options import (
-    WordChoice,
+    DATAROOT,
+    PATH,
+    agent_names,
+    agents_parameter,
     engine_of,
+    engine_parameters,
+    json_parameter,
+    on_error_parameter,
     refuse_unused,
+    release_of,
     release_parameters,
+    switches_of,
+    version_parameter,
 )
+from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field_option, together, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.breakdowns import ATTRIBUTES, EVERYTHING, attribute_name
+from deepaccident_devkit.evaluation.metrics.intervals import MOST_RESAMPLES
 from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
+    SampleSelection,
     breakdowns_of,
     checked_target,
+    coverage,
+    default_selection,
     evaluate_results,
     evaluation_store,
     read_bundle,
+    results_text,
     save_run,
     summary_text,
     with_prevented,
 )
 from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
+from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.release.fingerprints import digest_of
-from deepaccident_devkit.render.evaluation import save_report
+from deepaccident_devkit.release.store import Dataroot
+from deepaccident_devkit.taxonomy import AGENTS
 
+_FINDINGS_STATUS = 1
 _HELP = {
     "motion": "Evaluate predicted motion: IoU, VPQ and path errors.",
     "accident": "Evaluate predicted accidents: APA, and the errors in who, where and when.",
     "detection": "Evaluate detected boxes: AP and errors.",
     "warning": "Evaluate warnings: how early they come before accidents, and how often an alarm is false.",
 }
-_RELEASE = ("dataroot", "version", "index_dir", "on_error")
+_LINES = {
+    **_HELP,
+    "check": "Check every entry of a results file.",
+    "compare": "Compare two evaluations, and test the differences.",
+    "verify": "Repeat an evaluation and list all differences.",
+}
+_OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
+_selection_parameters = together(
+    click.option(
+        "--split",
+        default="val",
+        show_default=True,
+        help="train, val, test, train_mini, val_mini, or a split file (.txt).",
+    ),
+    click.option(
+        "--samples",
+        type=WordChoice(get_args(SampleList)),
+        help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.  "
+        "[default: evaluate; for warnings: all]",
+    ),
+    click.option(
+        "--scope",
+        type=WordChoice(get_args(ScopeName)),
+        help="Accident scenarios only, or all scenarios.  [default: accident; with --samples all: all]",
+    ),
+    agents_parameter,
+    click.option("--horizon", default=2.0, show_default=True, help="How many seconds the predictions look ahead."),
+)
 
 
-@click.group()
-def evaluate() -> None:
-    """Evaluate results files; check and compare evaluations."""
-
-
-def _warning_options(task: TaskName) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """For the task `warning`: the alarm threshold from the bundle of another split, and what alarms prevent."""
-    if task != "warning":
-        return lambda verb: verb
-    options = (
-        click.option(
-            "--threshold-from",
-            type=click.Path(path_type=Path),
-            help="Folder with an evaluation on another split; it sets the alarm threshold (protocol clean only).",
-        ),
-        click.option(
-            "--threshold-by",
-            type=WordChoice(get_args(Chooser)),
-            default="best_f1",
-            show_default=True,
-            help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm per minute. "
-            "braking: at most one second of braking for false alarms per minute, found by an evaluation with "
-            "--prevented.",
-        ),
-        click.option(
-            "--prevented",
-            is_flag=True,
-            help="Also compute which accidents a braking driver would have avoided after the alarm, and how much "
-            "braking the false alarms cause (protocol clean only).",
-        ),
-    )
-    return lambda verb: options[0](options[1](options[2](verb)))
+_WARNING = together(
+    click.option(
+        "--threshold-from",
+        type=PATH,
+        help="Folder with an evaluation on another split; it sets the alarm threshold (protocol clean only).",
+    ),
+    advanced(
+        "--threshold-by",
+        type=WordChoice(get_args(Chooser)),
+        default="best_f1",
+        show_default=True,
+        help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm per minute. "
+        "braking: at most one second of braking for false alarms per minute, found by an evaluation with "
+        "--prevented.",
+    ),
+    click.option(
+        "--prevented",
+        is_flag=True,
+        help="Also compute which accidents a braking driver would have avoided after the alarm, and how much "
+        "braking the false alarms cause (protocol clean only).",
+    ),
+)
 
 
 def _attributes(context: click.Context, parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -102,14 +131,10 @@ def _task_verb(task: TaskName) -> click.Command:
     """The verb of one task."""
     protocols = list(TASK_PROTOCOLS[task])
 
-    @click.command(
-        task, help=f"{_HELP[task]}\n\nThe predictions are compared with the labels of the release in DATAROOT."
-    )
+    @verb(task, help=f"{_HELP[task]}\n\nThe predictions are compared with the labels of the release in DATAROOT.")
     @release_parameters
-    @click.option(
-        "--results", required=True, type=click.Path(path_type=Path), help="Results file or folder with the predictions."
-    )
-    @selection_parameters
+    @click.option("--results", required=True, type=PATH, help="Results file or folder with the predictions.")
+    @_selection_parameters
     @click.option(
         "--protocol",
         type=WordChoice(protocols),
@@ -117,15 +142,15 @@ def _task_verb(task: TaskName) -> click.Command:
         show_default=True,
         help="Rules of the metrics; docs/protocols.md describes them.",
     )
-    @_warning_options(task)
-    @click.option(
+    @(_WARNING if task == "warning" else together())
+    @advanced(
         "--switch",
         "switches",
         multiple=True,
         metavar="NAME=VALUE",
         help="Change one field of the protocol; you can repeat this option.",
     )
-    @click.option(
+    @advanced(
         "--allow-partial",
         is_flag=True,
         help="Accept results that lack some samples (which marks every number as partial), or leave out predictions of "
@@ -139,25 +164,21 @@ def _task_verb(task: TaskName) -> click.Command:
         help="Also give the numbers for each value of this attribute; you can repeat this option. One of "
         f"{', '.join(ATTRIBUTES)}.",
     )
-    @resamples_parameter
+    @field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
     @click.option(
         "--sanity", is_flag=True, help="Look for classic mistakes: mirrored axes, another frame, swapped classes, …"
     )
-    @click.option(
-        "--out", type=click.Path(path_type=Path), help="Folder to write all numbers, figures and a report into."
-    )
+    @click.option("--out", type=PATH, help="Folder to write all numbers, figures and a report into.")
     @click.option("--overwrite", is_flag=True, help="Replace an evaluation that is already in --out.")
-    @click.option(
-        "--include-results", is_flag=True, help="Copy the results into --out, so that others can verify them."
-    )
-    @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
-    def verb(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
+    @advanced("--include-results", is_flag=True, help="Copy the results into --out, so that others can verify them.")
+    @json_parameter
+    def evaluated(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
         setup = EvaluationSetup(
             task=task, protocol=protocol, switches=switches_of(switches), horizon=options["horizon"]
         )
         _evaluate(setup, results, **options)
 
-    return verb
+    return evaluated
 
 
 def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any) -> None:
@@ -166,8 +187,8 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
     if out is not None:
         checked_target(out, overwrite=options["overwrite"])  # before the release is indexed
     opened = read_results(results)
-    dataset = DeepAccident(**{name: options[name] for name in _RELEASE}, **engine_of(options))
-    selection = selection_of(setup, options)
+    dataset = DeepAccident(**release_of(options), **engine_of(options))
+    selection = _selection_of(setup, options)
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})
@@ -201,6 +222,8 @@ def _written(
     if options["sanity"]:
         run, text = _with_sanity(run, dataset, results, options)
     if options["out"] is not None:
+        from deepaccident_devkit.render.evaluation import save_report
+
         report = partial(save_report, run, dataset=dataset, results=results)
         kept = {name: options[name] for name in ("include_results", "overwrite")}
         save_run(run, options["out"], **kept, extras=[report])
@@ -235,7 +258,62 @@ def _with_sanity(
     return replace(run, sanity=report.as_dict()), f"{mark}{report.to_text()}"
 
 
-for name in get_args(TaskName):
-    evaluate.add_command(_task_verb(name))
-for command in (check, verify, compare):
-    evaluate.add_command(command)
+def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:
+    """The samples that a verb's options name."""
+    agents = agent_names(options["agents"])
+    return default_selection(
+        setup,
+        options["split"],
+        samples=options["samples"],
+        scope=options["scope"],
+        agents=None if agents == AGENTS else agents,
+    )
+
+
+@verb()
+@click.argument("results", type=PATH)
+@click.option("--dataroot", type=DATAROOT, help="Also compare the samples with those of this release.")
+@version_parameter
+@_selection_parameters
+@engine_parameters
+@on_error_parameter
+def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
+    """Check every entry of the results file or folder RESULTS, and print a summary.
+
+    With --dataroot, also repeat the warnings of `evaluate … --sanity`.
+    Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong.
+    """
+    if dataroot is None:
+        refuse_unused("without --dataroot", *_OF_RELEASE)
+    opened, engine = read_results(results), engine_of(options)
+    opened.check(**engine, progress=True)
+    click.echo(results_text(opened))
+    if dataroot is None:
+        return
+    dataset = DeepAccident(version, dataroot, on_error=options["on_error"], **engine)
+    protocol = "boxes" if opened.task == "accident" else "released"  # the one that takes explicit accidents
+    setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
+    selection = _selection_of(setup, options)
+    covered = coverage(dataset, opened.tokens, selection)
+    click.echo(f"{selection.text()}: {covered.to_text()}")
+    shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))
+    warnings = check_sanity(dataset, opened, setup, shared, **engine).warnings_text() if shared else ""
+    if warnings:
+        click.echo(warnings)
+    if not covered.is_complete:
+        sys.exit(_FINDINGS_STATUS)
+
+
+def _verb(name: Any) -> click.Command:
+    if name in _HELP:
+        return _task_verb(name)
+    if name == "check":
+        return check
+    from deepaccident_devkit.cli.evaluate_bundles import compare, verify  # one renders, and so imports matplotlib
+
+    return compare if name == "compare" else verify
+
+
+@click.group(cls=LazyVerbs, verbs=_LINES, load=_verb)
+def evaluate() -> None:
+    """Evaluate results files; check and compare evaluations."""

@@ -1,4 +1,4 @@
-"""`deepaccident evaluate check|verify|compare`: check results; repeat or compare evaluations."""
+"""`deepaccident evaluate verify|compare`: repeat an evaluation, or compare two."""
 
 import json
 import sys
@@ -7,21 +7,19 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.evaluate_options import resamples_parameter, selection_of, selection_parameters
 from deepaccident_devkit.cli.options import (
     DATAROOT,
-    WordChoice,
-    engine_of,
+    PATH,
     engine_parameters,
+    index_dir_parameter,
+    json_parameter,
     on_error_parameter,
-    refuse_unused,
 )
+from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.results import read_results
-from deepaccident_devkit.evaluation.runs import compare_bundles, coverage, read_bundle, results_text, verify_bundle
-from deepaccident_devkit.evaluation.runs.sanity import check_sanity
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.metrics.intervals import MOST_RESAMPLES
+from deepaccident_devkit.evaluation.runs import compare_bundles, read_bundle, verify_bundle
 from deepaccident_devkit.evaluation.runs.verification import check_repeated
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.release import find_release
@@ -29,63 +27,22 @@ from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.render.evaluation import render_comparison
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, save_picture
 from deepaccident_devkit.tables import place_outside
-from deepaccident_devkit.taxonomy import VERSIONS, OnError
+from deepaccident_devkit.taxonomy import OnError
 
 _FINDINGS_STATUS = 1
-_OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
 _KINDS = (".csv", ".json", *PICTURE_SUFFIXES)
 _DPI = 130
 
 
-@click.command()
-@click.argument("results", type=click.Path(path_type=Path))
-@click.option("--dataroot", type=DATAROOT, help="Also compare the samples with those of this release.")
-@click.option("--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
-@selection_parameters
-@engine_parameters
-@on_error_parameter
-def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
-    """Check every entry of the results file or folder RESULTS, and print a summary.
-
-    With --dataroot, also repeat the warnings of `evaluate … --sanity`.
-    Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong.
-    """
-    if dataroot is None:
-        refuse_unused("without --dataroot", *_OF_RELEASE)
-    opened, engine = read_results(results), engine_of(options)
-    opened.check(**engine, progress=True)
-    click.echo(results_text(opened))
-    if dataroot is None:
-        return
-    dataset = DeepAccident(version, dataroot, on_error=options["on_error"], **engine)
-    protocol = "boxes" if opened.task == "accident" else "released"  # the one that takes explicit accidents
-    setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
-    selection = selection_of(setup, options)
-    covered = coverage(dataset, opened.tokens, selection)
-    click.echo(f"{selection.text()}: {covered.to_text()}")
-    shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))
-    warnings = check_sanity(dataset, opened, setup, shared, **engine).warnings_text() if shared else ""
-    if warnings:
-        click.echo(warnings)
-    if not covered.is_complete:
-        sys.exit(_FINDINGS_STATUS)
-
-
-@click.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@verb()
+@click.argument("folder", metavar="DIR", type=PATH)
 @click.option("--dataroot", type=DATAROOT, help="Folder of the release; without it, nothing is done.")
-@click.option(
-    "--results", type=click.Path(path_type=Path), help="Results file or folder.  [default: the copy in DIR, if any]"
-)
+@click.option("--results", type=PATH, help="Results file or folder.  [default: the copy in DIR, if any]")
 @click.option("--split", help="Split file, if the evaluation in DIR is of one.")
-@click.option(
-    "--index-dir",
-    type=click.Path(path_type=Path),
-    help="Folder of the index.  [default: as it is, or else in the user's cache]",
-)
+@index_dir_parameter
 @engine_parameters
 @on_error_parameter
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
+@json_parameter
 def verify(
     folder: Path,
     dataroot: Dataroot | None,
@@ -114,19 +71,19 @@ def verify(
         sys.exit(_FINDINGS_STATUS)
 
 
-@click.command()
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@verb()
+@click.argument("a", type=PATH)
+@click.argument("b", type=PATH)
 @click.option("--common", is_flag=True, help="Compare only the samples that both evaluations have.")
-@resamples_parameter
+@field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
 @click.option(
     "--out",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="File to write all numbers into (.csv or .json), or a figure of the differences "
     f"({', '.join(PICTURE_SUFFIXES)}); you can repeat this option.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
+@json_parameter
 def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...], as_json: bool) -> None:
     """Compare the evaluations in the folders A and B, and test which differences are statistically significant."""
     for path in out:

@@ -1,37 +1,344 @@
-"""`deepaccident export`: the data in other tools' formats."""
+"""`deepaccident export`: the data in other tools' formats. Only the format that is written is imported."""
 
+import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from deepaccident_devkit.cli.export_formats import mmdet3d, nuscenes, opencood, parquet, webdataset
-from deepaccident_devkit.cli.export_questions import questions
-from deepaccident_devkit.cli.export_town_maps import town_maps
 from deepaccident_devkit.cli.options import (
-    WordChoice,
+    PATH,
     agent_names,
     agents_parameter,
+    channels_parameter,
+    cooperating_parameter,
+    engine_of,
     frame_range_parameter,
+    json_parameter,
+    names_or_configuration,
     refuse_unused,
     release_parameters,
+    where_parameter,
+    words_of,
 )
+from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field_option, together, verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.evaluation.results import read_results
-from deepaccident_devkit.export.mcap import McapConfig, export_mcap
+from deepaccident_devkit.errors import ExportError, NotAvailableError
 from deepaccident_devkit.motion import PRESETS
-from deepaccident_devkit.taxonomy import AGENTS, LIDAR
-from deepaccident_devkit.text import spelled
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
+from deepaccident_devkit.text import choice, size_text, spelled
 from deepaccident_devkit.v2x.collisions import default_scenario
 
+if TYPE_CHECKING:
+    from deepaccident_devkit.export.bulk import Tally
 
-@click.group()
-def export() -> None:
-    """Write data in the formats of other tools."""
+_CONTINUED: Final = "If a run is interrupted, the same command continues it."
+_WAYS: Final = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
+_LINES: Final = {
+    "mcap": "Write a scenario as an interactive 3D scene (MCAP).",
+    "mmdet3d": "Write infos for mmdet3d, or for the released code.",
+    "nuscenes": "Write nuScenes tables and their sensor files.",
+    "opencood": "Write OPV2V's folders, for OpenCOOD, V2X-ViT, CoAlign and HEAL.",
+    "parquet": "Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.",
+    "questions": "Write questions on what happens next, for language models.",
+    "town-maps": "Write the roads and sidewalks of each town as GeoJSON.",
+    "webdataset": "Write samples with images, LiDAR and boxes as tar files, for webdataset.",
+}
+_HELP: Final = {
+    "nuscenes": "Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and all that reads nuScenes."
+    "\n\nKeyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, clouds are written: those of a whole release take "
+    "about 210 GB, and 42 GB with --no-sweeps; the nuScenes devkit holds its tables in 6 GB of memory, or 4 GB. "
+    f"--dry-run says how large yours are. {_CONTINUED}",
+    "opencood": "Write scenarios of the release in DATAROOT as OPV2V has them: a folder each, with yaml, json and pcd "
+    f"files.\n\n{_CONTINUED}",
+    "parquet": "Write all tables of the release in DATAROOT as Parquet files by split, with tokens in place of row "
+    f"numbers.\n\n{_CONTINUED}",
+    "webdataset": "Write samples of the release in DATAROOT as tar files: the images, the LiDAR points, and the rest "
+    f"as JSON.\n\n{_CONTINUED}",
+}
+link_parameter = advanced(
+    "--link",
+    type=WordChoice(_WAYS),
+    default="hard",
+    show_default=True,
+    help="How images are put there: hard links, else symbolic ones, else copies.",
+)
 
 
-for verb in (mmdet3d, nuscenes, opencood, parquet, questions, town_maps, webdataset):
-    export.add_command(verb)
+def bulk_parameters(agents: Callable[[Any], Any] = agents_parameter) -> Callable[[Any], Any]:
+    """The arguments of a release, --out, --split, --where, --agents and --dry-run.
+
+    `agents` gives a verb --agents, if it means something of its own.
+    """
+    return together(
+        release_parameters,
+        click.option("--out", required=True, type=PATH, metavar="FOLDER", help="Folder to write into."),
+        click.option("--split", help="Only this split: train, val, test, …, or a split file (.txt).  [default: all]"),
+        where_parameter,
+        agents,
+        click.option("--dry-run", is_flag=True, help="Only say how much would be written."),
+    )
+
+
+def run_export(
+    kind: Callable[..., Any],
+    own: dict[str, Any],
+    *,
+    out: Path,
+    split: str | None,
+    where: tuple[str, ...],
+    agents: tuple[str, ...],
+    link: str = "hard",
+    dry_run: bool,
+    **release: Any,
+) -> None:
+    """Export in a format with its `own` settings; says how much it will be, then what was written and left out."""
+    from deepaccident_devkit.export.bulk import export_release
+
+    form = kind(split=split, where=where, agents=agent_names(agents), link=link, **own)  # before the release is indexed
+    dataset = DeepAccident(**release)
+    left = export_release(dataset, out, form, dry_run=True)
+    if left.written:
+        free = shutil.disk_usage(next(each for each in (left.folder, *left.folder.parents) if each.exists())).free
+        linked = sum(left.tally.linked.values())  # a temporary folder may take other links than this one
+        told = f"{_counts(left.tally, 'to write')}{f', {linked:,} files to link' if linked else ''}"
+        click.echo(f"about {left.tally.samples:,} samples: {told}; {size_text(free)} free")
+        if left.tally.bytes > free:
+            raise ExportError(f"{out}: there is too little room; choose another disk, or fewer scenarios or agents")
+    if dry_run:
+        return
+    done = export_release(dataset, out, form, **engine_of(release), progress=True)
+    tally = done.tally
+    linked_text = "".join(f", {count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
+    click.echo(
+        f"{done.folder}: {_counts(tally, 'written')}{linked_text}; {done.written} written now, {done.kept} were there "
+        "already"
+    )
+    for what, count in sorted(tally.left_out.items()):
+        click.echo(f"left out: {count:,} {what}")
+
+
+def _counts(tally: "Tally", done: str) -> str:
+    return f"{f'{tally.files:,}' if tally.files else 'a few'} files {done} ({size_text(tally.bytes)})"
+
+
+def _of_format(name: str, kind: type[Any], *options: Callable[[Any], Any]) -> click.Command:
+    """The verb of a format, whose own options set fields of the format."""
+
+    @verb(name, short_help=_LINES[name], help=_HELP[name])
+    @bulk_parameters()
+    @together(*options)
+    def export_format(**chosen: Any) -> None:
+        run_export(kind, _own(kind, chosen), **chosen)
+
+    return export_format
+
+
+def _own(kind: type[Any], chosen: dict[str, Any]) -> dict[str, Any]:
+    """Take the fields that a format alone has out of a verb's options."""
+    from deepaccident_devkit.export.bulk import Format
+
+    fields = kind.__dataclass_fields__.keys() - Format.__dataclass_fields__.keys()
+    return {name: chosen.pop(name) for name in fields & chosen.keys()}
+
+
+def _nuscenes_options() -> tuple[Callable[[Any], Any], ...]:
+    from deepaccident_devkit.export.nuscenes import NuScenes
+
+    fields = ("van", "lidar_axes", "sweeps")
+    return link_parameter, *(field_option(NuScenes, field, option=advanced) for field in fields)
+
+
+def _nuscenes() -> click.Command:
+    from deepaccident_devkit.export.nuscenes import NuScenes
+
+    return _of_format("nuscenes", NuScenes, *_nuscenes_options())
+
+
+def _mmdet3d() -> click.Command:
+    from deepaccident_devkit.export.mmdet3d import Mmdet3d
+    from deepaccident_devkit.export.nuscenes import NuScenes
+    from deepaccident_devkit.export.released_infos import ReleasedInfos
+
+    released = [field_option(ReleasedInfos, field, option=advanced) for field in ("root_prefix", "drop_empty")]
+
+    @verb(short_help=_LINES["mmdet3d"])
+    @bulk_parameters()
+    @click.option(
+        "--style",
+        type=WordChoice(("nuscenes", "released")),
+        default="nuscenes",
+        show_default=True,
+        help="nuscenes: for mmdet3d from 1.1 on. released: as the released code's converter makes them.",
+    )
+    @together(*_nuscenes_options(), *released)
+    def mmdet3d(style: str, **chosen: Any) -> None:
+        """Write what mmdet3d's NuScenesDataset reads: infos, and a nuScenes export beside them if there is none yet.
+
+        With --style released, write carla_infos_train.pkl and carla_infos_val.pkl, which the released code's two
+        dataset classes read together with the release itself.
+        """
+        of_released, of_nuscenes = (_own(kind, chosen) for kind in (ReleasedInfos, NuScenes))
+        if style == "released":
+            refuse_unused("with --style released", *of_nuscenes, "link")
+            run_export(ReleasedInfos, of_released, **chosen)
+            return
+        refuse_unused("without --style released", *of_released)
+        for kind in (NuScenes, Mmdet3d):
+            run_export(kind, of_nuscenes, **chosen)
+
+    return mmdet3d
+
+
+def _opencood() -> click.Command:
+    from deepaccident_devkit.export.opencood import OpenCood
+
+    classes = field_option(
+        OpenCood,
+        "classes",
+        type=str,
+        default=",".join(OpenCood.classes),
+        callback=lambda _context, _option, value: tuple(value.split(",")),
+        metavar="NAME[,NAME…]",
+        help=f"Which boxes become vehicles: {', '.join(CATEGORIES)}.",
+    )
+    ego = field_option(OpenCood, "ego", type=WordChoice(VEHICLE_AGENTS))
+    return _of_format(
+        "opencood", OpenCood, link_parameter, classes, ego, field_option(OpenCood, "without_clouds", option=advanced)
+    )
+
+
+def _parquet() -> click.Command:
+    from deepaccident_devkit.export.parquet import Parquet
+
+    return _of_format("parquet", Parquet)
+
+
+def _webdataset() -> click.Command:
+    from deepaccident_devkit.export.webdataset import WebDataset
+
+    size = advanced(
+        "--shard-size",
+        type=click.IntRange(min=1),
+        default=WebDataset.shard_size // 10**6,
+        show_default=True,
+        callback=lambda _context, _option, value: value * 10**6,
+        metavar="MB",
+        help="Size of a tar file, about.",
+    )
+    return _of_format("webdataset", WebDataset, field_option(WebDataset, "frames"), size)
+
+
+def _questions() -> click.Command:
+    from deepaccident_devkit.export.questions import Questions, WindowRules
+
+    observing = together(
+        cooperating_parameter("Agents that observe together with each ego", "single"),
+        click.option(
+            "--ego",
+            multiple=True,
+            metavar="NAME[,NAME…]",
+            help="Agents that ask, each with questions of its own, or all.  [default: ego_vehicle]",
+        ),
+    )
+
+    @verb(short_help=_LINES["questions"])
+    @bulk_parameters(observing)
+    @field_option(WindowRules, "observe")
+    @field_option(WindowRules, "ahead", type=click.IntRange(min=1))
+    @field_option(WindowRules, "stride", option=advanced)
+    @field_option(Questions, "seen")
+    @click.option(
+        "--images",
+        type=WordChoice(("none", "link", "copy")),
+        default="none",
+        show_default=True,
+        help="Whether pictures go with the questions, under neutral names. link: as hard links, else copies.",
+    )
+    @click.option(
+        "--channels",
+        multiple=True,
+        metavar="NAME[,NAME…]",
+        help=f"With --images: whose pictures, or all.  [default: {CAMERAS[0]}]",
+    )
+    @field_option(Questions, "seed", metavar="TEXT")
+    def questions(
+        agents: tuple[str, ...],
+        ego: tuple[str, ...],
+        images: str,
+        channels: tuple[str, ...],
+        **options: Any,
+    ) -> None:
+        """Write questions about the release in DATAROOT: what some agents observed, and whether an accident follows.
+
+        FOLDER/questions holds all that a model may see, FOLDER/truth.jsonl the answers. `deepaccident results` makes a
+        results file of what a model answers. If a run is interrupted, the same command continues it.
+        """
+        if images == "none":
+            refuse_unused("without --images", "channels")
+        own = {
+            "observers": names_or_configuration(agents) or "single",
+            "window": WindowRules(**{name: options.pop(name) for name in ("observe", "ahead", "stride")}),
+            "cameras": () if images == "none" else _camera_names(channels),
+            **{name: options.pop(name) for name in ("seen", "seed")},
+        }
+        run_export(
+            Questions,
+            own,
+            agents=agent_names(ego or ("ego_vehicle",)),
+            link="copy" if images == "copy" else "hard",
+            **options,
+        )
+
+    return questions
+
+
+def _camera_names(given: tuple[str, ...]) -> tuple[str, ...]:
+    names = [choice("--channels", name, (*CAMERAS, "all")) for name in words_of(given)]
+    return CAMERAS if "all" in names else tuple(names) or CAMERAS[:1]
+
+
+@verb("town-maps", short_help=_LINES["town-maps"])
+@release_parameters
+@where_parameter
+@click.option("--out", required=True, type=click.Path(), metavar="FOLDER", help="Folder to write into.")
+@json_parameter
+def _town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -> None:
+    """Write a file FOLDER/TOWN.geojson for each town of the release in DATAROOT.
+
+    The maps are made from what the BEV cameras of all recordings saw. Coordinates are metres of the simulator's world,
+    right-handed: no longitude and latitude.
+    """
+    from deepaccident_devkit.files import writable_folder
+    from deepaccident_devkit.maps import town_map, towns_of
+
+    folder, dataset = writable_folder(out), DeepAccident(**release)
+    chosen = dataset.find(*where) if where else None
+    if chosen == []:
+        raise click.UsageError("no scenario matches --where, so there is no map; change it or omit it")
+    written: dict[str, dict[str, Any]] = {}
+    for town in towns_of(dataset, chosen):
+        try:
+            made = town_map(dataset, town, scenarios=chosen, progress=True, **engine_of(release))
+        except NotAvailableError as error:
+            click.echo(f"left out: {error}", err=True)
+            continue
+        path = made.to_geojson(folder / f"{made.town}.geojson")
+        counts = {name: getattr(made, name) for name in ("scenarios", "looks", "missing", "damaged")}
+        area = round(float(made.drivable().sum()) * made.resolution**2, 1)
+        written[made.town] = {"path": str(path), **counts, "drivable_square_metres": area}
+    if not written:
+        raise NotAvailableError("no town has a map: there is no readable file of a BEV camera")
+    click.echo(json.dumps(written, indent=2) if as_json else "\n".join(map(_town_line, written.values())))
+
+
+def _town_line(told: dict[str, Any]) -> str:
+    return (
+        f"{told['path']}: {told['drivable_square_metres']:,.0f} m² of road, from {told['looks']:,} pictures of "
+        f"{told['scenarios']:,} scenarios ({told['missing']:,} missing, {told['damaged']:,} damaged)"
+    )
 
 
 def _points(context: click.Context, parameter: click.Parameter, value: str) -> str | int:
@@ -42,23 +349,12 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
     return value if value == "all" else int(value)
 
 
-@export.command(short_help="Write a scenario as an interactive 3D scene (MCAP).")
+@verb("mcap", short_help=_LINES["mcap"])
 @release_parameters
 @click.argument("scenario", required=False)
-@click.option(
-    "--out",
-    required=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="File to write, such as accident.mcap.",
-)
+@click.option("--out", required=True, type=PATH, metavar="FILE", help="File to write, such as accident.mcap.")
 @agents_parameter
-@click.option(
-    "--channels",
-    multiple=True,
-    metavar="NAME[,NAME…]",
-    help="Sensors, such as Camera_Front or lidar01.  [default: all]",
-)
+@channels_parameter
 @frame_range_parameter
 @click.option(
     "--points",
@@ -68,15 +364,9 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
     show_default=True,
     help="all, or N for every N-th point of a cloud.",
 )
-@click.option("--labels/--no-labels", default=True, show_default=True, help="Whether to write the boxes.")
 @click.option("--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels by this preset.")
-@click.option(
-    "--results",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Also write the predictions of this results file.",
-)
-def mcap(
+@click.option("--results", type=PATH, metavar="FILE", help="Also write the predictions of this results file.")
+def _mcap(
     scenario: str | None,
     out: Path,
     agents: tuple[str, ...],
@@ -89,10 +379,13 @@ def mcap(
     SCENARIO is a token, such as type1_subtype1_accident/Town03_type001_subtype0001_scenario00024. Without SCENARIO the
     command takes the first scenario with a collision, or if there is none, the first scenario.
     """
+    from deepaccident_devkit.evaluation.results import read_results
+    from deepaccident_devkit.export.mcap import McapConfig, export_mcap
+
     names = agent_names(agents)
-    choices = {name: options.pop(name) for name in ("frames", "points", "labels", "motion_labels")}
+    choices = {name: options.pop(name) for name in ("frames", "points", "motion_labels")}
     choices["agents"] = None if names == AGENTS else names
-    choices["channels"] = [name for text in channels for name in text.split(",")] if channels else None
+    choices["channels"] = words_of(channels) if channels else None
     config = McapConfig.of(**choices)  # before the release is indexed
     if LIDAR not in (config.channels or ()):
         refuse_unused(f"without the channel {LIDAR}", "points")
@@ -101,3 +394,21 @@ def mcap(
     token = scenario or default_scenario(dataset)
     made = export_mcap(dataset, token, out, prediction=prediction, progress=True, **choices)
     click.echo(f"{made}: {token}, {made.stat().st_size / 1e6:.1f} MB; open it in Foxglove, or with: rerun {made}")
+
+
+_VERBS: Final[dict[str, Callable[[], click.Command]]] = {
+    "mcap": lambda: _mcap,
+    "mmdet3d": _mmdet3d,
+    "nuscenes": _nuscenes,
+    "opencood": _opencood,
+    "parquet": _parquet,
+    "questions": _questions,
+    "town-maps": lambda: _town_maps,
+    "webdataset": _webdataset,
+}
+"""Name → what makes the verb."""
+
+
+@click.group(cls=LazyVerbs, verbs=_LINES, load=lambda name: _VERBS[name]())
+def export() -> None:
+    """Write data in the formats of other tools."""

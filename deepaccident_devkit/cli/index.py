@@ -5,13 +5,14 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli.options import engine_of, refuse_unused, release_parameters
+from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.tables import Tables, clear_index, open_index
 from deepaccident_devkit.taxonomy import OnError
 
 
-@click.command()
+@verb()
 @release_parameters
 @click.option(
     "--check", is_flag=True, help="Compare the content of each label, calib and meta file and of the tables, not times."

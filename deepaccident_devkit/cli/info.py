@@ -7,6 +7,7 @@ import click
 
 from deepaccident_devkit.cli.options import (
     engine_of,
+    json_parameter,
     refuse_unused,
     release_parameters,
     say_report,
@@ -14,6 +15,7 @@ from deepaccident_devkit.cli.options import (
     where_parameter,
     write_report,
 )
+from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.selection.fields import fields_text
@@ -27,7 +29,7 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
         context.exit()
 
 
-@click.command()
+@verb()
 @release_parameters
 @where_parameter
 @click.option(
@@ -53,7 +55,7 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     help="Print instead where the indexes of all versions are, what they hold, and whether they are up to date. "
     "Nothing is changed.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
+@json_parameter
 def info(
     where: tuple[str, ...],
     statistics: bool,

@@ -6,16 +6,15 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.options import (
-    WordChoice,
     agent_names,
     agents_parameter,
     engine_of,
-    refuse_unused,
     release_parameters,
+    switches_of,
 )
+from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.label_folder import Manifest, folder_path
@@ -23,10 +22,10 @@ from deepaccident_devkit.motion.protocols import slip_names
 from deepaccident_devkit.motion.sample_lists import Purpose
 from deepaccident_devkit.v2x import AGENT_SETS
 
-_CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "only_vehicle")
+_CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
 
 
-@click.command()
+@verb()
 @release_parameters
 @click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (.txt).")
 @click.option(
@@ -52,18 +51,15 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
     help="Grid, orientation and protocol of the labels.",
 )
 @click.option("--protocol", type=WordChoice(LABEL_PROTOCOLS), help="Rules of the labels.  [default: of the preset]")
-@click.option(
+@advanced(
     "--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Switch one quirk of the protocol on or off."
-)
-@click.option(
-    "--orientation", type=WordChoice(ORIENTATIONS), help="Order of rows and columns.  [default: of the preset]"
 )
 @click.option(
     "--seen-by",
     type=WordChoice(AGENT_SETS),
     help="Only actors that these agents see.  [default: all actors]",
 )
-@click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians.")
+@field_option(MotionLabelConfig, "only_vehicle")
 @click.option(
     "--names",
     type=WordChoice(get_args(BatchNames)),
@@ -78,8 +74,6 @@ def labels(
 
     There is one file per scenario and agent. If a run is interrupted, the same command continues it.
     """
-    if names is not None:
-        refuse_unused("with --names: the code has its own orientation", "orientation")
     config = _config(options)
     chosen = agent_names(agents)
     Manifest.of(folder_path(out), config, names)  # before the release is indexed
@@ -101,20 +95,17 @@ def labels(
 
 def _config(options: dict[str, Any]) -> MotionLabelConfig:
     """Take the options that say what labels show out of the verb's."""
-    preset, protocol, switches, orientation, seen_by, only_vehicle = (options.pop(name) for name in _CONFIG_OPTIONS)
-    named = {"protocol": protocol, "orientation": orientation, "agents": seen_by, "only_vehicle": only_vehicle or None}
+    preset, protocol, switches, seen_by, only_vehicle = (options.pop(name) for name in _CONFIG_OPTIONS)
+    named = {"protocol": protocol, "agents": seen_by, "only_vehicle": only_vehicle or None}
     changes: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
     config = MotionLabelConfig.preset(preset, **changes)
     return replace(config, protocol=_switched(config.rules, switches)) if switches else config
 
 
-def _switched(rules: LabelProtocol, switches: tuple[str, ...]) -> LabelProtocol:
-    changes: dict[str, Any] = {}
-    for text in switches:
-        name, _, value = text.partition("=")
-        value = value.lower()
-        if name not in slip_names() or value not in ("yes", "no"):
+def _switched(rules: LabelProtocol, texts: tuple[str, ...]) -> LabelProtocol:
+    switches = switches_of(texts)
+    for name, value in switches.items():
+        if name not in slip_names() or not isinstance(value, bool):
             names = ", ".join(slip_names())
-            raise click.BadParameter(f"--switch: expected NAME=yes or NAME=no, NAME one of {names}; found {text!r}")
-        changes[name] = value == "yes"
-    return replace(rules, **changes)
+            raise click.BadParameter(f"--switch: expected yes or no for one of {names}; found {name}={value}")
+    return replace(rules, **switches)

@@ -1,42 +1,25 @@
-"""The arguments that every verb on a release takes, the same for all verbs."""
+"""The parameters that several verbs take, the same for all of them, and how they are read."""
 
 import functools
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, cast
 
 import click
 from click.core import ParameterSource
 
+from deepaccident_devkit.cli.verbs import Function, WordChoice, advanced, field_option, together
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.parallel import cluster_executor
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
-from deepaccident_devkit.text import choice, meant_text
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE, Link
 
 _ALL = ("all", AVAILABLE)
-Verb = TypeVar("Verb", bound=Callable[..., Any])
-if TYPE_CHECKING:
-    _Choice = click.Choice[str]
-else:
-    _Choice = click.Choice  # click 8.1 has no `Choice[str]`
-
-
-class WordChoice(_Choice):
-    """One of some words in any case of letters; the error of another one names the word that was probably meant."""
-
-    def __init__(self, words: Iterable[str]) -> None:
-        """Take the words."""
-        super().__init__(tuple(words), case_sensitive=False)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The word in its own spelling."""
-        try:
-            return super().convert(value, param, ctx)
-        except click.BadParameter as error:
-            self.fail(f"{error.message.removesuffix('.')}{meant_text(value, self.choices)}", param, ctx)
+_WORDS = {"yes": "true", "no": "false"}
 
 
 class DatarootParameter(click.Path):
@@ -51,95 +34,102 @@ class DatarootParameter(click.Path):
 
 DATAROOT = DatarootParameter(path_type=Path)
 """The type of what names a release."""
-on_error_parameter = click.option(
+PATH = click.Path(path_type=Path)
+dataroot_argument = click.argument("dataroot", type=DATAROOT)
+_SCHEDULER = advanced(
+    "--scheduler",
+    metavar="ADDRESS|FILE.json",
+    help="Run on this dask scheduler, or on that which wrote its address into a file; or mpi: on all ranks "
+    "(docs/clusters.md).",
+)
+version_parameter = click.option(
+    "--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release."
+)
+workers_parameter = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
+index_dir_parameter = advanced("--index-dir", type=PATH, help="Folder of the index.")
+on_error_parameter = advanced(
     "--on-error",
     type=WordChoice(["raise", "skip"]),
     default="raise",
     show_default=True,
     help="raise: list broken scenarios and stop. skip: leave them out.",
 )
-
-
-def _tell_unused(_context: click.Context, parameter: click.Parameter, value: str | None) -> None:
-    if value is not None:
-        click.echo(f"{parameter.opts[0]} changes nothing here: the command reads the files, not the index", err=True)
-
-
-_DATAROOT = click.argument("dataroot", type=DATAROOT)
-_VERSION = click.option(
-    "--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release."
+reader_parameters = together(
+    dataroot_argument, version_parameter, workers_parameter, index_dir_parameter, on_error_parameter
 )
-_WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
-_ENGINE = (
-    _WORKERS,
-    click.option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Run on this dask scheduler; or mpi: on all ranks (docs/clusters.md).",
-    ),
-    click.option(
-        "--scheduler-file",
-        type=click.Path(path_type=Path),
-        help="File that a dask scheduler wrote its address into, in place of --scheduler.",
-    ),
+"""For a verb that runs in one process: DATAROOT, --version, --index-dir, --workers and --on-error."""
+where_parameter = click.option(
+    "--where",
+    multiple=True,
+    metavar="FILTER",
+    help="Only scenarios that match, such as town=Town03,Town05, weather!=Clear, length=40..60 or collision=true. "
+    "If you repeat this option, all filters must match.",
 )
-_INDEX_DIR = click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index.")
-_UNUSED = tuple(
-    click.option(name, hidden=True, expose_value=False, callback=_tell_unused) for name in ("--index-dir", "--on-error")
+agents_parameter = click.option(
+    "--agents",
+    multiple=True,
+    metavar="NAME[,NAME…]",
+    help="Only samples of these agents; it does not choose who cooperates.  [default: all]",
 )
-
-
-LINK_OPTIONS = ("latency", "pose_noise", "packet_loss", "seed")
-"""Their names as parameters of a verb."""
-_LINK = (
-    click.option(
-        "--latency", default=0.0, show_default=True, help="Delay of the partners' data, in seconds, in steps of 0.1."
-    ),
-    click.option(
-        "--pose-noise",
-        default=0.0,
-        show_default=True,
-        help="Mean position error of the partners' poses, in metres.",
-    ),
-    click.option(
-        "--packet-loss", default=0.0, show_default=True, help="Probability that a partner's data do not arrive."
-    ),
-    click.option("--seed", default=0, show_default=True, help="Seed of all that is drawn."),
+channels_parameter = click.option(
+    "--channels",
+    multiple=True,
+    metavar="NAME[,NAME…]",
+    help="Only these sensors, such as Camera_Front or lidar01.  [default: all]",
 )
+model_parameters = together(
+    click.option(
+        "--device", default="auto", show_default=True, help="cpu, cuda, …; auto takes a GPU where there is one."
+    ),
+    click.option("--images-cache", type=PATH, help="Folder of `deepaccident cache` with the images."),
+)
+json_parameter = click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 
 
-def release_parameters(verb: Verb) -> Verb:
-    """Give a verb DATAROOT, --version, --index-dir, --on-error and what `engine_parameters` gives."""
-    return _DATAROOT(_VERSION(_INDEX_DIR(engine_parameters(on_error_parameter(verb)))))
+def engine_parameters(run_verb: Function) -> Function:
+    """Give a verb `workers`, and as `executor` that of --scheduler, which is open while the verb runs."""
 
-
-def reader_parameters(verb: Verb) -> Verb:
-    """Give a verb that runs in one process DATAROOT, --version, --index-dir, --workers and --on-error."""
-    return _DATAROOT(_VERSION(_INDEX_DIR(_WORKERS(on_error_parameter(verb)))))
-
-
-def engine_parameters(verb: Verb) -> Verb:
-    """Give a verb `workers`, and as `executor` that of --scheduler or --scheduler-file, which is open while it runs."""
-
-    @functools.wraps(verb)
-    def run(*arguments: Any, scheduler: str | None, scheduler_file: Path | None, **options: Any) -> Any:
-        if scheduler is not None and scheduler_file is not None:
-            raise click.UsageError("--scheduler and --scheduler-file name the same; give one of them")
-        if scheduler or scheduler_file:
+    @functools.wraps(run_verb)
+    def run(*arguments: Any, scheduler: str | None, **options: Any) -> Any:
+        if scheduler is not None:
             refuse_unused("with a scheduler, which has workers of its own", "workers")
-        with cluster_executor(scheduler, scheduler_file) as executor:
+        file = Path(scheduler) if scheduler is not None and scheduler.endswith(".json") else None
+        with cluster_executor(None if file else scheduler, file) as executor:
             if executor is not None:  # workers have working folders of their own
                 options = {name: each.absolute() if isinstance(each, Path) else each for name, each in options.items()}
-            return verb(*arguments, executor=executor, **options)
+            return run_verb(*arguments, executor=executor, **options)
 
-    for option in reversed(_ENGINE):
-        run = option(run)
-    return cast("Verb", run)
+    return cast("Function", workers_parameter(_SCHEDULER(run)))
+
+
+release_options = together(version_parameter, engine_parameters, index_dir_parameter, on_error_parameter)
+"""--version, --index-dir, --on-error and what `engine_parameters` gives."""
+release_parameters = together(dataroot_argument, release_options)
+"""For a verb on a release: DATAROOT and its options."""
 
 
 def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
     """Of a verb's options, those that say what it runs on."""
     return {name: options[name] for name in ("workers", "executor")}
+
+
+def release_of(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a verb's options, those that say which release is opened, and how."""
+    return {name: options[name] for name in ("dataroot", "version", "index_dir", "on_error")}
+
+
+def switches_of(texts: Sequence[str]) -> dict[str, Any]:
+    """The names and values of repeated --switch NAME=VALUE; a value that is neither yes, no nor JSON stays a text."""
+    switches: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise click.BadParameter(f"--switch: expected NAME=VALUE, found {text!r}")
+        try:
+            switches[name] = parsed_json(_WORDS.get(value.lower(), value).encode())
+        except ValueError:
+            switches[name] = value
+    return switches
 
 
 def write_report(report: Any, folder: Path | None, name: str) -> list[Path]:
@@ -158,49 +148,21 @@ def say_report(report: Any, written: Sequence[Path], folder: Path | None, *, as_
         click.echo(f"written: {len(written)} files in {folder}", err=as_json)
 
 
-def files_parameters(verb: Verb) -> Verb:
-    """Give a verb that reads files and not the index DATAROOT, --version and what `engine_parameters` gives.
-
-    It takes the other options of a release too, as all verbs do, but does not offer them.
-    """
-    for parameter in _UNUSED:
-        verb = parameter(verb)
-    return _DATAROOT(_VERSION(engine_parameters(verb)))
+def words_of(given: Sequence[str]) -> list[str]:
+    """The words of the texts of a repeated option, each text one word or several with commas."""
+    return [word for text in given for word in text.split(",")]
 
 
-def where_parameter(verb: Verb) -> Verb:
-    """Give a verb `where`, the texts of repeated --where (`deepaccident_devkit.selection` says what they may be)."""
-    option = click.option(
-        "--where",
-        multiple=True,
-        metavar="FILTER",
-        help="Only scenarios that match, such as town=Town03,Town05, weather!=Clear, length=40..60 or collision=true. "
-        "If you repeat this option, all filters must match.",
-    )
-    return option(verb)
-
-
-def agents_parameter(verb: Verb) -> Verb:
-    """Give a verb `agents`, the texts of repeated --agents (`agent_names` reads them)."""
-    option = click.option(
-        "--agents",
-        multiple=True,
-        metavar="NAME[,NAME…]",
-        help="Only samples of these agents; it does not choose who cooperates.  [default: all]",
-    )
-    return option(verb)
-
-
-def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
-    """The agents of repeated --agents, each text one name or several with commas; no text means all.
+def agent_names(given: Sequence[str]) -> tuple[str, ...]:
+    """The agents of repeated --agents; no text means all.
 
     `all` and `available` do too: this only chooses among the samples that are there.
     """
-    names = [choice("--agents", name, (*AGENTS, *_ALL)) for text in given for name in text.split(",")]
+    names = [choice("--agents", name, (*AGENTS, *_ALL)) for name in words_of(given)]
     return AGENTS if not names or set(names) & set(_ALL) else tuple(names)
 
 
-def cooperating_parameter(whose: str, default: str) -> Callable[[Verb], Verb]:
+def cooperating_parameter(whose: str, default: str) -> Callable[[Function], Function]:
     """An option --agents for agents that cooperate (`names_or_configuration` reads it)."""
     return click.option(
         "--agents",
@@ -210,19 +172,24 @@ def cooperating_parameter(whose: str, default: str) -> Callable[[Verb], Verb]:
     )
 
 
-def model_parameters(verb: Verb) -> Verb:
-    """Give a verb that runs the model `device` and `images_cache`."""
-    options = (
-        click.option(
-            "--device", default="auto", show_default=True, help="cpu, cuda, …; auto takes a GPU where there is one."
-        ),
-        click.option(
-            "--images-cache", type=click.Path(path_type=Path), help="Folder of `deepaccident cache` with the images."
-        ),
+def names_or_configuration(given: Sequence[str]) -> str | list[str] | None:
+    """Repeated --agents for agents that cooperate: one configuration, names, or None if it was not given."""
+    names = words_of(given)
+    if len(names) != 1:
+        return names or None
+    alone = choice("--agents", names[0], (*AGENT_SETS, *AGENTS))
+    return names if alone in AGENTS else alone
+
+
+def link_parameters(latency: float = 0.0, pose_noise: float = 0.0) -> Callable[[Function], Function]:
+    """Options for what happens to partners' data, with these defaults."""
+    return together(
+        field_option(Link, "latency", default=latency),
+        field_option(Link, "pose_noise", default=pose_noise, type=float),
     )
-    for option in reversed(options):
-        verb = option(verb)
-    return verb
+
+
+seed_parameter = click.option("--seed", default=0, show_default=True, help="Seed of all that is drawn.")
 
 
 def use_threads_sparingly() -> None:
@@ -233,41 +200,18 @@ def use_threads_sparingly() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
-def link_parameters(verb: Verb) -> Verb:
-    """Give a verb `latency`, `pose_noise`, `packet_loss` and `seed` (`link_of` reads them)."""
-    for option in reversed(_LINK):
-        verb = option(verb)
-    return verb
-
-
-def link_of(options: dict[str, Any]) -> Link | None:
-    """Take the link's options out of a verb's; None if nothing happens to the partners' data."""
-    latency, noise, loss, seed = (options.pop(name) for name in LINK_OPTIONS)
-    if not (latency or noise or loss):
-        return None
-    return Link(latency=latency, pose_noise=noise or None, packet_loss=loss, seed=seed)
-
-
-def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
-    """Repeated --agents for agents that cooperate: one configuration, names, or None if it was not given."""
-    names = [name for text in given for name in text.split(",")]
-    if len(names) != 1:
-        return names or None
-    alone = choice("--agents", names[0], (*AGENT_SETS, *AGENTS))
-    return names if alone in AGENTS else alone
-
-
 def was_given(parameter: str) -> bool:
     """Whether the call of the verb that runs has this option, be it with its default."""
     return click.get_current_context().get_parameter_source(parameter) is not ParameterSource.DEFAULT
 
 
 def refuse_unused(why: str, *parameters: str) -> None:
-    """End with a usage error if one of these options of the verb that runs was given, because it changes nothing."""
+    """End with a usage error if one of these parameters of the verb that runs was given, because it changes nothing."""
     context = click.get_current_context()
     for option in context.command.params:
         if option.name in parameters and was_given(option.name):
-            raise click.UsageError(f"{option.opts[0]} changes nothing {why}; leave it out", context)
+            name = option.opts[0] if isinstance(option, click.Option) else option.human_readable_name
+            raise click.UsageError(f"{name} changes nothing {why}; leave it out", context)
 
 
 def pixel_size(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -280,18 +224,6 @@ def pixel_size(context: click.Context, parameter: click.Parameter, value: str | 
     return int(match[1]), int(match[2])
 
 
-def frame_range_parameter(verb: Verb) -> Verb:
-    """Give a verb `frames`, the numbers that --frame-range stands for, or None."""
-    option = click.option(
-        "--frame-range",
-        "frames",
-        callback=_frame_range,
-        metavar="FIRST..LAST",
-        help="Only these frames of a scenario, counted from 1.",
-    )
-    return option(verb)
-
-
 def _frame_range(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
     """Parse `FIRST..LAST`, or one number; None stays."""
     if value is None:
@@ -300,3 +232,13 @@ def _frame_range(context: click.Context, parameter: click.Parameter, value: str 
     if match is None or int(match[1]) > int(match[2] or match[1]):
         raise click.BadParameter(f"expected frame numbers such as 20..40, found {value!r}", context, parameter)
     return range(int(match[1]), int(match[2] or match[1]) + 1)
+
+
+frame_range_parameter = click.option(
+    "--frame-range",
+    "frames",
+    callback=_frame_range,
+    metavar="FIRST..LAST",
+    help="Only these frames of a scenario, counted from 1.",
+)
+"""An option for `frames`, the numbers that it stands for, or None."""

@@ -1,73 +1,161 @@
-"""`deepaccident predict`: results files of a trained model."""
+"""`deepaccident predict`: results files of a trained model, or of a baseline that needs none."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.evaluate_options import purpose_parameter, scope_parameter
+from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, predict_results
+from deepaccident_devkit.baselines.predict_results import is_predicted
 from deepaccident_devkit.cli.options import (
-    LINK_OPTIONS,
+    PATH,
     cooperating_parameter,
-    link_of,
+    engine_of,
     link_parameters,
     model_parameters,
     names_or_configuration,
-    reader_parameters,
     refuse_unused,
+    release_of,
+    release_parameters,
+    seed_parameter,
     use_threads_sparingly,
 )
+from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
+from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
+from deepaccident_devkit.files import writable_folder
+from deepaccident_devkit.motion.sample_lists import no_samples_text
+from deepaccident_devkit.text import choice
+from deepaccident_devkit.v2x import Link
 
-_ALL = "all"
+_ALONE = "single"
+_LINK = ("latency", "pose_noise", "packet_loss", "seed")
+"""Their names as parameters of a verb."""
+_RELEASED_HORIZON = Baseline().horizon
 _EXAMPLES = """\b
 Examples:
+  deepaccident predict constant_velocity DATAROOT --agents all --out baseline
   deepaccident predict runs/all DATAROOT --split val --out results
   deepaccident predict runs/all DATAROOT --agents single --out results_single
   deepaccident evaluate motion DATAROOT --results results/motion --switch labels=clean"""
 
 
-@click.command(epilog=_EXAMPLES)
-@click.argument("run", type=click.Path(path_type=Path))
-@reader_parameters
+@verb(epilog=_EXAMPLES)
+@click.argument("model")
+@release_parameters
 @click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
-@cooperating_parameter("Agents that cooperate with each ego", _ALL)
-@link_parameters
-@purpose_parameter
-@scope_parameter
+@cooperating_parameter("Agents that cooperate with each ego", "all; of a baseline: single")
+@click.option(
+    "--task",
+    "tasks",
+    multiple=True,
+    type=WordChoice([*get_args(ResultsTask), "all"]),
+    default=("all",),
+    show_default=True,
+    help="Of a baseline: task to write results for; you can repeat this option.",
+)
+@click.option(
+    "--horizon",
+    default=_RELEASED_HORIZON,
+    show_default=True,
+    help="Of a baseline: how many seconds to predict, in steps of 0.5.",
+)
+@link_parameters()
+@field_option(Link, "packet_loss")
+@seed_parameter
+@click.option(
+    "--samples",
+    "purpose",
+    type=WordChoice(["evaluate", "all"]),
+    default="evaluate",
+    show_default=True,
+    help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
+)
+@click.option(
+    "--scope",
+    type=WordChoice(["accident", "all"]),
+    default="accident",
+    show_default=True,
+    help="Accident scenarios only, or all scenarios.",
+)
 @model_parameters
-@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="DIR", help="Folder to write into.")
-def predict(run: Path, split: str, purpose: Any, scope: Scope, out: Path, **options: Any) -> None:
-    """Predict a split of the release in DATAROOT with the model that was trained in RUN.
+@click.option("--out", required=True, type=PATH, metavar="DIR", help="Folder to write into.")
+def predict(model: str, purpose: Any, **options: Any) -> None:
+    """Predict a split of the release in DATAROOT.
 
-    RUN is a run's folder, a file of weights, or `tiny` for those that the devkit ships. It writes motion/,
-    accident.json and detection.json, which `deepaccident evaluate` takes.
+    MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` for those that the devkit ships.
+    Or a baseline, which needs no training: `constant_velocity` or `constant_turn_rate` say how actors go on that some
+    agents see. The files motion/, accident.json and detection.json are what `deepaccident evaluate` takes.
     """
+    if not Path(model).exists():  # before PyTorch is asked for
+        model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, "tiny"))
+    if purpose == "all":
+        refuse_unused("with --samples all, which are those of all scenarios", "scope")
+    seed, link = options["seed"], _link_of(options)
+    agents = names_or_configuration(options.pop("agents"))
+    predicted = _by_baseline if model in MOTION_MODELS else _by_network
+    predicted(model, purpose, agents=agents, link=link, seed=seed, **options)
+
+
+def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, out: Path, **options: Any) -> None:
+    refuse_unused("with a baseline", "device", "images_cache")
+    agents = agents or _ALONE
+    if agents == _ALONE:
+        refuse_unused("with --agents single, which has no partners", *_LINK)
+    if link is None or not (link.pose_noise or link.packet_loss):
+        refuse_unused("without --pose-noise or --packet-loss", "seed")
+    chosen = Baseline(agents=agents, model=model, link=link, horizon=options["horizon"])
+    folder = writable_folder(out)
+    released = chosen.horizon == _RELEASED_HORIZON and options["scope"] == "accident"
+    engine = engine_of(options)
+    dataset = DeepAccident(**release_of(options), **engine)
+    tokens = _samples(dataset, purpose, "released" if released else "paper", chosen.horizon, options)
+    for task in get_args(ResultsTask):
+        if task in options["tasks"] or "all" in options["tasks"]:
+            path = folder / RESULTS_NAMES[task]
+            kept = is_predicted(dataset, task, tokens, path, chosen)
+            predict_results(dataset, task, tokens, path, chosen, **engine, progress=True)
+            click.echo(f"{task}: {len(tokens):,} samples in {path}{', which were there already' if kept else ''}")
+
+
+def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, seed: int, **options: Any) -> None:
+    refuse_unused("with a trained model, which predicts all tasks as far as it was trained", "tasks", "horizon")
+    refuse_unused("with a trained model, which runs on this machine", "scheduler")
+    if agents == _ALONE:
+        refuse_unused("with --agents single, which has no partners", *(name for name in _LINK if name != "seed"))
     use_threads_sparingly()
     from deepaccident_devkit.model import PredictConfig, checked_device, load_model, predict_results
 
-    seed, link = options["seed"], link_of(options)
-    agents = names_or_configuration(options["agents"]) or _ALL
-    if agents == "single":
-        refuse_unused("with --agents single, which has no partners", *(name for name in LINK_OPTIONS if name != "seed"))
-    if purpose == "all":
-        refuse_unused("with --samples all, which are those of all scenarios", "scope")
     device = checked_device(options["device"])
-    model = load_model(run).to(device)
-    dataset = DeepAccident(**{name: options[name] for name in ("dataroot", "version", "index_dir", "on_error")})
-    horizon = model.config.horizon
-    tokens = dataset.samples(split, purpose, "paper", horizon=horizon, scope=scope)
-    if not tokens:
-        raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
+    network = load_model(Path(model)).to(device)
+    dataset = DeepAccident(**release_of(options))
+    tokens = _samples(dataset, purpose, "paper", network.config.horizon, options)
     config = PredictConfig(
-        agents=agents,
+        agents=agents or "all",
         link=link,
         seed=seed,
         device=device,
         workers=options["workers"] or 0,
         images_cache=options["images_cache"],
     )
-    for task, path in predict_results(model, dataset, tokens, out, config, progress=True).items():
+    for task, path in predict_results(network, dataset, tokens, options["out"], config, progress=True).items():
         click.echo(f"{task}: {len(tokens):,} samples in {path}")
+
+
+def _samples(dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, options: dict[str, Any]) -> list[str]:
+    """The samples to predict; raises NotAvailableError if there are none."""
+    split, scope = options["split"], options["scope"]
+    tokens = dataset.samples(split, purpose, rules, horizon=horizon, scope=scope)
+    if not tokens:
+        raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
+    return tokens
+
+
+def _link_of(options: dict[str, Any]) -> Link | None:
+    """Take the link's options out of the verb's; None if nothing happens to the partners' data."""
+    chosen = {name: options.pop(name) for name in _LINK}
+    noise = chosen.pop("pose_noise") or None  # noise with a mean of 0 m would still have a spread
+    if not (chosen["latency"] or noise or chosen["packet_loss"]):
+        return None
+    return Link(pose_noise=noise, **chosen)

@@ -1,7 +1,7 @@
 """`deepaccident render`: pictures and videos of a release, one verb for each view."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +10,19 @@ from typing import Any, cast, get_args
 import click
 
 from deepaccident_devkit.cli.options import (
-    WordChoice,
+    PATH,
     cooperating_parameter,
     frame_range_parameter,
+    link_parameters,
     names_or_configuration,
     pixel_size,
     refuse_unused,
     release_parameters,
+    seed_parameter,
+    words_of,
 )
 from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
+from deepaccident_devkit.cli.verbs import Verb, WordChoice, advanced, together, verb
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
@@ -78,11 +82,6 @@ def _visibility(dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES
     return render_visibility_matrix(dataset, token, **choices)
 
 
-def _words(given: Sequence[str]) -> list[str] | None:
-    """The words of repeated texts, split at commas; None if there are no texts."""
-    return [word for text in given for word in text.split(",")] or None
-
-
 def _seconds(context: click.Context, parameter: click.Parameter, value: str) -> list[float]:
     try:
         return [float(word) for word in value.split(",")]
@@ -90,22 +89,9 @@ def _seconds(context: click.Context, parameter: click.Parameter, value: str) -> 
         raise click.BadParameter(f"expected seconds such as 2,1,0, found {value!r}", context, parameter) from None
 
 
-def _link_options(latency: float, pose_noise: float) -> tuple[Any, ...]:
-    return (
-        click.option("--latency", default=latency, show_default=True, help="Delay of the partners' data, in seconds."),
-        click.option(
-            "--pose-noise",
-            default=pose_noise,
-            show_default=True,
-            help="Mean position error of the partners' poses, in metres.",
-        ),
-        click.option("--seed", default=0, show_default=True, help="Seed of the noise."),
-    )
-
-
 _AGENTS = cooperating_parameter("Agents to show", "chosen by the view")
 _VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres to show on each side.")
-_COORDINATES = click.option(
+_COORDINATES = advanced(
     "--frame", type=WordChoice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
 )
 _LAYERS = click.option(
@@ -196,10 +182,9 @@ _PICTURES = {
             _AGENTS,
             _VIEW_RANGE,
             _COORDINATES,
-            click.option(
-                "--sweeps", type=click.IntRange(min=1), help="Number of frames of LiDAR points.  [default: 1]"
-            ),
-            *_link_options(0.0, 0.0),
+            advanced("--sweeps", type=click.IntRange(min=1), help="Number of frames of LiDAR points.  [default: 1]"),
+            link_parameters(),
+            seed_parameter,
             _LAYERS,
         ),
         help="Render one moment from above: boxes, LiDAR points and other layers, of one or several agents.",
@@ -241,7 +226,7 @@ _PICTURES = {
         draw=_evaluated,
         of="sample",
         options=(
-            click.option("--results", type=click.Path(path_type=Path), required=True, help="Results file of a model."),
+            click.option("--results", type=PATH, required=True, help="Results file of a model."),
             click.option(
                 "--task", type=WordChoice(["motion", "accident"]), help="Verdict on motion, or on the accident in it."
             ),
@@ -256,7 +241,7 @@ _PICTURES = {
     "link": _Picture(
         draw=_linked(render_link),
         of="sample",
-        options=(_AGENTS, _VIEW_RANGE, *_link_options(0.2, 0.3), _LAYERS),
+        options=(_AGENTS, _VIEW_RANGE, link_parameters(0.2, 0.3), seed_parameter, _LAYERS),
         help="Render how latency and pose noise change the data that partners share with the sample's agent.",
     ),
     "calibration": _Picture(
@@ -281,12 +266,12 @@ def _verb(name: str, picture: _Picture) -> click.Command:
     own = f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}]; " if picture.styles else ""
     text += f" Without TOKEN the command renders {picture.default}."
 
-    @click.command(name, help=text, short_help=picture.help)
+    @verb(name, help=text, short_help=picture.help)
     @release_parameters
     @click.argument("tokens", nargs=-1, metavar="[TOKEN…]")
-    @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE|FOLDER", help=_OUT)
+    @click.option("--out", type=PATH, required=True, metavar="FILE|FOLDER", help=_OUT)
     @click.option("--size", callback=pixel_size, metavar="WxH", help="Size in pixels.  [default: chosen by the view]")
-    @click.option(
+    @advanced(
         "--dpi",
         type=click.FloatRange(min=1),
         help="Pixels per inch; the text grows with it.  [default: 100; paper: 300; slide: 240]",
@@ -299,7 +284,8 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         help=f"{own}paper: as wide as a column, without token; slide: 16 to 9, with large text.",
     )
     @frame_range_parameter
-    def verb(
+    @together(*picture.options)
+    def render_view(
         tokens: tuple[str, ...],
         out: Path,
         size: tuple[int, int] | None,
@@ -314,7 +300,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
             refuse_unused("without --agents: it is about the data of partners", "latency", "pose_noise", "seed")
         if not options.get("pose_noise"):
             refuse_unused("without --pose-noise", "seed")
-        options["layers"] = _words(options.pop("layers", ()))
+        options["layers"] = words_of(options.pop("layers", ())) or None
         choices = {option: value for option, value in options.items() if value is not None}
         if not tokens and "results" in choices:
             tokens = read_results(choices["results"]).tokens[:1]
@@ -331,21 +317,19 @@ def _verb(name: str, picture: _Picture) -> click.Command:
                     _logger.warning("%s: %s", path, "; ".join(words))
                 click.echo(f"rendered: {row} in {path}")
 
-    for option in picture.options:  # on a command they come last, on a function they would come first
-        verb = option(verb)
-    return verb
+    return render_view
 
 
 for _name, _picture in _PICTURES.items():
     render.add_command(_verb(_name, _picture))
 
 
-@render.command(short_help="Write a scenario as a video of one or several views.")
+@render.command(cls=Verb, short_help="Write a scenario as a video of one or several views.")
 @release_parameters
 @click.argument("scenario", required=False)
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     required=True,
     metavar="FILE",
     help=f"File to write ({', '.join(SUFFIXES)}).",
@@ -383,9 +367,9 @@ def video(
         dataset,
         scenario or default_scenario(dataset),
         out,
-        what=_words(what) or "frame",
+        what=words_of(what) or "frame",
         agents=names_or_configuration(agents),
-        layers=cast(list[Layer] | None, _words(layers)),
+        layers=cast(list[Layer] | None, words_of(layers) or None),
         workers=release["workers"],
         executor=release["executor"],
         **options,
@@ -393,7 +377,7 @@ def video(
     click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB")
 
 
-@render.command(short_help="Write a scenario as one HTML file that plays.")
+@render.command(cls=Verb, short_help="Write a scenario as one HTML file that plays.")
 @release_parameters
 @click.argument("scenario", required=False)
 @click.option("--out", required=True, type=click.Path(), metavar="FILE", help="File to write, such as replay.html.")

@@ -5,35 +5,54 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import release_parameters
-from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.evaluation.results import ResultsWriter
-from deepaccident_devkit.export.nuscenes.detections import results_from_nuscenes
-from deepaccident_devkit.export.questions import results_of_answers
+from deepaccident_devkit.cli.options import DATAROOT, PATH, refuse_unused, release_options
+from deepaccident_devkit.cli.verbs import verb
+
+_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
-@click.group()
-def results() -> None:
-    """Make results files of what models of other frameworks predict."""
+@verb()
+@click.argument("file", type=_FILE)
+@click.argument("dataroot", type=DATAROOT, required=False)
+@click.option("--truth", type=_FILE, metavar="FILE", help="truth.jsonl of the export of the questions.")
+@release_options
+@click.option(
+    "--threshold",
+    type=click.FloatRange(0, 1),
+    default=0.5,
+    show_default=True,
+    help="With --truth: probability from which a second is an alarm; 0 keeps all alarms, for curves.",
+)
+@click.option("--method", metavar="TEXT", help="With --truth: name of the model, which the file and reports show.")
+@click.option("--out", required=True, type=PATH, metavar="FILE", help="Results file to write.")
+def results(file: Path, truth: Path | None, out: Path, threshold: float, method: str | None, **release: Any) -> None:
+    """Make a results file of what a model of another framework predicts.
 
+    With DATAROOT, FILE has detections of a nuScenes export of that release: the JSON of a detector, as the nuScenes
+    devkit reads it. Boxes of classes that DeepAccident does not have are left out. `deepaccident evaluate detection
+    --samples all` evaluates what this writes.
 
-@results.group("from")
-def from_() -> None:
-    """Convert predictions of other tools."""
-
-
-@from_.command()
-@click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
-@release_parameters
-@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="FILE", help="Results file to write.")
-def nuscenes(file: Path, out: Path, **options: Any) -> None:
-    """Convert detections of a nuScenes export of the release in DATAROOT.
-
-    FILE is the JSON of a detector, as the nuScenes devkit reads it. Boxes of classes that DeepAccident does not have
-    are left out. `deepaccident evaluate detection --samples all` evaluates what this writes.
+    With --truth, FILE has answers to the questions of `deepaccident export questions`, one a line, as README.md beside
+    the questions says. A question without an answer raises no alarm. `deepaccident evaluate accident` and
+    `deepaccident evaluate warning` take what this writes.
     """
+    if (truth is None) == (release["dataroot"] is None):
+        raise click.UsageError("give DATAROOT for detections of a nuScenes export, or --truth for answers to questions")
+    if truth is None:
+        refuse_unused("without --truth", "threshold", "method")
+        _of_detections(file, out, release)
+    else:
+        refuse_unused("with --truth", "version", "index_dir", "on_error", "workers", "scheduler")
+        _of_answers(file, truth, out, threshold, {} if method is None else {"method": method})
+
+
+def _of_detections(file: Path, out: Path, release: dict[str, Any]) -> None:
+    from deepaccident_devkit.deepaccident import DeepAccident
+    from deepaccident_devkit.evaluation.results import ResultsWriter
+    from deepaccident_devkit.export.nuscenes.detections import results_from_nuscenes
+
     ResultsWriter(out, "detection")  # refuses a path that is taken, before the release is indexed
-    found = results_from_nuscenes(DeepAccident(**options), file)
+    found = results_from_nuscenes(DeepAccident(**release), file)
     with ResultsWriter(out, "detection", meta=found.meta) as writer:
         for token, boxes in found.boxes.items():
             writer.add(token, boxes)
@@ -42,31 +61,9 @@ def nuscenes(file: Path, out: Path, **options: Any) -> None:
         click.echo(f"left out: {count:,} boxes of the class {name}, which DeepAccident does not have")
 
 
-@from_.command()
-@click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
-@click.option(
-    "--truth",
-    required=True,
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
-    help="truth.jsonl of the export of the questions.",
-)
-@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="FILE", help="Results file to write.")
-@click.option(
-    "--threshold",
-    type=click.FloatRange(0, 1),
-    default=0.5,
-    show_default=True,
-    help="Probability from which a second is an alarm; 0 keeps all alarms, for curves.",
-)
-@click.option("--method", metavar="TEXT", help="Name of the model, which the results file and reports show.")
-def questions(file: Path, truth: Path, out: Path, threshold: float, method: str | None) -> None:
-    """Convert answers to the questions of `deepaccident export questions`.
+def _of_answers(file: Path, truth: Path, out: Path, threshold: float, meta: dict[str, str]) -> None:
+    from deepaccident_devkit.export.questions import results_of_answers
 
-    FILE holds an answer a line, as README.md beside the questions says. A question without an answer raises no alarm.
-    `deepaccident evaluate accident` and `deepaccident evaluate warning` take what this writes.
-    """
-    meta = {} if method is None else {"method": method}
     read = results_of_answers(file, truth, out, threshold=threshold, meta=meta)
     click.echo(f"{out}: {read.alarms:,} alarms in {read.answered:,} answers")
     if read.missing:

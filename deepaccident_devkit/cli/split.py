@@ -5,27 +5,26 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import refuse_unused, release_parameters, where_parameter
+from deepaccident_devkit.cli.options import PATH, json_parameter, refuse_unused, release_parameters, where_parameter
+from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.splits import OFFICIAL_SEED, official_split, save_selection, split_report
 
 
-@click.command()
+@verb()
 @release_parameters
 @click.option("--seed", default=OFFICIAL_SEED, show_default=True, help="Seed of the official procedure.")
-@click.option("--released-skip", is_flag=True, help="Skip the normal twins that a quirk of the released code skips.")
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Folder to write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into; or a file that ends in "
     ".txt: a split file of the scenarios that match --where, or of all.",
 )
 @where_parameter
 @click.option("--overwrite", is_flag=True, help="Replace files that already exist.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
+@json_parameter
 def split(
     seed: int,
-    released_skip: bool,
     out: Path | None,
     where: tuple[str, ...],
     overwrite: bool,
@@ -40,7 +39,7 @@ def split(
     if where and out and not save:
         raise click.UsageError(f"--where chooses scenarios for a split file; give --out FILE.txt, found {out}")
     if where or save:
-        refuse_unused("with --where or a split file: it is for the official split", "seed", "released_skip")
+        refuse_unused("with --where or a split file: it is for the official split", "seed")
     if not out:
         refuse_unused("without --out", "overwrite")
     dataset = DeepAccident(**release)
@@ -49,7 +48,7 @@ def split(
         written = [save_selection(chosen, save, overwrite=overwrite)] if save else []
         report = split_report(dataset, {"selection": chosen})
     else:
-        made = official_split(dataset, seed, released_skip=released_skip)
+        made = official_split(dataset, seed)
         written = made.save(out, overwrite=overwrite) if out else []
         report = split_report(dataset, made)
     click.echo(report.to_json() if as_json else report.to_text())

@@ -2,28 +2,22 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import (
-    WordChoice,
-    engine_parameters,
-    pixel_size,
-    refuse_unused,
-)
+from deepaccident_devkit.cli.options import PATH, engine_of, engine_parameters, pixel_size, refuse_unused
+from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE, Sensors
+from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
 from deepaccident_devkit.synth.scenario import checked_text
 from deepaccident_devkit.synth.sensors.caster import has_embree
-from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text, read_spec
-from deepaccident_devkit.taxonomy import Layout
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, designs_text, read_spec
 
-_DEFAULTS = SynthConfig()
 _OF_FILES = (
-    *("scenarios", "image_size", "layout", "sensors", "unlabelled_test", "exact", "for_released_code"),
-    *("unplanned", "workers", "scheduler", "scheduler_file"),
+    *("scenarios", "image_size", "layout", "sensors", "unlabelled_test", "for_released_code"),
+    *("unplanned", "workers", "scheduler"),
 )
 """Options of what is written."""
 _FAULTY = 1
@@ -31,34 +25,43 @@ _FAULTY = 1
 _EXAMPLES = """\b
 Examples:
   deepaccident synth OUT --scenarios 24 --sensors none     only labels, all twelve designs
-  deepaccident synth --show-design 3 > mine.yaml         print a scenario file to edit
-  deepaccident synth --spec mine.yaml --check            say what happens in your file, and write nothing
-  deepaccident synth OUT --spec mine.yaml                make accidents from your file
-  deepaccident synth OUT --for-released-code             for the released DeepAccident code"""
+  deepaccident synth --show-design 3 > mine.yaml           print a scenario file to edit
+  deepaccident synth --design mine.yaml --check            say what happens in your file, and write nothing
+  deepaccident synth OUT --design mine.yaml                make accidents from your file
+  deepaccident synth OUT --for-released-code               for the released DeepAccident code"""
 
 
-def _list_designs(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
-    if wanted:
-        click.echo(designs_text())
+def _show_design(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    if value is not None:
+        whole = value.strip().lower() == "all"
+        text = f"{designs_text()}\n" if whole else design_text(_number(context, parameter, value))
+        click.echo(text, nl=False)
         context.exit()
 
 
-def _show_design(context: click.Context, _parameter: click.Parameter, number: int | None) -> None:
-    if number is not None:
-        click.echo(design_text(number), nl=False)
-        context.exit()
+def _number(context: click.Context, parameter: click.Parameter, text: str) -> int:
+    kind: Any = click.IntRange(DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1])
+    return int(kind.convert(text, parameter, context))
 
 
-@click.command(epilog=_EXAMPLES)
-@click.argument("out", required=False, type=click.Path(path_type=Path))
-@click.option(
-    "--scenarios",
-    default=_DEFAULTS.scenarios,
-    show_default=True,
-    help="Number of scenarios: accidents and their normal twins in turn.",
-)
-@click.option(
-    "--frames", type=int, help="Record only the last N frames of each scenario (10 Hz).  [default: all, 40 to 100]"
+def _designs(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> dict[str, Any]:
+    """The fields `designs` and `spec` of what was given: numbers of designs, or one scenario file."""
+    files = [text for text in given if not text.isdecimal()]
+    if len(files) > 1 or (files and len(given) > 1):
+        raise click.BadParameter("give one scenario file, or numbers of designs", context, parameter)
+    numbers = () if files else tuple(_number(context, parameter, text) for text in given)
+    return {"designs": numbers, "spec": Path(files[0]) if files else None}
+
+
+@verb(epilog=_EXAMPLES)
+@click.argument("out", required=False, type=PATH)
+@field_option(SynthConfig, "scenarios")
+@field_option(
+    SynthConfig,
+    "frames",
+    default=None,
+    show_default=False,
+    help="Record only the last N frames of each scenario (10 Hz).  [default: all, 40 to 100]",
 )
 @click.option(
     "--size",
@@ -69,92 +72,52 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     "this size: with another size it computes wrong camera geometry.  [default: {}x{}; {}x{} with "
     "--for-released-code]".format(*IMAGE_SIZE, *RELEASED_IMAGE_SIZE),
 )
-@click.option(
-    "--layout",
-    type=WordChoice(get_args(Layout)),
-    default=_DEFAULTS.layout,
-    show_default=True,
-    help="A: all splits in one folder. B: one folder per split.",
-)
-@click.option("--seed", default=_DEFAULTS.seed, show_default=True, help="The same seed gives the same bytes.")
-@click.option(
-    "--sensors",
-    type=WordChoice(get_args(Sensors)),
-    default=_DEFAULTS.sensors,
-    show_default=True,
-    help="What to write besides labels, calib and meta. all: images, point clouds, BEV arrays. cameras: images alone. "
-    "none: nothing.",
-)
-@click.option("--unlabelled-test", is_flag=True, help="Write no labels for the test split, as in the real release.")
-@click.option(
-    "--exact", is_flag=True, help="Leave out the small errors of calib and point counts that the real release has."
-)
-@click.option(
-    "--for-released-code",
-    is_flag=True,
-    help="A release that the released DeepAccident code reads correctly: images of 1600x900, layout A, a labelled test "
-    "split, and the split files under split_txt_files/ too.",
-)
+@field_option(SynthConfig, "layout")
+@field_option(SynthConfig, "seed")
+@field_option(SynthConfig, "sensors")
+@field_option(SynthConfig, "view")
+@field_option(SynthConfig, "unlabelled_test", option=advanced)
+@field_option(SynthConfig, "for_released_code")
 @click.option(
     "--design",
     "designs",
-    type=click.IntRange(DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1]),
     multiple=True,
-    help="Only accidents of this design; you can repeat this option.  [default: all twelve in turn]",
-)
-@click.option(
-    "--spec",
-    type=click.Path(path_type=Path),
-    help="Your own scenario file, in place of the designs; docs/scenarios.md describes its fields.",
+    callback=_designs,
+    metavar="N|FILE",
+    help="Only accidents of this design; you can repeat this option. Or a scenario file of your own; docs/scenarios.md "
+    "describes its fields.  [default: all twelve in turn]",
 )
 @click.option(
     "--check",
     is_flag=True,
-    help="Draw one accident and its normal twin from the file of --spec, print who hits whom, and write nothing; "
+    help="Draw one accident and its normal twin from the file of --design, print who hits whom, and write nothing; "
     "without OUT. Exit status 1 if the file gives no scenario.",
 )
-@click.option(
-    "--unplanned",
-    default=_DEFAULTS.unplanned,
-    show_default=True,
-    help="Share of accidents (0 to 1) that follow no design, such as one with a pedestrian or a third vehicle.",
-)
-@click.option(
-    "--view",
-    type=WordChoice(get_args(View)),
-    help="hidden: a house at the corner hides the two vehicles that will collide from each other.",
-)
+@field_option(SynthConfig, "unplanned", option=advanced)
 @engine_parameters
 @click.option(
-    "--list-designs",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_list_designs,
-    help="List the twelve designs and stop.",
-)
-@click.option(
     "--show-design",
-    type=click.IntRange(DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1]),
+    metavar="N|all",
     is_eager=True,
     expose_value=False,
     callback=_show_design,
-    help="Print the scenario file of a design, as a start for your own, and stop.",
+    help="Print the scenario file of a design, as a start for your own, or with all a list of them, and stop.",
 )
 @click.pass_context
-def synth(context: click.Context, /, out: Path | None, *, check: bool, **options: Any) -> None:
+def synth(context: click.Context, /, out: Path | None, *, check: bool, designs: dict[str, Any], **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
     If a run is interrupted, the same command continues it.
     """
-    how = {name: options.pop(name) for name in ("workers", "executor")}
+    how = engine_of(options)
+    options = {name: each for name, each in options.items() if name not in how} | designs
     if check:
         _check(context, out, options)
         return
     if out is None:
         raise click.UsageError("Missing argument 'OUT': the folder to make.", context)
     if options["spec"] is not None or options["view"] == "hidden":
-        refuse_unused("with --spec or --view hidden, which ask for one certain accident", "unplanned")
+        refuse_unused("with a scenario file or --view hidden, which ask for one certain accident", "unplanned")
     config = SynthConfig(**options)
     if config.sensors == "none" and not has_embree():
         click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
@@ -171,7 +134,7 @@ def synth(context: click.Context, /, out: Path | None, *, check: bool, **options
 def _check(context: click.Context, out: Path | None, options: Mapping[str, Any]) -> None:
     """Print what a scenario file gives; exit status 1 with the error if it gives nothing."""
     if options["spec"] is None:
-        raise click.UsageError("--check needs the scenario file: --spec FILE.", context)
+        raise click.UsageError("--check needs a scenario file: --design FILE.", context)
     if out is not None:
         raise click.UsageError(f"--check writes nothing; leave {out} out.", context)
     refuse_unused("with --check, which draws one pair and writes nothing", *_OF_FILES)

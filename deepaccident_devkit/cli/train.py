@@ -6,18 +6,20 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.options import (
-    WordChoice,
+    PATH,
     cooperating_parameter,
     model_parameters,
     names_or_configuration,
     reader_parameters,
+    release_of,
     use_threads_sparingly,
 )
+from deepaccident_devkit.cli.verbs import WordChoice, advanced, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.taxonomy import ModelFusion, ModelPreset
 
 _CHOICE = ("preset", "fusion", "horizon")
-_TRAINING = ("steps", "moments", "egos", "accumulate", "split", "validation", "samples", "seed", "bf16")
+_TRAINING = ("steps", "moments", "egos", "split", "validation", "samples", "seed", "bf16")
 _EXAMPLES = """\b
 Examples:
   deepaccident train DATAROOT --preset tiny --agents all --out runs/all
@@ -25,7 +27,7 @@ Examples:
   torchrun --nproc-per-node 4 -m deepaccident_devkit.cli train DATAROOT --preset released --bf16 --out runs/big"""
 
 
-@click.command(epilog=_EXAMPLES)
+@verb(epilog=_EXAMPLES)
 @reader_parameters
 @click.option(
     "--preset",
@@ -51,27 +53,24 @@ Examples:
     help="train: one a second, as released. all: two a second. every: ten a second.",
 )
 @click.option("--steps", type=click.IntRange(min=1), default=1500, show_default=True, help="Steps of the optimizer.")
-@click.option(
+@advanced(
     "--moments", type=click.IntRange(min=1), default=1, show_default=True, help="Moments a step, each with all agents."
 )
-@click.option("--accumulate", type=click.IntRange(min=1), default=1, show_default=True, help="Batches a step.")
-@click.option("--egos", type=click.IntRange(min=1), help="Agents of a moment that are the ego in turn.  [default: all]")
-@click.option("--learning-rate", type=float, default=2e-3, show_default=True, help="The highest learning rate.")
+@advanced("--egos", type=click.IntRange(min=1), help="Agents of a moment that are the ego in turn.  [default: all]")
+@advanced("--learning-rate", type=float, default=2e-3, show_default=True, help="The highest learning rate.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is drawn.")
 @click.option(
     "--from",
     "weights",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Run or file of weights to begin from, or `tiny`; or a checkpoint of the release, BEVerse, Swin or ResNet.",
 )
-@click.option(
+@advanced(
     "--freeze", multiple=True, metavar="NAME", help="Do not train parameters whose names begin so; you can repeat this."
 )
 @model_parameters
-@click.option("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), metavar="RUN", help="Folder of weights, log and curves."
-)
+@advanced("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
+@click.option("--out", required=True, type=PATH, metavar="RUN", help="Folder of weights, log and curves.")
 def train(weights: Path | None, **options: Any) -> None:
     """Train the model on the release in DATAROOT.
 
@@ -89,7 +88,7 @@ def train(weights: Path | None, **options: Any) -> None:
         **{**{name: options[name] for name in _TRAINING}, "validation": None if validation == "none" else validation},
     )
     choice = ModelChoice(**{name: options[name] for name in _CHOICE})
-    dataset = DeepAccident(**{name: options[name] for name in ("dataroot", "version", "index_dir", "on_error")})
+    dataset = DeepAccident(**release_of(options))
     best = train_model(
         dataset,
         options["out"],

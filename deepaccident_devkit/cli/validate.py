@@ -1,23 +1,32 @@
 """`deepaccident validate`: what is wrong, odd or missing in a release."""
 
 import sys
-from pathlib import Path
 from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import files_parameters, refuse_unused
+from deepaccident_devkit.cli.options import (
+    PATH,
+    dataroot_argument,
+    engine_parameters,
+    json_parameter,
+    refuse_unused,
+    version_parameter,
+)
+from deepaccident_devkit.cli.verbs import advanced, verb
 from deepaccident_devkit.release.store import Dataroot
 from deepaccident_devkit.validation import release_completeness, validate_release
 
 _FINDINGS_STATUS = 1
 
 
-@click.command()
-@files_parameters
-@click.option(
+@verb()
+@dataroot_argument
+@version_parameter
+@engine_parameters
+@advanced(
     "--parts",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FOLDER",
     help="Folder to keep what is found in each scenario: the same command then goes on, and several share the work.",
 )
@@ -31,17 +40,15 @@ _FINDINGS_STATUS = 1
 @click.option(
     "--scenario", "scenarios", multiple=True, metavar="TOKEN", help="Only this scenario; you can repeat this option."
 )
-@click.option("--notes", is_flag=True, help="Also list notes, which are no errors and no warnings.")
-@click.option("--all", "whole", is_flag=True, help="List all findings of each scenario, not only the first eight.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document, for programs.")
+@click.option(
+    "--all",
+    "whole",
+    is_flag=True,
+    help="List all findings of each scenario, not only the first eight, and notes, which are no errors or warnings.",
+)
+@json_parameter
 def validate(
-    dataroot: Dataroot,
-    scenarios: tuple[str, ...],
-    files: bool,
-    notes: bool,
-    whole: bool,
-    as_json: bool,
-    **how: Any,
+    dataroot: Dataroot, scenarios: tuple[str, ...], files: bool, whole: bool, as_json: bool, **how: Any
 ) -> None:
     """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
 
@@ -51,14 +58,14 @@ def validate(
     """
     how |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
     if files:
-        refuse_unused("with --files, which opens no file", "deep", "notes", "whole", "parts")
+        refuse_unused("with --files, which opens no file", "deep", "whole", "parts")
         del how["deep"], how["parts"]
         counted = release_completeness(dataroot, **how)
         click.echo(counted.to_json() if as_json else counted.to_text())
         return
     if as_json:
-        refuse_unused("with --json, which has all findings and notes", "notes", "whole")
+        refuse_unused("with --json, which has all findings and notes", "whole")
     report = validate_release(dataroot, **how)
-    click.echo(report.to_json() if as_json else report.to_text(notes=notes, whole=whole))
+    click.echo(report.to_json() if as_json else report.to_text(notes=whole, whole=whole))
     if not report.is_good:
         sys.exit(_FINDINGS_STATUS)

@@ -195,7 +195,7 @@ _NO_TARGET = _Answer(400, "The request has no path.")
 _NO_HOST = _Answer(
     400,
     "The explorer does not know the host that the request names: start it with --root-path and the address that the "
-    "browser shows, if a proxy is between them, or else with --host and that host.",
+    "browser shows, if a proxy is between them, or else with --address and that host.",
 )
 _METHOD = _Answer(405, "The explorer only shows: it answers GET and HEAD.", {"allow": ", ".join(_METHODS)})
 _FOREIGN = _Answer(403, "A page of another site asked for this; open the address that the command printed.")

@@ -28,7 +28,7 @@ _STOP_SECONDS: Final = 0.7
 """Time for answers that are being made when the server stops; then they are left to their threads."""
 _EXPOSED: Final = (
     "warning: anyone who can reach this machine can try to open the pages, and anyone who has the address with the "
-    "token sees the release. Nothing is encrypted: prefer an SSH tunnel, which needs no --host."
+    "token sees the release. Nothing is encrypted: prefer an SSH tunnel, which needs no --address."
 )
 
 
@@ -221,9 +221,9 @@ class _TakenError(ConfigError):
 def _listen(host: str, port: int | None) -> socket.socket:
     """A socket that listens. Raises ConfigError."""
     if not host:
-        raise ConfigError("--host: expected a name or an address of this machine, found nothing")
+        raise ConfigError("host: expected a name or an address of this machine, found nothing")
     if port is not None and not 0 <= port <= _LAST_PORT:
-        raise ConfigError(f"--port: expected a number up to {_LAST_PORT}, found {port}")
+        raise ConfigError(f"port: expected a number up to {_LAST_PORT}, found {port}")
     for candidate in _PORTS if port is None else ():
         with suppress(_TakenError):
             return _listener(host, candidate)
@@ -243,15 +243,15 @@ def _listener(host: str, port: int) -> socket.socket:
             listening.close()
             raise
     except PermissionError as error:
-        raise ConfigError(f"--port {port}: not allowed here; choose a port from 1024 on") from error
+        raise ConfigError(f"port {port}: not allowed here; choose a port from 1024 on") from error
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise _TakenError(
-                f"--port {port}: another program listens there; choose another port, or leave --port out"
+                f"port {port}: another program listens there; choose another port (--address), or leave it out"
             ) from error
         raise ConfigError(
-            f"--host {host}: cannot listen there ({error}); give a name or an address of this machine, or leave --host "
-            "out"
+            f"host {host}: cannot listen there ({error}); give a name or an address of this machine (--address), or "
+            "leave it out"
         ) from error
     return listening
 

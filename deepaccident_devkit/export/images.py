@@ -35,9 +35,10 @@ class ImageConfig:
         mean: subtracted from the channels R, G, B in [0, 1]; `float32` only.
         std: the channels are then divided by this; `float32` only.
         cameras: the cameras, in this order.
-        decode: with `resize`, `full` decodes whole images and resizes by Pillow's bilinear filter; `scaled` decodes
+        decode: how images are resized: `full`, or `scaled` in a third of the time, with slightly other pixels
+            (docs/training.md). `full` decodes whole images and resizes by Pillow's bilinear filter; `scaled` decodes
             JPEG at the smallest of 1/1, 1/2, 1/4 and 1/8 that is no smaller than `resize` and resizes by OpenCV's area
-            filter: a third of the time, and slightly other pixels (docs/training.md).
+            filter.
     """
 
     resize: tuple[int, int] | None = None

@@ -80,11 +80,12 @@ class Link:
     order of calls, on other agents or on the other effects.
 
     Attributes:
-        latency: seconds, a multiple of 0.1 (the paper: 0.1 to 0.5): a partner's data are those of an earlier frame,
-            placed by its pose at that time: standing actors are right, moving ones are where they were.
-        pose_noise: None for exact poses; a number is `PoseNoise(mean=…)`.
+        latency: delay of partners' data, seconds, a multiple of 0.1 (the paper: 0.1 to 0.5). They are those of an
+            earlier frame, placed by the pose at that time: standing actors are right, moving ones are where they were.
+        pose_noise: mean position error of partners' poses, metres. A number is `PoseNoise(mean=…)`; None for exact
+            poses.
         packet_loss: probability in [0, 1] that a partner's data do not arrive at a frame.
-        seed: seed of all draws.
+        seed: seed of all that is drawn.
     """
 
     latency: float = 0.0

@@ -143,7 +143,7 @@ class ValidationReport(Report):
         yield f"files: {self.files.section()}"
         hidden = self.counts["note"] and not notes
         verdict = ", ".join(counted(self.counts[severity], severity) for severity in SEVERITIES)
-        yield verdict + (" (--notes lists the notes)" if hidden else "")
+        yield verdict + (" (--all lists the notes)" if hidden else "")
 
 
 def worst_first(findings: Sequence[Finding]) -> list[Finding]:

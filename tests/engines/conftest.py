@@ -17,7 +17,7 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Local:
     folder = tmp_path_factory.mktemp("engines")
     config = SynthConfig(scenarios=6, frames=24, sensors=False, seed=12)
     release = make_release(folder / "release", config, workers=2)
-    done(command(["baseline", "predict", str(release), "--split", "train", "--out", str(folder / "results")]))
+    done(command(["predict", "constant_velocity", str(release), "--split", "train", "--out", str(folder / "results")]))
     places = {"release": release, "results": folder / "results", "out": folder / "local"}
     printed = {name: done(command(words(name, places))) for name in COMMANDS}
     return Local(places, contents(folder / "local"), printed["validate"])

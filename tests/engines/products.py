@@ -14,7 +14,7 @@ COMMANDS = {
     "opencood": "export opencood {release} --without-clouds --out {out}/opencood",
     "evaluate": "evaluate accident {release} --results {results}/motion --split train --resamples 20 "
     "--out {out}/bundle",
-    "predict": "baseline predict {release} --split train --task accident --out {out}/predictions",
+    "predict": "predict constant_velocity {release} --split train --task accident --out {out}/predictions",
     "stats": "info {release} --statistics --out {out}/stats",
     "synth": "synth {out}/made --scenarios 3 --frames 3 --size 64x36 --seed 5",
 }

@@ -18,7 +18,7 @@ tried, and what became of it. 10 minutes. [SECURITY.md](../SECURITY.md) says wha
 
 {count:,} times, one file of a healthy tree was changed in one way and then read, as a user would read it: by opening
 the release or its zip, by `validate`, by evaluating the results, by verifying and comparing the bundle,
-by going on with an export that was killed, by `results from questions`, by loading weights, by going on with a run of
+by going on with an export that was killed, by `results`, by loading weights, by going on with a run of
 training, and so on. A case is *read* if all that was read equals what a plain reader finds in the same bytes (Python's
 `json`, `split` and `zipfile`, numpy, Pillow, PyTorch) or what a checksum says. It is *refused* if the devkit raises its
 own error, which names the file in at most 2,000 characters, none of which moves a terminal's cursor or turns the

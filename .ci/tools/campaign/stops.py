@@ -55,7 +55,7 @@ VERBS = (
         "evaluate compare {home}/bundles/accident {home}/bundles/accident --resamples 20 --out {out}/a.csv "
         "--out {out}/a.json --out {out}/a.png",
     ),
-    Verb("baseline predict", f"baseline predict {_EVALUATE} --task accident --horizon 0.5 --out {{out}}/predicted"),
+    Verb("predict", f"predict constant_velocity {_EVALUATE} --task accident --horizon 0.5 --out {{out}}/predicted"),
     Verb("render bev", f"render bev {_RELEASE} {SCENARIO}/ego_vehicle/003 --out {{out}}/picture.png --dpi 40"),
     Verb("render video", f"render video {_RELEASE} {SCENARIO} --what bev --size 160x90 --out {{out}}/video.gif"),
     Verb("export mcap", f"export mcap {_SENSORS} --out {{out}}/scenario.mcap"),
@@ -69,19 +69,18 @@ VERBS = (
     ),
     Verb(
         "export questions",
-        f"export questions {_RELEASE} --observe 0 --ahead 1 --stride 0.5 --partial-past --out {{out}}/questions",
+        f"export questions {_RELEASE} --observe 0 --ahead 1 --stride 0.5 --out {{out}}/questions",
         progress="questions/questions.manifest.json",
     ),
     Verb(
         "cache",
         "cache {home}/sensors --index-dir {home}/index_of_sensors --workers 1 --out {out}/cache --size 30x18 "
-        "--cameras Camera_Front --agents ego_vehicle --where length>=1",
+        "--channels Camera_Front --agents ego_vehicle --where length>=1",
         progress="cache/cache.manifest.json",
     ),
     Verb(
-        "results from questions",
-        "results from questions {home}/questions/answers.jsonl --truth {home}/questions/truth.jsonl "
-        "--out {out}/answered.json",
+        "results",
+        "results {home}/questions/answers.jsonl --truth {home}/questions/truth.jsonl --out {out}/answered.json",
     ),
     Verb("safety report", f"safety report {_RELEASE} --replays none --out {{out}}/safety"),
     Verb("explore", f"explore {_RELEASE} --out {{out}}/pages"),

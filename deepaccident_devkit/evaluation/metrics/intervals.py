@@ -39,8 +39,9 @@ class Resampling:
     """The settings of intervals, and of the test of two runs' difference.
 
     Attributes:
-        resamples: how often, at most, numbers are computed again: with a cluster left out for intervals (at
-            most 100 times), with clusters swapped between two runs for a test; 0 for no intervals and no tests.
+        resamples: number of resamples for intervals and tests, at most; 0 for no intervals and no tests. Numbers are
+            computed again with a cluster left out for intervals (at most 100 times), with clusters swapped between two
+            runs for a test.
         confidence: share of such intervals that should hold the true number; tests are at 1 − confidence.
         seed: of the random choice of clusters or swaps, if there are more than are taken.
     """

@@ -43,8 +43,8 @@ class NuScenes(Format):
     between are sweeps.
 
     Attributes:
-        van: nuScenes' vehicle that vans become, `car` or `truck`.
-        lidar_axes: of clouds and their calibration: `ego`, x forward and y left as everywhere in the devkit, or
+        van: vehicle of nuScenes that vans become, `car` or `truck`.
+        lidar_axes: axes of clouds and their calibration: `ego`, x forward and y left as everywhere in the devkit, or
             `nuscenes`, x right and y forward, which code made for nuScenes may take for granted.
         sweeps: whether the frames between keyframes are exported too.
 

@@ -117,7 +117,7 @@ class Questions(ShortRepr, Format):
             raise NotAvailableError(
                 f"no recording is long enough for a window of {self.window.observe:g} s: the longest has "
                 f"{max(lengths.values()) * FRAME_PERIOD:.1f} s; observe less (--observe), or let windows begin before "
-                "the recording (--partial-past)"
+                "the recording (WindowRules(partial_past=True))"
             )
         return super().units(dataset, scenarios)
 

@@ -59,9 +59,9 @@ class WindowRules:
     accident is the impact, is none. The rule is the same for recordings with and without an accident.
 
     Attributes:
-        observe: seconds before the present, a whole number of steps of `rate`; 0 for the present alone.
+        observe: seconds before the present that are shown; 0 for the present alone. A whole number of steps of `rate`.
         rate: moments a second of a window: 1, 2, 5 or 10.
-        ahead: whole seconds that are asked about.
+        ahead: whole seconds after the present that are asked about.
         stride: seconds from one window of a recording to the next, a multiple of 0.5.
         partial_past: whether there are also windows that begin before the recording, of whose moments only the recorded
             ones count. Their number then tells how long the recording has run.

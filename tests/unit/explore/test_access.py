@@ -200,7 +200,7 @@ def test_another_host_is_refused(served: Served, host: str) -> None:
     answer = asked(served, f"/?token={served.token}", host=host.format(served.port))
     assert answer.status == 400
     assert "--root-path" in answer.body
-    assert "--host" in answer.body
+    assert "--address" in answer.body
     assert "evil" not in answer.body
 
 

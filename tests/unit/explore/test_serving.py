@@ -98,7 +98,7 @@ def test_a_taken_port_is_an_error_with_the_remedy() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with (
-            pytest.raises(ConfigError, match=f"--port {port}: another program listens there; choose another port"),
+            pytest.raises(ConfigError, match=f"port {port}: another program listens there; choose another port"),
             serving(TinyApp(), port=port),
         ):
             pass
@@ -119,12 +119,12 @@ def test_by_default_it_takes_the_first_free_port(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ({"port": 65536}, "--port: expected a number up to 65535, found 65536"),
-        ({"port": -1}, "--port: expected a number up to 65535, found -1"),
-        ({"host": ""}, "--host: expected a name or an address of this machine, found nothing"),
-        ({"host": "192.0.2.1"}, r"--host 192.0.2.1: cannot listen there \(.*\); give a name or an address"),
-        ({"host": "x" * 70}, "--host x+: cannot listen there"),
-        ({"host": "no host"}, "--host no host: cannot listen there"),
+        ({"port": 65536}, "port: expected a number up to 65535, found 65536"),
+        ({"port": -1}, "port: expected a number up to 65535, found -1"),
+        ({"host": ""}, "host: expected a name or an address of this machine, found nothing"),
+        ({"host": "192.0.2.1"}, r"host 192.0.2.1: cannot listen there \(.*\); give a name or an address"),
+        ({"host": "x" * 70}, "host x+: cannot listen there"),
+        ({"host": "no host"}, "host no host: cannot listen there"),
         ({"root_path": "user"}, "--root-path: expected a path"),
     ],
 )
@@ -138,7 +138,7 @@ def test_a_port_that_only_root_may_use_is_an_error(monkeypatch: pytest.MonkeyPat
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(socket.socket, "bind", refuse)
-    with pytest.raises(ConfigError, match="--port 80: not allowed here; choose a port from 1024 on"):
+    with pytest.raises(ConfigError, match="port 80: not allowed here; choose a port from 1024 on"):
         module._listen("127.0.0.1", 80)
 
 
@@ -325,12 +325,12 @@ def test_a_missing_extra_is_an_error_with_the_remedy(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--out", "out", "--port", "9000"], "--port changes nothing with --out"),
+        (["--out", "out", "--address", "9000"], "--address changes nothing with --out"),
         (["--out", "out", "--no-open"], "--no-open changes nothing with --out"),
         (["--out", "out", "--root-path", "/x"], "--root-path changes nothing with --out"),
-        (["--out", "out", "--host", "::1"], "--host changes nothing with --out"),
         (["--where", "town=Town03"], "--where changes nothing without --out"),
-        (["--port", "0"], "0 is not in the range"),
+        (["--address", "localhost:0"], "expected HOST:PORT, HOST or PORT, found 'localhost:0'"),
+        (["--address", "::1"], "expected HOST:PORT, HOST or PORT, found '::1'"),
     ],
 )
 def test_the_verb_refuses_options_that_change_nothing(words: list[str], sentence: str) -> None:
@@ -359,15 +359,15 @@ def test_the_verb_makes_one_call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     for folder in given[:2]:
         folder.mkdir()
         (folder / SUMMARY_FILE).touch()
-    ((dataset, opened),), options = verb("--no-open", "--port", "9000", "--workers", "1")
+    ((dataset, opened),), options = verb("--no-open", "--address", "[::1]:9000", "--workers", "1")
     say: Callable[[str], object] = options.pop("say")
     say("")
     assert dataset == {
         "dataroot": Path("release"), "version": "v1", "index_dir": None, "workers": 1, "on_error": "raise",
     }  # fmt: skip
     assert opened == {**shared, "workers": 1}
-    assert options == {"host": "127.0.0.1", "port": 9000, "root_path": "", "open_browser": False}
-    assert verb("--root-path", "/x")[1].items() >= {"port": None, "root_path": "/x", "open_browser": True}.items()
+    assert options == {"host": "::1", "port": 9000, "root_path": "", "open_browser": False}
+    assert verb("--root-path", "/x")[1].items() >= {"root_path": "/x", "open_browser": True}.items()
     (_, target), options = verb("--out", "out", "--where", "town=Town03", "--where", "length=1..9")
     wanted = {**shared, "where": ("town=Town03", "length=1..9"), "workers": None, "progress": True}
     assert (target, options) == (Path("out"), wanted)

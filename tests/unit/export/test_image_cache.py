@@ -241,7 +241,7 @@ def command(*words: str | Path) -> Any:
 
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
     words = [da.dataroot, "--out", tmp_path / "out", "--workers", "1", "--size", "30x18", "--crop", "3,2,25,12"]
-    words += ["--agents", "ego_vehicle", "--cameras", "Camera_Back,Camera_Front", "--decode", "scaled"]
+    words += ["--agents", "ego_vehicle", "--channels", "Camera_Back,Camera_Front", "--decode", "scaled"]
     refused = command(*words)
     assert isinstance(refused.exception, ConfigError)
     assert "as raw images; choose a split or a filter (--split, --where)" in str(refused.exception)

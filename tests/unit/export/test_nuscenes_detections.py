@@ -69,7 +69,7 @@ def test_perfect_detections_of_an_export_evaluate_as_perfect(da_motion: DeepAcci
     count = sum(map(len, truth.values()))
     truth[sample].append(entry("barrier"))
     file, out = written(tmp_path / "nuscenes.json", truth), tmp_path / "ours.json"
-    done = verb("results", "from", "nuscenes", file, da_motion.dataroot, "--out", out)
+    done = verb("results", file, da_motion.dataroot, "--out", out)
     assert done.output == (
         f"{out}: {count:,} boxes of {len(truth)} samples\n"
         "left out: 1 boxes of the class barrier, which DeepAccident does not have\n"
@@ -162,7 +162,7 @@ def test_only_keyframes_are_samples_of_the_export(da_motion: DeepAccident, tmp_p
 
 def test_the_verb_refuses_before_it_indexes(tmp_path: Path) -> None:
     (tmp_path / "there.json").write_text("{}")
-    words = ("results", "from", "nuscenes")
+    words = ("results",)
     with pytest.raises(ResultsError, match=r"there\.json: is there already"):
         verb(*words, tmp_path / "there.json", tmp_path / "no release", "--out", tmp_path / "there.json")
     missing = verb(*words, tmp_path / "missing.json", tmp_path / "no release", "--out", tmp_path / "new.json")

@@ -187,6 +187,3 @@ def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert list(map(repr, rows_of(tmp_path / "out", "annotation"))) == told(da, "annotation")["train"]
-    refused = CliRunner().invoke(deepaccident, [*words, "--link", "copy"])
-    assert refused.exit_code == 2
-    assert "--link changes nothing here: no file is linked" in refused.output

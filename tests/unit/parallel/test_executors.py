@@ -89,14 +89,10 @@ def test_errors_of_the_work_are_not_those_of_workers() -> None:
     assert fault_of_workers(ValueError("deepaccident_devkit")) is None
 
 
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--scheduler", "tcp://x", "--scheduler-file", "f"], "name the same; give one of them"),
-        (["--scheduler", "tcp://x", "--workers", "2"], "--workers changes nothing with a scheduler"),
-    ],
-)
-def test_usage_errors(options: list[str], told: str) -> None:
-    result = CliRunner().invoke(deepaccident, ["index", "release", *options])
-    assert result.exit_code == 2
-    assert told in result.output
+def test_the_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refused = CliRunner().invoke(deepaccident, ["index", "release", "--scheduler", "tcp://x", "--workers", "2"])
+    assert (refused.exit_code, "--workers changes nothing with a scheduler" in refused.output) == (2, True)
+    monkeypatch.setattr("deepaccident_devkit.parallel.scheduler_file._SECONDS", 0.2)
+    path = tmp_path / "absent.json"
+    with pytest.raises(WorkerError, match=f"^{path}: no dask scheduler answers"):
+        CliRunner().invoke(deepaccident, ["index", "release", "--scheduler", str(path)], catch_exceptions=False)

@@ -203,14 +203,12 @@ def test_the_command(da_motion: DeepAccident, tmp_path: Path) -> None:
     root, normal = str(da_motion.dataroot), da_motion.find(collision=False)[0]["token"]
     all_of_them = CliRunner().invoke(deepaccident, ["safety", "twins", root], catch_exceptions=False)
     assert all_of_them.exit_code == 0
-    one = CliRunner().invoke(
-        deepaccident, ["safety", "twins", root, normal, "--distance", "0.6", "--turn", "5", "--out", str(tmp_path)]
-    )
-    assert (one.exit_code, "an actor parts from 0.6 m or 5° on" in one.output) == (0, True)
+    one = CliRunner().invoke(deepaccident, ["safety", "twins", root, normal, "--out", str(tmp_path)])
+    assert (one.exit_code, "an actor parts from 1 m or 10° on" in one.output) == (0, True)
     names = {"twins.csv", "twin_actors.csv", "torn_twins.csv", "skipped.csv", "twins.json", "twins.png"}
     assert {path.name for path in tmp_path.iterdir()} == {*names, "twins_over_time.csv"}
     told = json.loads((tmp_path / "twins.json").read_text(encoding="utf-8"))
-    diff = twin_diff(da_motion, normal, Parting(distance=0.6, heading=math.radians(5)))
+    diff = twin_diff(da_motion, normal)
     assert told["twins"] == [diff.to_dict()]
     with (tmp_path / "twin_actors.csv").open(encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == len(diff.categories)

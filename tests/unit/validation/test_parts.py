@@ -124,7 +124,7 @@ def test_parts_need_a_folder(root: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_verb_prints_the_same_report(root: Path, tmp_path: Path) -> None:
-    for options in (("--notes", "--all"), ("--json",), ("--deep",)):
+    for options in (("--all",), ("--json",), ("--deep",)):
         whole = run(root, *options)
         for _ in range(2):
             again = run(root, *options, "--parts", tmp_path)

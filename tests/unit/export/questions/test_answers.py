@@ -242,7 +242,7 @@ def test_a_truth_file_that_was_changed(asked: Asked, tmp_path: Path, name: str, 
 def test_the_command(asked: Asked, tmp_path: Path) -> None:
     answers, out = written(tmp_path / "answers.jsonl", perfect(asked)[1:]), tmp_path / "accident.json"
     words = [str(answers), "--truth", str(asked.done.folder / "truth.jsonl"), "--out", str(out), "--method", "mine"]
-    result = CliRunner().invoke(deepaccident, ["results", "from", "questions", *words], catch_exceptions=False)
+    result = CliRunner().invoke(deepaccident, ["results", *words], catch_exceptions=False)
     assert result.exit_code == 0
     alarms = sum(len(read_results(out).prediction(token)) for token in read_results(out).tokens)
     assert f"{out}: {alarms} alarms in {len(asked.truth) - 1} answers\n" in result.stdout

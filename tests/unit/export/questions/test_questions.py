@@ -315,12 +315,12 @@ def test_the_command(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> N
     assert "16 samples: a few files to write" in result.stdout
     for name in ("questions/questions.jsonl", "truth.jsonl"):
         assert (tmp_path / "out" / name).read_bytes() == (asked.done.folder / name).read_bytes()
-    refused = verb("export", "questions", da_motion.dataroot, "--out", tmp_path / "out", "--cameras", "Camera_Back")
-    assert (refused.exit_code, "--cameras changes nothing without --images" in refused.stderr) == (2, True)
+    refused = verb("export", "questions", da_motion.dataroot, "--out", tmp_path / "out", "--channels", "Camera_Back")
+    assert (refused.exit_code, "--channels changes nothing without --images" in refused.stderr) == (2, True)
 
 
 def test_the_command_with_pictures(da: DeepAccident, tmp_path: Path) -> None:
-    words = ["--observe", 0, "--stride", 0.5, "--images", "copy", "--cameras", "all", "--seed", "a b", "--most", 1]
+    words = ["--observe", 0, "--stride", 0.5, "--images", "copy", "--channels", "all", "--seed", "a b"]
     result = verb("export", "questions", da.dataroot, "--out", tmp_path / "out", "--workers", 1, *words)
     assert result.exit_code == 0, result.output
     found = read_back(export_release(da, tmp_path / "out", Questions(**_settings(tmp_path / "out")), workers=1))

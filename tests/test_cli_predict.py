@@ -1,4 +1,4 @@
-"""`deepaccident baseline`: one library call a verb."""
+"""`deepaccident predict` with a baseline."""
 
 import shutil
 from pathlib import Path
@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import NotAvailableError, ResultsError
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.splits import save_selection
 from deepaccident_devkit.v2x import Link
@@ -18,13 +18,14 @@ pytestmark = pytest.mark.slow
 
 
 def run(*arguments: object) -> str:
-    result = CliRunner().invoke(deepaccident, ["baseline", *map(str, arguments)], catch_exceptions=False)
+    result = CliRunner().invoke(deepaccident, ["predict", *map(str, arguments)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
 
 def test_predict_writes_all_tasks_of_the_samples_that_are_evaluated(da_motion: DeepAccident, tmp_path: Path) -> None:
-    text = run("predict", da_motion.dataroot, "--split", "train", "--agents", "all", "--workers", 1, "--out", tmp_path)
+    words = ("constant_velocity", da_motion.dataroot, *["--split", "train", "--agents", "all", "--workers", "1"])
+    text = run(*words, "--out", tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["accident.json", "detection.json", "motion"]
     for name in ("motion", "accident.json", "detection.json"):
         results = read_results(tmp_path / name)
@@ -35,9 +36,9 @@ def test_predict_writes_all_tasks_of_the_samples_that_are_evaluated(da_motion: D
 
 
 def test_predict_takes_a_link_a_model_a_horizon_and_a_scope(da_motion: DeepAccident, tmp_path: Path) -> None:
-    options = "--split train --task accident --model constant_turn_rate --latency 0.2 --pose-noise 0.3 --seed 4"
+    options = "--split train --task accident --latency 0.2 --pose-noise 0.3 --seed 4"
     options += " --agents all --horizon 1.5 --scope all --workers 1"
-    run("predict", da_motion.dataroot, *options.split(), "--out", tmp_path)
+    run("constant_turn_rate", da_motion.dataroot, *options.split(), "--out", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["accident.json"]
     results = read_results(tmp_path / "accident.json")
     link = Link(latency=0.2, pose_noise=0.3, seed=4)
@@ -49,7 +50,7 @@ def test_predict_takes_a_link_a_model_a_horizon_and_a_scope(da_motion: DeepAccid
 def test_predict_takes_names_and_the_agents_that_are_there(da_motion: DeepAccident, tmp_path: Path) -> None:
     root = tmp_path / "release"
     shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "infrastructure"))
-    words = ("predict", root, "--split", "train", "--task", "accident", "--workers", 1)
+    words = ("constant_velocity", root, "--split", "train", "--task", "accident", "--workers", 1)
     for agents, meta in (("available", "available"), ("ego_vehicle,other_vehicle", ["ego_vehicle", "other_vehicle"])):
         run(*words, "--agents", agents, "--out", tmp_path / agents)
         assert read_results(tmp_path / agents / "accident.json").meta["agents"] == meta
@@ -60,7 +61,7 @@ def test_predict_takes_names_and_the_agents_that_are_there(da_motion: DeepAccide
 def test_predict_of_scenarios_without_an_accident_names_the_scope(da_motion: DeepAccident, tmp_path: Path) -> None:
     normal = tmp_path / "normal.txt"
     save_selection(da_motion.find(designed_accident=False), normal)
-    words = ("predict", da_motion.dataroot, "--split", normal, "--task", "accident", "--workers", 1)
+    words = ("constant_velocity", da_motion.dataroot, "--split", normal, "--task", "accident", "--workers", 1)
     told = r"has no samples to predict; the scope accident, .* leaves out all 1 of its scenarios, .* \(--scope all\)$"
     with pytest.raises(NotAvailableError, match=told):
         run(*words, "--out", tmp_path / "out")
@@ -69,20 +70,12 @@ def test_predict_of_scenarios_without_an_accident_names_the_scope(da_motion: Dee
 
 def test_predict_takes_every_half_second_of_all_scenarios(da_motion: DeepAccident, tmp_path: Path) -> None:
     root = da_motion.dataroot
-    run(
-        "predict",
+    words = (
+        "constant_velocity",
         root,
-        "--split",
-        "train",
-        "--task",
-        "detection",
-        "--samples",
-        "all",
-        "--workers",
-        1,
-        "--out",
-        tmp_path,
+        *["--split", "train", "--task", "detection", "--samples", "all", "--workers", "1"],
     )
+    run(*words, "--out", tmp_path)
     assert list(read_results(tmp_path / "detection.json").tokens) == da_motion.samples("train", "all")
 
 
@@ -91,7 +84,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, tmp_path: Path) -> None:
-    words = ("predict", da_motion.dataroot, "--split", "train", "--workers", 1, "--out", tmp_path)
+    words = ("constant_velocity", da_motion.dataroot, "--split", "train", "--workers", 1, "--out", tmp_path)
     run(*words, "--task", "accident")
     before = (tmp_path / "accident.json").stat().st_mtime_ns
     text = run(*words)
@@ -103,14 +96,8 @@ def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, t
         run(*words, "--task", "accident", "--agents", "all")
 
 
-def test_predict_has_the_grammar_of_all_other_verbs() -> None:
-    text = CliRunner().invoke(deepaccident, ["baseline", "predict", "--help"]).output
-    for word in (
-        "DATAROOT",
-        "--version",
-        "--index-dir",
-        "--workers",
-        "--on-error",
-        "--out DIR",
+def test_a_model_that_is_not_there_is_named() -> None:
+    with pytest.raises(
+        ChoiceError, match=r"MODEL.*: expected one of constant_velocity, .*did you mean 'constant_velocity'"
     ):
-        assert word in text
+        run("constant_velocty", "release", "--out", "out")
