@@ -26,14 +26,22 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 
 def test_dataroots_that_are_none(tmp_path: Path, release_root: Path) -> None:
-    with pytest.raises(DatarootError, match=r"nowhere: does not exist; give the folder"):
-        DeepAccident(dataroot=tmp_path / "nowhere")
-    with pytest.raises(DatarootError, match="no scenario found; expected <scenario_type>/<agent>/calib"):
-        DeepAccident(dataroot=tmp_path)
-    with pytest.raises(DatarootError, match="is a file"):
-        DeepAccident(dataroot=release_root / "train.txt")
-    with pytest.raises(VersionError, match="unknown version 'v2'; known are v1, v1-mini"):
-        DeepAccident("v2", release_root)
+    for make, error, sentence in (
+        (
+            lambda: DeepAccident(dataroot=tmp_path / "nowhere"),
+            DatarootError,
+            r"nowhere: does not exist; give the folder",
+        ),
+        (
+            lambda: DeepAccident(dataroot=tmp_path),
+            DatarootError,
+            "no scenario found; expected <scenario_type>/<agent>/calib",
+        ),
+        (lambda: DeepAccident(dataroot=release_root / "train.txt"), DatarootError, "is a file"),
+        (lambda: DeepAccident("v2", release_root), VersionError, "unknown version 'v2'; known are v1, v1-mini"),
+    ):
+        with pytest.raises(error, match=sentence):
+            make()
     for path, written in ((str(release_root), str(release_root)), (Path("a/b"), "a/b"), ("~", "~"), ("./x", "./x")):
         remedy = f"; to open the folder, write DeepAccident(dataroot='{written}')"
         with pytest.raises(VersionError, match=f"{re.escape(remedy)}$"):
@@ -41,12 +49,17 @@ def test_dataroots_that_are_none(tmp_path: Path, release_root: Path) -> None:
     for nuscenes, ours in (("v1.0-mini", "v1-mini"), ("v1.0-trainval", "v1")):
         with pytest.raises(VersionError, match=rf"known are v1, v1-mini; did you mean '{ours}'\?$"):
             DeepAccident(nuscenes, release_root)
-    with pytest.raises(VersionError, match=r"known are v1, v1-mini$"):
-        DeepAccident("v2", release_root)
-    with pytest.raises(VersionError, match="holds no mini release"):
-        DeepAccident("v1-mini", release_root)
-    with pytest.raises(ChoiceError, match="on_error: expected one of raise, skip, found 'ignore'"):
-        DeepAccident(dataroot=release_root, on_error="ignore")  # type: ignore[arg-type]
+    for make, error, sentence in (
+        (lambda: DeepAccident("v2", release_root), VersionError, r"known are v1, v1-mini$"),
+        (lambda: DeepAccident("v1-mini", release_root), VersionError, "holds no mini release"),
+        (
+            lambda: DeepAccident(dataroot=release_root, on_error="ignore"),
+            ChoiceError,
+            "on_error: expected one of raise, skip, found 'ignore'",
+        ),
+    ):
+        with pytest.raises(error, match=sentence):
+            make()
 
 
 @pytest.mark.slow
@@ -119,22 +132,22 @@ def test_unknown_tokens_of_other_tables(da: DeepAccident, table: str) -> None:
 
 def test_unknown_tables_fields_channels_and_frames(da: DeepAccident) -> None:
     sample = da.sample[0]["token"]
-    with pytest.raises(TableError, match="no table 'scene'; there are scenario, agent"):
-        da.get("scene", "x")
-    with pytest.raises(FieldError, match="table 'scenario' has no field 'rain'; it has token, name"):
-        da.field2token("scenario", "rain", 1)
-    with pytest.raises(TokenError, match="the channels are Camera_Front, "):
-        da.load_image(f"{sample}/Camera_Side")
-    with pytest.raises(ChoiceError, match="lidar01 holds no images"):
-        da.load_image(f"{sample}/lidar01")
-    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, Camera_Front"):
-        da.boxes(sample, "camera")
-    with pytest.raises(ChoiceError, match="visible: expected one of camera, released, or None"):
-        da.boxes(sample, visible="lidar")  # type: ignore[arg-type]
-    with pytest.raises(ChoiceError, match="velocity: expected one of decoded, derived, label"):
-        da.boxes(sample, velocity="mine")  # type: ignore[arg-type]
-    with pytest.raises(ChoiceError, match="split: expected one of train, val, test"):
-        da.split_scenarios("training")
+    for make, error, sentence in (
+        (lambda: da.get("scene", "x"), TableError, "no table 'scene'; there are scenario, agent"),
+        (
+            lambda: da.field2token("scenario", "rain", 1),
+            FieldError,
+            "table 'scenario' has no field 'rain'; it has token, name",
+        ),
+        (lambda: da.load_image(f"{sample}/Camera_Side"), TokenError, "the channels are Camera_Front, "),
+        (lambda: da.load_image(f"{sample}/lidar01"), ChoiceError, "lidar01 holds no images"),
+        (lambda: da.boxes(sample, "camera"), ChoiceError, "frame: expected one of world, ego, lidar, Camera_Front"),
+        (lambda: da.boxes(sample, visible="lidar"), ChoiceError, "visible: expected one of camera, released, or None"),
+        (lambda: da.boxes(sample, velocity="mine"), ChoiceError, "velocity: expected one of decoded, derived, label"),
+        (lambda: da.split_scenarios("training"), ChoiceError, "split: expected one of train, val, test"),
+    ):
+        with pytest.raises(error, match=sentence):
+            make()
     other = da.get("frame", da.scenario[1]["first_frame_token"])
     with pytest.raises(ChoiceError, match="expected two samples of one scenario"):
         da.transform(sample, da.samples_of(other)[0])

@@ -205,12 +205,19 @@ def test_samples_that_cannot_be(da: DeepAccident, tokens: list[str]) -> None:
 
 def test_a_missing_file_is_named(da_b: DeepAccident) -> None:
     token = da_b.sample[0]["token"]
-    with pytest.raises(MissingFileError, match=r"lidar01.*no such file"):
-        V2XDataset(da_b, [token])[0]
-    with pytest.raises(MissingFileError, match=r"Camera_Front.*no such file"):
-        V2XDataset(da_b, [token], V2XConfig(points=False, images=ImageConfig()))[0]
-    with pytest.raises(MissingFileError, match=r"BEV_instance_camera.*no such file"):
-        V2XDataset(da_b, [token], V2XConfig(points=False, bev_segmentation=BevGrid()))[0]
+    for make, sentence in (
+        (lambda: V2XDataset(da_b, [token])[0], r"lidar01.*no such file"),
+        (
+            lambda: V2XDataset(da_b, [token], V2XConfig(points=False, images=ImageConfig()))[0],
+            r"Camera_Front.*no such file",
+        ),
+        (
+            lambda: V2XDataset(da_b, [token], V2XConfig(points=False, bev_segmentation=BevGrid()))[0],
+            r"BEV_instance_camera.*no such file",
+        ),
+    ):
+        with pytest.raises(MissingFileError, match=sentence):
+            make()
 
 
 def test_a_broken_file_is_named(da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Fusion modules: the laws that all of them keep, their options, windows, and wrong configs."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -232,18 +233,18 @@ def test_windows_hold_neighbours_or_cells_spread_over_the_map() -> None:
     assert Windows(size=2, strided=True).split(numbers)[1, :, 0].tolist() == [1, 4, 13, 16]
 
 
-def test_wrong_configs_say_so() -> None:
-    with pytest.raises(ConfigError, match=r"expected numbers from 0 to 7, found \[31, 41"):
-        ReleasedFusionConfig(channels=C)
-    with pytest.raises(ConfigError, match="heads: 3 do not divide 8 channels"):
-        replace(COBEVT, heads=3)
-    with pytest.raises(ConfigError, match="window_heads: 3 do not divide 8 channels"):
-        replace(V2XVIT, window_heads=(2, 3))
-    with pytest.raises(ConfigError, match=r"one number for each of 2 windows, found \(2,\)"):
-        replace(V2XVIT, window_heads=(2,))
-    with pytest.raises(ConfigError, match="by: expected one of mean, max, found 'sum'"):
-        PoolFusionConfig(by="sum")
-    with pytest.raises(ConfigError, match="agents: expected at least 2, found 1"):
-        Agent3DConfig(channels=C, agents=1)
-    with pytest.raises(ConfigError, match="the config of a fusion module, found 'mean'"):
-        fusion("mean")
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: ReleasedFusionConfig(channels=C), r"expected numbers from 0 to 7, found \[31, 41"),
+        (lambda: replace(COBEVT, heads=3), "heads: 3 do not divide 8 channels"),
+        (lambda: replace(V2XVIT, window_heads=(2, 3)), "window_heads: 3 do not divide 8 channels"),
+        (lambda: replace(V2XVIT, window_heads=(2,)), r"one number for each of 2 windows, found \(2,\)"),
+        (lambda: PoolFusionConfig(by="sum"), "by: expected one of mean, max, found 'sum'"),
+        (lambda: Agent3DConfig(channels=C, agents=1), "agents: expected at least 2, found 1"),
+        (lambda: fusion("mean"), "the config of a fusion module, found 'mean'"),
+    ],
+)
+def test_wrong_configs_say_so(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        make()

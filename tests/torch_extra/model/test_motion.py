@@ -248,14 +248,30 @@ def test_a_sample_without_its_past_has_no_frame_that_counts() -> None:
 
 def test_what_does_not_fit_is_refused() -> None:
     head, features, targets = head_and_data(SHARED)
-    with pytest.raises(GeometryError, match=r"segmentation of shape \(2, 3, 10, 10\), found \(2, 3, 20, 24\)"):
-        head(features[..., :5, :5], targets)
-    with pytest.raises(GeometryError, match=r"noise: expected shape \(2, 2, 3, 3\), found \(2, 2, 1, 1\)"):
-        head(features, targets, noise=torch.zeros(2, 2, 1, 1))
-    with pytest.raises(GeometryError, match="noise: expected that of 3 draws, found 5"):
-        head(features, noise=torch.zeros(5, 2, 2, 3, 3))
-    with pytest.raises(NotAvailableError, match=r"outputs: .* found no posterior; give the targets"):
-        motion_losses(head(features), targets, LOSSES)
+    for make, error, sentence in (
+        (
+            lambda: head(features[..., :5, :5], targets),
+            GeometryError,
+            r"segmentation of shape \(2, 3, 10, 10\), found \(2, 3, 20, 24\)",
+        ),
+        (
+            lambda: head(features, targets, noise=torch.zeros(2, 2, 1, 1)),
+            GeometryError,
+            r"noise: expected shape \(2, 2, 3, 3\), found \(2, 2, 1, 1\)",
+        ),
+        (
+            lambda: head(features, noise=torch.zeros(5, 2, 2, 3, 3)),
+            GeometryError,
+            "noise: expected that of 3 draws, found 5",
+        ),
+        (
+            lambda: motion_losses(head(features), targets, LOSSES),
+            NotAvailableError,
+            r"outputs: .* found no posterior; give the targets",
+        ),
+    ):
+        with pytest.raises(error, match=sentence):
+            make()
 
 
 @pytest.mark.parametrize(

@@ -232,12 +232,25 @@ def test_detected_boxes_are_drawn_in_their_own_frame(da: DeepAccident, scenario:
 
 def test_predictions_that_are_none_are_refused(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
     sample = f"{scenario}/ego_vehicle/002"
-    with pytest.raises(ConfigError, match=r"prediction: expected Results, or a mapping .*, found list"):
-        exported(da, scenario, tmp_path, prediction=[sample])
-    with pytest.raises(ConfigError, match="a list of Accident or DetectedBoxes for each sample, found str"):
-        exported(da, scenario, tmp_path, prediction={sample: "an accident"})
-    with pytest.raises(NotAvailableError, match=f"prediction: has nothing of {scenario} at these agents and frames"):
-        exported(da, scenario, tmp_path, prediction={sample: []}, frames=[3])
+    for make, error, sentence in (
+        (
+            lambda: exported(da, scenario, tmp_path, prediction=[sample]),
+            ConfigError,
+            r"prediction: expected Results, or a mapping .*, found list",
+        ),
+        (
+            lambda: exported(da, scenario, tmp_path, prediction={sample: "an accident"}),
+            ConfigError,
+            "a list of Accident or DetectedBoxes for each sample, found str",
+        ),
+        (
+            lambda: exported(da, scenario, tmp_path, prediction={sample: []}, frames=[3]),
+            NotAvailableError,
+            f"prediction: has nothing of {scenario} at these agents and frames",
+        ),
+    ):
+        with pytest.raises(error, match=sentence):
+            make()
 
 
 @pytest.mark.parametrize("package", ["mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google.protobuf"])

@@ -306,9 +306,10 @@ def test_other_things_than_boxes_and_transforms_are_refused(two: Boxes) -> None:
     for compare in (two.iou_bev, two.iou_3d, two.distance_bev):
         with pytest.raises(GeometryError, match="other: expected Boxes, found NoneType"):
             compare(None)
-    with pytest.raises(GeometryError, match=r"a Box is one row of Boxes, found list; boxes\[0\] picks one"):
-        Box([])
-    with pytest.raises(GeometryError, match="target_from_source: expected an SE3, found ndarray; of a matrix"):
-        two.transform(np.eye(4), "ego")
-    with pytest.raises(GeometryError, match=r"frame: expected the name of a frame, .* found 5"):
-        two.transform(SE3.identity(), 5)
+    for make, sentence in (
+        (lambda: Box([]), r"a Box is one row of Boxes, found list; boxes\[0\] picks one"),
+        (lambda: two.transform(np.eye(4), "ego"), "target_from_source: expected an SE3, found ndarray; of a matrix"),
+        (lambda: two.transform(SE3.identity(), 5), r"frame: expected the name of a frame, .* found 5"),
+    ):
+        with pytest.raises(GeometryError, match=sentence):
+            make()

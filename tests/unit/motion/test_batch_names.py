@@ -103,14 +103,27 @@ def test_labels_answer_to_the_names_of_the_heads() -> None:
 def test_batches_that_do_not_fit_are_refused() -> None:
     labels = made()
     batch = labels.as_batch("beverse")
-    with pytest.raises(ChoiceError, match="names: expected one of fiery, beverse, deepaccident, found 'stp3'"):
-        labels.as_batch("stp3")
-    with pytest.raises(FieldError, match="batch: fiery labels have 'centerness'; there are future_egomotions"):
-        MotionLabels.from_batch(batch, labels.config, "fiery")
-    with pytest.raises(GeometryError, match=r"motion_segmentation: expected shape \(5, 80, 100\)"):
-        MotionLabels.from_batch(
-            {**batch, "motion_segmentation": batch["motion_instance"][None]}, labels.config, "beverse"
-        )
+    for make, error, sentence in (
+        (
+            lambda: labels.as_batch("stp3"),
+            ChoiceError,
+            "names: expected one of fiery, beverse, deepaccident, found 'stp3'",
+        ),
+        (
+            lambda: MotionLabels.from_batch(batch, labels.config, "fiery"),
+            FieldError,
+            "batch: fiery labels have 'centerness'; there are future_egomotions",
+        ),
+        (
+            lambda: MotionLabels.from_batch(
+                {**batch, "motion_segmentation": batch["motion_instance"][None]}, labels.config, "beverse"
+            ),
+            GeometryError,
+            r"motion_segmentation: expected shape \(5, 80, 100\)",
+        ),
+    ):
+        with pytest.raises(error, match=sentence):
+            make()
 
 
 def test_settings_of_the_other_codes() -> None:

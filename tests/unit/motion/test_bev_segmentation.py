@@ -88,12 +88,17 @@ def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
 
 def test_unknown_classes_and_shares_are_refused(da: DeepAccident) -> None:
     image = _image()
-    with pytest.raises(ConfigError, match="coverage: expected one of road, lane_line"):
-        segmentation_of(image, BevGrid(), coverage={"tram": 0.5})
-    with pytest.raises(ConfigError, match="choose a share"):
-        segmentation_of(image, BevGrid(), coverage={"road": 1.0})
-    with pytest.raises(ChoiceError, match="expected one of"):
-        segmentation_of(image, BevGrid()).mask("tram")
+    for make, error, sentence in (
+        (
+            lambda: segmentation_of(image, BevGrid(), coverage={"tram": 0.5}),
+            ConfigError,
+            "coverage: expected one of road, lane_line",
+        ),
+        (lambda: segmentation_of(image, BevGrid(), coverage={"road": 1.0}), ConfigError, "choose a share"),
+        (lambda: segmentation_of(image, BevGrid()).mask("tram"), ChoiceError, "expected one of"),
+    ):
+        with pytest.raises(error, match=sentence):
+            make()
 
 
 def test_results_are_read_only() -> None:

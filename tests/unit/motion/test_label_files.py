@@ -422,12 +422,17 @@ class TestRefusing:
     def test_what_cannot_be_drawn_is_said_before_anything_is_written(self, root: Path, tmp_path: Path) -> None:
         small, out = opened(root), tmp_path / "labels"
         unlabelled = opened(tiny.write_tiny_release(tmp_path / "test", labelled=False))
-        with pytest.raises(NotAvailableError, match="ego_vehicle/003 has no label"):
-            write(unlabelled, out, tokens_of(unlabelled, 3))
-        with pytest.raises(TokenError, match="no token 'nothing'"):
-            write(small, out, [*tokens_of(small, 3), "nothing"])
-        with pytest.raises(ChoiceError, match="expected at least one sample, found none"):
-            write(small, out, [])
+        for make, error, sentence in (
+            (
+                lambda: write(unlabelled, out, tokens_of(unlabelled, 3)),
+                NotAvailableError,
+                "ego_vehicle/003 has no label",
+            ),
+            (lambda: write(small, out, [*tokens_of(small, 3), "nothing"]), TokenError, "no token 'nothing'"),
+            (lambda: write(small, out, []), ChoiceError, "expected at least one sample, found none"),
+        ):
+            with pytest.raises(error, match=sentence):
+                make()
         for one in (tokens_of(small, 3)[0], small.sample[3]):
             with pytest.raises(ChoiceError, match="put it into a list"):
                 write_label_files(small, out, one)

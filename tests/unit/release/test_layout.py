@@ -83,12 +83,13 @@ def test_an_unknown_version(root: Path) -> None:
 def test_no_release_there(root: Path, version: str) -> None:
     file = root / "file.txt"
     file.write_text("")
-    with pytest.raises(DatarootError, match=rf"^{root / 'gone'}: does not exist; give the folder"):
-        find_release(root / "gone", version)
-    with pytest.raises(DatarootError, match=rf"^{file}: is a file; give the folder"):
-        find_release(file, version)
-    with pytest.raises(DatarootError, match=rf"^{root}: no scenario found; expected .*deepaccident synth OUT"):
-        find_release(root, version)
+    for make, sentence in (
+        (lambda: find_release(root / "gone", version), rf"^{root / 'gone'}: does not exist; give the folder"),
+        (lambda: find_release(file, version), rf"^{file}: is a file; give the folder"),
+        (lambda: find_release(root, version), rf"^{root}: no scenario found; expected .*deepaccident synth OUT"),
+    ):
+        with pytest.raises(DatarootError, match=sentence):
+            make()
     # the shell of one: sensors and labels, but no calib; files where folders are expected
     (root / ACCIDENT / "ego_vehicle" / "label" / NAME).mkdir(parents=True)
     (root / ACCIDENT / "other_vehicle").write_text("")

@@ -41,12 +41,17 @@ def test_a_trajectory_in_a_samples_frame_has_a_past_and_a_future(da: DeepAcciden
 
 def test_trajectories_that_cannot_be(da: DeepAccident) -> None:
     instance = da.instance[0]["token"]
-    with pytest.raises(TokenError, match="has no actor 7"):
-        da.trajectory(f"{da.scenario[0]['token']}/actor/7")
-    with pytest.raises(ChoiceError, match="frame 'ego' is one of a sample"):
-        da.trajectory(instance, frame="ego")
-    with pytest.raises(ChoiceError, match="different worlds"):
-        da.trajectory(instance, f"{da.scenario[1]['token']}/ego_vehicle/001", "ego")
+    for make, error, sentence in (
+        (lambda: da.trajectory(f"{da.scenario[0]['token']}/actor/7"), TokenError, "has no actor 7"),
+        (lambda: da.trajectory(instance, frame="ego"), ChoiceError, "frame 'ego' is one of a sample"),
+        (
+            lambda: da.trajectory(instance, f"{da.scenario[1]['token']}/ego_vehicle/001", "ego"),
+            ChoiceError,
+            "different worlds",
+        ),
+    ):
+        with pytest.raises(error, match=sentence):
+            make()
 
 
 def test_tracks_of_every_scenario_are_its_own(da: DeepAccident) -> None:

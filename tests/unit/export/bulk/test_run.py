@@ -200,12 +200,13 @@ def test_a_folder_of_other_settings_is_refused(
 def test_a_folder_with_other_things_is_refused(small: DeepAccident, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     before = states(tmp_path)
-    with pytest.raises(ExportError, match=r"is not empty \(notes.txt\) and holds no tiny export; choose a new folder"):
-        written(small, tmp_path)
-    with pytest.raises(ExportError, match=r"notes.txt: is a file; give a folder"):
-        written(small, tmp_path / "notes.txt")
-    with pytest.raises(ExportError, match=r"cannot be written \(.*Not a directory"):
-        written(small, tmp_path / "notes.txt" / "out")
+    for make, sentence in (
+        (lambda: written(small, tmp_path), r"is not empty \(notes.txt\) and holds no tiny export; choose a new folder"),
+        (lambda: written(small, tmp_path / "notes.txt"), r"notes.txt: is a file; give a folder"),
+        (lambda: written(small, tmp_path / "notes.txt" / "out"), r"cannot be written \(.*Not a directory"),
+    ):
+        with pytest.raises(ExportError, match=sentence):
+            make()
     assert states(tmp_path) == before
 
 
