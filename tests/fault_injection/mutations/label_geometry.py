@@ -49,7 +49,9 @@ def _of_actor(place: Place, rng: np.random.Generator, edit: Edit, *, moving: boo
 
 def _of_agent(place: Place, rng: np.random.Generator, edit: Edit) -> str:
     """Edit all boxes of one agent."""
-    return _of_agent(place, rng, edit)
+    agent = place.any_agent(rng)
+    place.edit_rows(agent, place.frames, edit)
+    return agent
 
 
 def _of_all(place: Place, edit: Edit) -> str:

@@ -229,17 +229,6 @@ def test_weights_weigh() -> None:
         assert ratio == pytest.approx(dict.fromkeys(once, 1) | {f"motion_{name}": 2})
 
 
-def test_half_precision_trains() -> None:
-    head, features, targets = head_and_data(SHARED)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        losses = motion_losses(head(features, targets), targets, LOSSES)
-        predicted = head.eval()(features)
-    assert {loss.dtype for loss in losses.values()} == {torch.float32}
-    sum(losses.values()).backward()
-    assert all(values.grad.isfinite().all() for values in head.parameters())
-    assert predicted.maps.segmentation.isfinite().all()
-
-
 def test_a_sample_without_its_past_has_no_frame_that_counts() -> None:
     label_valid = torch.tensor([[True, True, False], [True, True, True]])
     past_valid = torch.tensor([[True, True], [False, True]])

@@ -17,7 +17,6 @@ from deepaccident_devkit.model.fusion import CobevtConfig, DiscoNetConfig, PoolF
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.presets import PRESETS, ModelChoice, load_model, released, tiny
 from deepaccident_devkit.taxonomy import ModelFusion
-from deepaccident_devkit.v2x import Link
 
 
 def parameters(model: torch.nn.Module) -> int:
@@ -132,13 +131,3 @@ def test_a_model_is_loaded_by_its_notes(tmp_path: Path, monkeypatch: pytest.Monk
 def test_parts_that_do_not_fit_are_named(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         replace(small(), **changes)
-
-
-def test_inputs_are_what_the_model_sees() -> None:
-    config = small()
-    link = Link(latency=0.2)
-    given = config.inputs("all", link=link, boxes="sample")
-    assert (given.past, given.step, given.images) == (2, 1, config.images)
-    assert (given.agents, given.link, given.boxes, given.points) == ("all", link, "sample", False)
-    assert given.on_missing == "skip"
-    assert given.labels is None

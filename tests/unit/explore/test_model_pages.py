@@ -187,12 +187,6 @@ def main_number(run: EvaluationRun, token: str) -> float | None:
     return value if not np.isnan(value) else 0.0 if false else None
 
 
-def test_a_models_page_has_the_worst_twelve(site: Site) -> None:
-    page = site.page("/model/first/").partition("<h2>The worst samples</h2>")[2]
-    shown = [sample_of(f"./{each}") for each in re.findall(r'href="(sample/[^"]+)"', page)]
-    assert shown == site.samples("/model/first/samples")[:12]
-
-
 @pytest.mark.parametrize("name", ["first", "motion", "detection", "warning"])
 def test_each_bar_leads_to_the_samples_of_its_group(site: Site, name: str) -> None:
     run, address = site.runs[name], of("model", name)
@@ -581,12 +575,6 @@ def test_other_labels_are_told(site: Site, da_motion: DeepAccident, tmp_path: Pa
     page = other.page("/model/changed/")
     other.explorer.jobs.end()
     assert "files of 1 scenario are not those that it was evaluated with" in page
-
-
-def test_many_scenarios_are_read_only_for_who_asks(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deepaccident_devkit.explore.pages.models._FEW", 0)
-    assert "?check=truth" in hrefs(site.page("/model/first/"))
-    assert "the same, in 1 scenario" in site.page("/model/first/?check=truth")
 
 
 def test_without_models_the_page_says_how_to_give_some(da_motion: DeepAccident) -> None:

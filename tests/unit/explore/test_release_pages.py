@@ -94,11 +94,6 @@ def mapped(da: DeepAccident, tmp_path: Path) -> Iterator[Reader]:
 # all of them
 
 
-def test_the_address_ends_in_a_slash(reader: Reader) -> None:
-    answer = get(reader.app, "/release")
-    assert (answer.status, answer.headers["location"]) == (307, "./release/")
-
-
 def test_all_links_lead_somewhere(of_damaged: Reader) -> None:
     seen: set[str] = set()
     for tab in TABS:
@@ -278,19 +273,6 @@ def test_findings_are_filtered(of_damaged: Reader, report: ValidationReport, sev
     assert re.search(r"(\d+) finding", page.text.rpartition("loads")[2])
 
 
-def test_the_links_of_kinds_and_severities_filter(of_damaged: Reader, report: ValidationReport) -> None:
-    page = of_damaged.ready("/release/findings")
-    for kind in kinds_of(report.findings):
-        found = of_damaged.page(f"/release/findings{page.address_of(kind['code'])}")
-        assert len(found.table("scenario")) == kind["count"]  # notes too
-    for severity, count in report.counts.items():
-        if count:
-            words = f"{count} {severity}{'' if count == 1 else 's'}"
-            found = of_damaged.page(f"/release/findings{page.address_of(words)}")
-            assert len(found.table("scenario")) == count
-            assert of_damaged.page(f"/release/findings{found.address_of(f'{severity} ×')}").text == page.text
-
-
 def test_long_lists_have_pages(of_damaged: Reader, report: ValidationReport, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(release, "part_of", partial(part_of, size=1))
     page, whats = of_damaged.ready(f"/release/findings?severity={ANY}"), []
@@ -371,21 +353,6 @@ def test_a_selection_that_makes_no_sense_is_told(reader: Reader) -> None:
         assert not [name for name in reader.begun if name.startswith("statistics")]
         assert get(reader.app, f"/release/statistics/ends.png?{query}").status == 404
         assert not page.all("b") or page.all("b") == [{"id": "count"}]
-
-
-def test_a_selection_waits_for_its_column(reader: Reader) -> None:
-    go_on = threading.Event()
-    reader.explorer.jobs.ask("other", "something slow", go_on.wait)
-    try:
-        page = reader.page("/release/statistics?q=min_ttc<1.5")
-        assert "min_ttc<1.5: is being computed" in page.text
-        (place,) = (each for _, each in page.tags if "data-titles" in each)
-        assert "something slow" in json.loads(place["data-titles"])
-        assert not [name for name in reader.begun if name.startswith("statistics")]
-    finally:
-        go_on.set()
-    assert reader.explorer.jobs.wait(60)
-    assert reader.ready("/release/statistics?q=min_ttc<1.5").tables
 
 
 # maps

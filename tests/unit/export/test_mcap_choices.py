@@ -21,7 +21,6 @@ from deepaccident_devkit.errors import (
     MissingFileError,
     NotAvailableError,
     SensorFileError,
-    TokenError,
 )
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
@@ -136,11 +135,6 @@ def test_choices_that_cannot_be_are_refused(
     with pytest.raises(ChoiceError, match=sentence):
         export_mcap(da, scenario, tmp_path / "a.mcap", **choices)
     assert not list(tmp_path.iterdir())
-
-
-def test_an_unknown_scenario_is_refused(da: DeepAccident, tmp_path: Path) -> None:
-    with pytest.raises(TokenError, match="no token 'nowhere/nothing'"):
-        export_mcap(da, "nowhere/nothing", tmp_path / "a.mcap")
 
 
 def test_missing_files_are_left_out_and_told(
@@ -309,8 +303,3 @@ def test_the_verb_refuses_what_it_cannot_read(tmp_path: Path, options: list[str]
     done = CliRunner().invoke(export, ["mcap", str(tmp_path), "--out", "a.mcap", *options])
     assert done.exit_code == 2
     assert sentence in done.output
-
-
-def test_the_verb_refuses_agents_that_do_not_exist(tmp_path: Path) -> None:
-    with pytest.raises(ChoiceError, match=r"--agents: expected .*, found 'nobody'"):
-        export.main(["mcap", str(tmp_path), "--out", "a.mcap", "--agents", "nobody"], standalone_mode=False)

@@ -217,11 +217,6 @@ def test_what_was_left_before_the_manifest_is_no_other_thing(small: DeepAccident
     assert contents(written(small, tmp_path).folder) == contents(whole)
 
 
-def test_an_empty_path_is_refused(small: DeepAccident) -> None:
-    with pytest.raises(ExportError, match="expected a folder for the export, found an empty path"):
-        export_release(small, "", TinyFormat())
-
-
 def test_a_place_that_cannot_be_written_to(small: DeepAccident, tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"/proc/out: cannot be written .*; make room there, or choose"):
         written(small, Path("/proc/out"))
