@@ -80,8 +80,10 @@ SECTION = "Sums.\n\nArgs:\n    first: one.\n\n    second: two."
         (SECTION, SECTION),
         (
             "| field | values |\n|---|---|\n| `town` | any |",
-            "\n.. list-table::\n    :header-rows: 1\n\n    * - field\n      - values\n"
-            "    * - ``town``\\ \n      - any\n",
+            (
+                "\n.. list-table::\n    :header-rows: 1\n\n    * - field\n      - values\n"
+                "    * - ``town``\\ \n      - any\n"
+            ),
         ),
     ],
     ids=["code", "code over a line", "doctest", "fence", "indented code", "section", "table"],
