@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from refusals import assert_refused
 from torch import Tensor, nn
 
 from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
@@ -237,7 +238,7 @@ def test_a_sample_without_its_past_has_no_frame_that_counts() -> None:
 
 def test_what_does_not_fit_is_refused() -> None:
     head, features, targets = head_and_data(SHARED)
-    for make, error, sentence in (
+    assert_refused(
         (
             lambda: head(features[..., :5, :5], targets),
             GeometryError,
@@ -258,9 +259,7 @@ def test_what_does_not_fit_is_refused() -> None:
             NotAvailableError,
             r"outputs: .* found no posterior; give the targets",
         ),
-    ):
-        with pytest.raises(error, match=sentence):
-            make()
+    )
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
@@ -106,7 +107,15 @@ def test_blocks_fill_up_to_the_first_invalid_frame_only() -> None:
 
 
 def test_wrong_configs_say_so() -> None:
-    with pytest.raises(ConfigError, match="at least 1 channel and 1 frame, found 6 and 0"):
-        TemporalConfig(channels=6, grid=GRID, frames=0)
-    with pytest.raises(ConfigError, match="chain: expected one of released, exact, found 'reverse'"):
-        TemporalConfig(channels=6, grid=GRID, chain="reverse")
+    assert_refused(
+        (
+            lambda: TemporalConfig(channels=6, grid=GRID, frames=0),
+            ConfigError,
+            "at least 1 channel and 1 frame, found 6 and 0",
+        ),
+        (
+            lambda: TemporalConfig(channels=6, grid=GRID, chain="reverse"),
+            ConfigError,
+            "chain: expected one of released, exact, found 'reverse'",
+        ),
+    )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from mcap_reading import cloud_of, read_mcap, xyz_of
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.export import export
@@ -226,7 +227,7 @@ def test_detected_boxes_are_drawn_in_their_own_frame(da: DeepAccident, scenario:
 
 def test_predictions_that_are_none_are_refused(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
     sample = f"{scenario}/ego_vehicle/002"
-    for make, error, sentence in (
+    assert_refused(
         (
             lambda: exported(da, scenario, tmp_path, prediction=[sample]),
             ConfigError,
@@ -242,9 +243,7 @@ def test_predictions_that_are_none_are_refused(da: DeepAccident, scenario: str, 
             NotAvailableError,
             f"prediction: has nothing of {scenario} at these agents and frames",
         ),
-    ):
-        with pytest.raises(error, match=sentence):
-            make()
+    )
 
 
 @pytest.mark.parametrize("package", ["mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google.protobuf"])

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, Boxes, BoxVisibility, PinholeCamera
@@ -43,10 +44,10 @@ def test_wrong_shapes_are_refused_and_the_intrinsic_is_a_copy() -> None:
     assert camera.intrinsic[0, 0] == 1
     with pytest.raises(ValueError, match="read-only"):
         camera.intrinsic[0, 0] = 2
-    with pytest.raises(GeometryError, match=r"points: expected shape \(N, 3\)"):
-        camera.project([1, 2, 3])
-    with pytest.raises(GeometryError, match=r"pixels: expected shape \(N, 2\)"):
-        camera.in_image([[1, 2, 3]])
+    assert_refused(
+        (lambda: camera.project([1, 2, 3]), GeometryError, r"points: expected shape \(N, 3\)"),
+        (lambda: camera.in_image([[1, 2, 3]]), GeometryError, r"pixels: expected shape \(N, 2\)"),
+    )
 
 
 def test_unproject_by_hand() -> None:
@@ -54,10 +55,14 @@ def test_unproject_by_hand() -> None:
     points = camera.unproject([[800, 450], [900, 450], [800, 530], [np.nan] * 2], [5, 5, 10, 1])
     assert_allclose(points, [[0, 0, 5], [1, 0, 5], [0, 2, 10], [np.nan] * 3], atol=1e-12)
     assert camera.unproject(np.zeros((0, 2)), []).shape == (0, 3)
-    with pytest.raises(GeometryError, match=r"depth: expected shape \(1\), found \(2,\)"):
-        camera.unproject([[1, 2]], [1, 2])
-    with pytest.raises(GeometryError, match=r"has no inverse; is a focal length 0\?"):
-        PinholeCamera(np.zeros((3, 3)), 10, 10).unproject([[1, 2]], [1])
+    assert_refused(
+        (lambda: camera.unproject([[1, 2]], [1, 2]), GeometryError, r"depth: expected shape \(1\), found \(2,\)"),
+        (
+            lambda: PinholeCamera(np.zeros((3, 3)), 10, 10).unproject([[1, 2]], [1]),
+            GeometryError,
+            r"has no inverse; is a focal length 0\?",
+        ),
+    )
 
 
 def test_in_image_by_depth_and_margin() -> None:

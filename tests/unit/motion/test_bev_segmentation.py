@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
@@ -88,7 +89,7 @@ def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
 
 def test_unknown_classes_and_shares_are_refused(da: DeepAccident) -> None:
     image = _image()
-    for make, error, sentence in (
+    assert_refused(
         (
             lambda: segmentation_of(image, BevGrid(), coverage={"tram": 0.5}),
             ConfigError,
@@ -96,9 +97,7 @@ def test_unknown_classes_and_shares_are_refused(da: DeepAccident) -> None:
         ),
         (lambda: segmentation_of(image, BevGrid(), coverage={"road": 1.0}), ConfigError, "choose a share"),
         (lambda: segmentation_of(image, BevGrid()).mask("tram"), ChoiceError, "expected one of"),
-    ):
-        with pytest.raises(error, match=sentence):
-            make()
+    )
 
 
 def test_results_are_read_only() -> None:

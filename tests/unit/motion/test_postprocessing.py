@@ -5,6 +5,7 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
@@ -184,7 +185,7 @@ def test_results_cannot_be_changed_and_own_nobodys_arrays() -> None:
 
 def test_settings_that_cannot_be() -> None:
     assert post_processing("motion") == PostProcessing()
-    for make, error, sentence in (
+    assert_refused(
         (
             lambda: predict_instances(drawn({}), "vpq"),
             ChoiceError,
@@ -221,9 +222,7 @@ def test_settings_that_cannot_be() -> None:
             ConfigError,
             r"heads: expected MotionHeads, found dict; MotionHeads.from_labels",
         ),
-    ):
-        with pytest.raises(error, match=sentence):
-            make()
+    )
     assert PostProcessing(max_centers=np.int64(100), link_distance=10) == PostProcessing()
 
 
@@ -267,50 +266,56 @@ def test_heads_come_from_anything_that_holds_an_array() -> None:
 def test_heads_that_cannot_be() -> None:
     good = np.zeros((2, 2, 3, 4), dtype=np.float32)
     heat = good[:, :1]
-    for make, sentence in (
+    assert_refused(
         (
             lambda: MotionHeads.from_arrays(
                 good, heat, good, Tensor(good, RuntimeError("Can't call numpy() on Tensor that …"))
             ),
+            GeometryError,
             r"flow: expected numbers, found Tensor .*detach\(\)\.cpu\(\)",
         ),
         (
             lambda: MotionHeads.from_arrays(good, heat, good.astype("U1"), good),
+            GeometryError,
             r"offset: expected numbers, found ndarray \(no numbers: <U1\)",
         ),
         (
             lambda: MotionHeads.from_arrays(np.zeros((2, 3, 3, 4)), heat, good, good),
+            GeometryError,
             r"segmentation: expected \(T, 2, H, W\), .*, found \(2, 3, 3, 4\)$",
         ),
         (
             lambda: MotionHeads.from_arrays(np.moveaxis(good, 1, -1), heat, good, good),
+            GeometryError,
             r"found \(2, 3, 4, 2\); move the channels to the second axis",
         ),
         (
             lambda: MotionHeads.from_arrays(heat, heat, good, good),
+            GeometryError,
             r"found \(2, 1, 3, 4\); of a single logit x for actors, stack -x and x",
         ),
         (
             lambda: MotionHeads.from_arrays(good, good, good, good),
+            GeometryError,
             r"centerness: expected shape \(2, 1, 3, 4\), found \(2, 2, 3, 4\)",
         ),
         (
             lambda: MotionHeads.from_arrays(good, heat, good, good[:1]),
+            GeometryError,
             r"flow: expected shape \(2, 2, 3, 4\), found \(1, 2, 3, 4\)",
         ),
         (
             lambda: MotionHeads.from_arrays(good[:0], heat[:0], good[:0], good[:0]),
+            GeometryError,
             r"at least one frame of one cell, found \(0, 2, 3, 4\)",
         ),
-    ):
-        with pytest.raises(GeometryError, match=sentence):
-            make()
+    )
     certain = good.copy()
     certain[1, 0, 2, 3], certain[1, 1, 2, 3] = -np.inf, np.inf
     assert MotionHeads.from_arrays(certain, heat, good, good).segmentation[1, 0, 2, 3] == -np.inf
     broken = good.copy()
     broken[1, 0, 2, 3] = np.nan
-    for make, error, sentence in (
+    assert_refused(
         (
             lambda: MotionHeads.from_arrays(broken, heat, good, good),
             GeometryError,
@@ -326,9 +331,7 @@ def test_heads_that_cannot_be() -> None:
             ChoiceError,
             "orientation: expected one of devkit, released, fiery, found 'up'",
         ),
-    ):
-        with pytest.raises(error, match=sentence):
-            make()
+    )
 
 
 def test_labels_are_a_prediction_that_is_right_and_255_is_no_vector() -> None:

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 from strategies import mutations
 
 from deepaccident_devkit.errors import LabelError, MissingFileError
@@ -154,10 +155,10 @@ def test_more_files_than_go_into_one_call(write) -> None:
 def test_of_many_files_the_first_faulty_one_is_named(write) -> None:
     good, first, second = write(REAL, "good.txt"), write("1 x", "first.txt"), write("1 y", "second.txt")
     paths = [good] * 300 + [first] + [good] * 2500 + [second] + [good] * 10
-    with pytest.raises(LabelError, match=rf"^{first}:1: 'x' is no number"):
-        read_labels(paths)
-    with pytest.raises(MissingFileError, match=r"gone\.txt"):
-        read_labels([*paths[:300], good.with_name("gone.txt"), *paths])
+    assert_refused(
+        (lambda: read_labels(paths), LabelError, rf"^{first}:1: 'x' is no number"),
+        (lambda: read_labels([*paths[:300], good.with_name("gone.txt"), *paths]), MissingFileError, r"gone\.txt"),
+    )
 
 
 WORDS = st.one_of(

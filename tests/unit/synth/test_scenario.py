@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.collision import separation
@@ -126,10 +127,10 @@ def test_a_scenario_in_which_nobody_meets_is_given_up(build_own, monkeypatch, ca
 def test_draws_that_all_miss_by_far_are_given_up_early(build_own, monkeypatch):
     monkeypatch.setattr("deepaccident_devkit.synth.scenario.FAR_DRAWS", 3)
     monkeypatch.setattr("deepaccident_devkit.synth.scenario.MAX_DRAWS", 4)
-    with pytest.raises(ConfigError, match="in 3 draws"):
-        build_own(LATE)
-    with pytest.raises(ConfigError, match="in 4 draws"):
-        build_own(LATE.replace("from: south", "from: [south, north]"))
+    assert_refused(
+        (lambda: build_own(LATE), ConfigError, "in 3 draws"),
+        (lambda: build_own(LATE.replace("from: south", "from: [south, north]")), ConfigError, "in 4 draws"),
+    )
 
 
 def test_paths_that_do_not_cross_are_named(build_own, monkeypatch):
@@ -141,12 +142,18 @@ def test_paths_that_do_not_cross_are_named(build_own, monkeypatch):
 
 def test_a_twin_that_cannot_be_made_is_named_by_its_file(build_own, monkeypatch):
     monkeypatch.setattr("deepaccident_devkit.synth.scenario.perform_twin", lambda *_: None)
-    with pytest.raises(ConfigError, match=r"own.yaml:3: actors: the road users collide although all obey the rules"):
-        build_own(LATE.partition("meet:")[0])
-    with pytest.raises(
-        ConfigError, match=r"own.yaml:3: actors: the road users collide in the normal twin too, even if"
-    ):
-        build_own(LATE.replace("offset: 3", "offset: 0"), twin=True)
+    assert_refused(
+        (
+            lambda: build_own(LATE.partition("meet:")[0]),
+            ConfigError,
+            r"own.yaml:3: actors: the road users collide although all obey the rules",
+        ),
+        (
+            lambda: build_own(LATE.replace("offset: 3", "offset: 0"), twin=True),
+            ConfigError,
+            r"own.yaml:3: actors: the road users collide in the normal twin too, even if",
+        ),
+    )
 
 
 def test_a_slow_cyclist_is_hit(build_own):

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import tiny
 from click.testing import CliRunner
+from refusals import assert_refused
 from tiny_index import INDEX, contents, label, opened
 
 from deepaccident_devkit import files
@@ -101,10 +102,10 @@ def test_info_of_indexes_in_more_than_one_place(root: Path, cache: Path, monkeyp
 
 
 def test_info_of_no_release(tmp_path: Path) -> None:
-    with pytest.raises(DatarootError, match="does not exist"):
-        index_report(tmp_path / "nowhere")
-    with pytest.raises(VersionError, match="unknown version 'v2'"):
-        index_report(tmp_path, version="v2")
+    assert_refused(
+        (lambda: index_report(tmp_path / "nowhere"), DatarootError, "does not exist"),
+        (lambda: index_report(tmp_path, version="v2"), VersionError, "unknown version 'v2'"),
+    )
 
 
 def test_clear_removes_every_index_and_says_what(root: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

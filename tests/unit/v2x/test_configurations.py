@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
@@ -68,7 +69,7 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
     assert cooperating_agents(da_b, sample, [POLE, OTHER, POLE]) == (OTHER, POLE)
     assert cooperating_agents(da_b, sample, [POLE]) == (POLE,)
     assert cooperating_agents(da_b, sample, "available") == cooperating_agents(da_b, sample, None)
-    for make, error, sentence in (
+    assert_refused(
         (
             lambda: cooperating_agents(da_b, sample, POLE),
             ChoiceError,
@@ -76,9 +77,7 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
         ),
         (lambda: cooperating_agents(da_b, sample, []), ChoiceError, "at least one agent"),
         (lambda: cooperating_agents(da_b, sample + "9"), TokenError, "table 'sample' has no token"),
-    ):
-        with pytest.raises(error, match=sentence):
-            make()
+    )
 
 
 def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:

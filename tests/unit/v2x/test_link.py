@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident, v2x
 from deepaccident_devkit.errors import ConfigError
@@ -43,15 +44,13 @@ def test_a_latency_longer_than_the_past_names_what_there_is(da_b: DeepAccident, 
 
 
 def test_settings_that_are_not_possible() -> None:
-    for make, sentence in (
-        (lambda: Link(packet_loss=2), "packet_loss: 2 is no probability"),
-        (lambda: PoseNoise(std=-1), "std is -1; choose a finite number"),
-        (lambda: Link(pose_noise="much"), "pose_noise: expected metres or a PoseNoise, found 'much'"),
-        (lambda: PoseNoise(law="cauchy"), "law: expected one of paper, zero-mean, found 'cauchy'"),
-        (lambda: PoseNoise(mean=0.3, law="zero-mean"), r"zero-mean takes no mean, found 0\.3"),
-    ):
-        with pytest.raises(ConfigError, match=sentence):
-            make()
+    assert_refused(
+        (lambda: Link(packet_loss=2), ConfigError, "packet_loss: 2 is no probability"),
+        (lambda: PoseNoise(std=-1), ConfigError, "std is -1; choose a finite number"),
+        (lambda: Link(pose_noise="much"), ConfigError, "pose_noise: expected metres or a PoseNoise, found 'much'"),
+        (lambda: PoseNoise(law="cauchy"), ConfigError, "law: expected one of paper, zero-mean, found 'cauchy'"),
+        (lambda: PoseNoise(mean=0.3, law="zero-mean"), ConfigError, r"zero-mean takes no mean, found 0\.3"),
+    )
     assert Link(pose_noise=0.3) == Link(pose_noise=PoseNoise(mean=0.3, std=0.02, heading_std=0, law="paper"))
     assert pickle.loads(pickle.dumps(Link(pose_noise=0.3))) == Link(pose_noise=0.3)
 
@@ -202,8 +201,16 @@ def test_every_call_that_takes_agents_takes_a_link() -> None:
 
 
 def test_likely_mistakes_of_units_are_named() -> None:
-    with pytest.raises(ConfigError, match=r"latency: 200 s is longer than any scenario; if .* milliseconds, give 0\.2"):
-        Link(latency=200)
-    with pytest.raises(ConfigError, match=r"heading_std is 5 radians, .*; if these are degrees, give 0\.08727"):
-        PoseNoise(heading_std=5.0)
+    assert_refused(
+        (
+            lambda: Link(latency=200),
+            ConfigError,
+            r"latency: 200 s is longer than any scenario; if .* milliseconds, give 0\.2",
+        ),
+        (
+            lambda: PoseNoise(heading_std=5.0),
+            ConfigError,
+            r"heading_std is 5 radians, .*; if these are degrees, give 0\.08727",
+        ),
+    )
     assert Link(latency=20).latency_frames == 200

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.segmentation import BevSegmentationEvaluator
@@ -42,10 +43,14 @@ def test_unknown_cells_do_not_count() -> None:
 
 def test_predictions_that_do_not_fit() -> None:
     evaluator, truth = BevSegmentationEvaluator(), targets()
-    with pytest.raises(GeometryError, match="expected shape"):
-        evaluator.update("a", np.zeros((5, 3, 4), dtype=bool), truth)
-    with pytest.raises(GeometryError, match="compare scores with a threshold"):
-        evaluator.update("a", np.full((5, 4, 4), 0.4), truth)
+    assert_refused(
+        (lambda: evaluator.update("a", np.zeros((5, 3, 4), dtype=bool), truth), GeometryError, "expected shape"),
+        (
+            lambda: evaluator.update("a", np.full((5, 4, 4), 0.4), truth),
+            GeometryError,
+            "compare scores with a threshold",
+        ),
+    )
     moved = BevSegmentation(grid=GRID.with_orientation("fiery"), masks=truth.masks, known=truth.known)
     with pytest.raises(GeometryError, match="use one grid"):
         evaluator.update("a", moved, truth)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 from tiny_format import KilledFormat, TinyFormat
 
 from deepaccident_devkit import DeepAccident
@@ -200,13 +201,15 @@ def test_a_folder_of_other_settings_is_refused(
 def test_a_folder_with_other_things_is_refused(small: DeepAccident, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     before = states(tmp_path)
-    for make, sentence in (
-        (lambda: written(small, tmp_path), r"is not empty \(notes.txt\) and holds no tiny export; choose a new folder"),
-        (lambda: written(small, tmp_path / "notes.txt"), r"notes.txt: is a file; give a folder"),
-        (lambda: written(small, tmp_path / "notes.txt" / "out"), r"cannot be written \(.*Not a directory"),
-    ):
-        with pytest.raises(ExportError, match=sentence):
-            make()
+    assert_refused(
+        (
+            lambda: written(small, tmp_path),
+            ExportError,
+            r"is not empty \(notes.txt\) and holds no tiny export; choose a new folder",
+        ),
+        (lambda: written(small, tmp_path / "notes.txt"), ExportError, r"notes.txt: is a file; give a folder"),
+        (lambda: written(small, tmp_path / "notes.txt" / "out"), ExportError, r"cannot be written \(.*Not a directory"),
+    )
     assert states(tmp_path) == before
 
 

@@ -14,12 +14,20 @@ def presents(rules: WindowRules, last: int) -> list[int]:
     return [each.present for each in rules.windows(last, "recording", "seed")]
 
 
-def test_presents_are_counted_back_from_the_last_frame_which_is_none() -> None:
-    assert presents(WindowRules(observe=2.0), 57) == [27, 37, 47]
-    assert presents(WindowRules(observe=2.0, stride=0.5), 40) == [25, 30, 35]
-    assert presents(WindowRules(observe=2.0, stride=0.5), 41) == [21, 26, 31, 36]
-    assert presents(WindowRules(observe=2.0, stride=0.5, partial_past=True), 12) == [2, 7]
-    assert presents(WindowRules(observe=5.0), 51) == []
+@pytest.mark.parametrize(
+    ("rules", "last", "expected"),
+    [
+        (WindowRules(observe=2.0), 57, [27, 37, 47]),
+        (WindowRules(observe=2.0, stride=0.5), 40, [25, 30, 35]),
+        (WindowRules(observe=2.0, stride=0.5), 41, [21, 26, 31, 36]),
+        (WindowRules(observe=2.0, stride=0.5, partial_past=True), 12, [2, 7]),
+        (WindowRules(observe=5.0), 51, []),
+    ],
+)
+def test_presents_are_counted_back_from_the_last_frame_which_is_none(
+    rules: WindowRules, last: int, expected: list[int]
+) -> None:
+    assert [each.present for each in rules.windows(last, "recording", "seed")] == expected
 
 
 def test_the_moments_of_a_window() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from accident_scenes import as_heads, as_maps, scene, standing
 from numpy.testing import assert_allclose
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, EvaluationError
@@ -260,10 +261,10 @@ def test_label_maps_against_the_boxes_of_a_release(da_motion: DeepAccident) -> N
 
 
 def test_what_cannot_be_evaluated(da_motion: DeepAccident) -> None:
-    with pytest.raises(EvaluationError, match="accident_context"):
-        BOXES.counts([alarm()], None, META)
-    with pytest.raises(EvaluationError, match="list of Accidents"):
-        counted([(1, 2)], CRASH)
+    assert_refused(
+        (lambda: BOXES.counts([alarm()], None, META), EvaluationError, "accident_context"),
+        (lambda: counted([(1, 2)], CRASH), EvaluationError, "list of Accidents"),
+    )
     for metres in (0, math.inf):
         with pytest.raises(ConfigError, match="match_distance"):
             PaperAccidents(match_distance=metres)

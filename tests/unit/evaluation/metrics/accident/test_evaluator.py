@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from accident_scenes import as_maps, scene, standing
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, NotAvailableError
@@ -37,10 +38,18 @@ def test_boxes_take_their_truth_as_label_or_as_context() -> None:
     result = evaluator.compute()
     assert (result.apa, result.positives) == (1, 4)
     evaluator.update("both", [PAIR], scene(CARS), AccidentContext(truth=TRUTH))
-    with pytest.raises(EvaluationError, match="both say what is true"):
-        evaluator.update("twice", [PAIR], TRUTH, AccidentContext(truth=TRUTH))
-    with pytest.raises(EvaluationError, match=r"give box_truth\(dataset, sample\)"):
-        evaluator.update("nothing", [PAIR], scene(CARS))
+    assert_refused(
+        (
+            lambda: evaluator.update("twice", [PAIR], TRUTH, AccidentContext(truth=TRUTH)),
+            EvaluationError,
+            "both say what is true",
+        ),
+        (
+            lambda: evaluator.update("nothing", [PAIR], scene(CARS)),
+            EvaluationError,
+            r"give box_truth\(dataset, sample\)",
+        ),
+    )
 
 
 def test_a_generator_of_alarms_counts_like_a_list() -> None:
@@ -56,10 +65,18 @@ def test_other_predictions_and_labels_are_refused(protocol) -> None:
     for prediction in (None, label.instance, PAIR, "alarm", [PAIR, None]):
         with pytest.raises(EvaluationError, match="a MotionOutput or a list of Accidents"):
             evaluator.update("one", prediction, label, AccidentContext(truth=TRUTH))
-    with pytest.raises(EvaluationError, match="label: expected MotionLabels"):
-        evaluator.update("one", as_maps(label), label.instance)
-    with pytest.raises(EvaluationError, match="context: expected an AccidentContext"):
-        evaluator.update("one", as_maps(label), label, TRUTH)
+    assert_refused(
+        (
+            lambda: evaluator.update("one", as_maps(label), label.instance),
+            EvaluationError,
+            "label: expected MotionLabels",
+        ),
+        (
+            lambda: evaluator.update("one", as_maps(label), label, TRUTH),
+            EvaluationError,
+            "context: expected an AccidentContext",
+        ),
+    )
     assert len(evaluator) == 0
 
 
