@@ -29,6 +29,7 @@ from deepaccident_devkit.interactions import (
     gaps_of_pairs,
     interactions_of,
     modified_ttc,
+    nearest_approach,
     post_encroachment_time,
     time_to_collision,
     time_to_collision_1d,
@@ -55,6 +56,7 @@ def measure() -> list[Figure]:
         "drac": lambda: drac(*there),
         "mttc": lambda: modified_ttc(*boxes, *speeds, *rates),
         "closing_speed_of_boxes": lambda: closing_speed_of_boxes(*there),
+        "nearest_approach": lambda: nearest_approach(*there),
         "pet": lambda: post_encroachment_time(*there),
     }
     with one_core():

@@ -2,15 +2,19 @@
 
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
-from deepaccident_devkit.interactions.approach import modified_ttc
+from deepaccident_devkit.interactions.approach import modified_ttc, nearest_approach
 from deepaccident_devkit.interactions.config import CLASS_MASSES, InteractionConfig, masses_of
-from deepaccident_devkit.interactions.encroachment import post_encroachment_time
+from deepaccident_devkit.interactions.encroachment import conflict_area_pet, post_encroachment_time
 from deepaccident_devkit.interactions.measures import (
+    closing_speed,
     closing_speed_of_boxes,
     delta_v,
     drac,
+    drac_1d,
     drac_of,
+    impact_direction,
     impact_heading,
+    modified_ttc_1d,
     relative_speed,
     time_exposed,
     time_integrated,
@@ -24,16 +28,22 @@ __all__ = [
     "InteractionConfig",
     "InteractionPairs",
     "Interactions",
+    "closing_speed",
     "closing_speed_of_boxes",
+    "conflict_area_pet",
     "delta_v",
     "drac",
+    "drac_1d",
     "drac_of",
     "gaps_of_pairs",
+    "impact_direction",
     "impact_heading",
     "interactions",
     "interactions_of",
     "masses_of",
     "modified_ttc",
+    "modified_ttc_1d",
+    "nearest_approach",
     "post_encroachment_time",
     "relative_speed",
     "time_exposed",

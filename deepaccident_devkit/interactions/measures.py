@@ -32,6 +32,21 @@ def time_to_collision_1d(
     return _known(np.where(meets, times, np.inf), closing)
 
 
+def drac_1d(
+    first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
+) -> FloatArray:
+    """Deceleration rate to avoid a crash, m/s², along the first's heading: c² / 2g; see `time_to_collision_1d`.
+
+    Returns:
+        (…,) 0 without a conflict, infinite at contact.
+    """
+    gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        rates = np.where(gap <= 0, np.inf, closing**2 / (2 * gap))
+    meets = ~beside & ((closing > 0) | (gap <= 0))
+    return _known(np.where(meets, rates, 0.0), closing)
+
+
 def drac(first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray) -> FloatArray:
     """Deceleration rate to avoid a crash in the plane, m/s²: the relative speed over twice the time to collision.
 
@@ -49,9 +64,44 @@ def drac_of(times: FloatArray, relative_speeds: FloatArray) -> FloatArray:
     return _known(np.where(times == 0, np.inf, rates), times)
 
 
+def modified_ttc_1d(
+    first: FloatArray,
+    second: FloatArray,
+    first_velocity: FloatArray,
+    second_velocity: FloatArray,
+    first_acceleration: FloatArray,
+    second_acceleration: FloatArray,
+) -> FloatArray:
+    """`time_to_collision_1d` with accelerations (…,) that stay, m/s² along each one's own heading.
+
+    As the literature has it, also past a standstill: who brakes reverses in the end. `modified_ttc` does not.
+
+    Returns:
+        (…,) infinite unless the two overlap sideways now and the gap closes at some time; 0 if it has none.
+    """
+    gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
+    heading = normals(first[..., 4])
+    accelerations = [
+        acceleration[..., None] * normals(boxes[..., 4])
+        for boxes, acceleration in ((first, first_acceleration), (second, second_acceleration))
+    ]
+    ahead = np.sign(_dot(second[..., :2] - first[..., :2], heading))
+    gaining = ahead * _dot(accelerations[0] - accelerations[1], heading)
+    times = np.where(gap <= 0, 0.0, least_root(gaining / 2, closing, -gap))
+    return _known(np.where(beside, np.inf, times), closing + gaining)
+
+
 def relative_speed(first_velocity: FloatArray, second_velocity: FloatArray) -> FloatArray:
     """Length (…,) of the difference of two velocities (…, 2)."""
     return _length(second_velocity - first_velocity)
+
+
+def closing_speed(
+    first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
+) -> FloatArray:
+    """Speed (…,) with which the centres come closer; negative if they part, NaN if they are one point."""
+    apart = second[..., :2] - first[..., :2]
+    return _closing(apart, second_velocity - first_velocity)
 
 
 def closing_speed_of_boxes(
@@ -77,6 +127,16 @@ def impact_heading(first: FloatArray, second: FloatArray) -> FloatArray:
     return wrapped(second[..., 4] - first[..., 4])
 
 
+def impact_direction(first: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray) -> FloatArray:
+    """The direction (…,) in which the first moves relative to the second, as the first sees it, in (−π, π].
+
+    0 is straight ahead. NaN where there is no relative motion.
+    """
+    motion = first_velocity - second_velocity
+    direction = wrapped(np.arctan2(motion[..., 1], motion[..., 0]) - first[..., 4])
+    return np.where(_length(motion) > 0, direction, np.nan)
+
+
 def time_exposed(times: FloatArray, threshold: float, step: float) -> FloatArray:
     """Time exposed TET (…,): seconds of moments (…, T), `step` apart, whose time to collision is within a threshold."""
     result: FloatArray = (np.asarray(times) <= threshold).sum(axis=-1) * step
@@ -94,6 +154,20 @@ def wrapped(angles: FloatArray) -> FloatArray:
     """Angles in (−π, π]."""
     turned: FloatArray = np.pi - np.mod(np.pi - angles, 2 * np.pi)
     return turned
+
+
+def least_root(square: FloatArray, linear: FloatArray, constant: FloatArray) -> FloatArray:
+    """The least root above 0 of square·t² + linear·t + constant, whose constant is below 0; infinite without one.
+
+    In the form that loses no digits where the square is small.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        inner = linear**2 - 4 * square * constant
+        half = -(linear + np.copysign(np.sqrt(inner), linear)) / 2
+        roots = np.stack(np.broadcast_arrays(constant / half, half / square))
+    roots = np.where(np.isfinite(roots) & (roots > 0), roots, np.inf)
+    least: FloatArray = roots.min(axis=0)
+    return least
 
 
 def _along_heading(

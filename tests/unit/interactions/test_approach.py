@@ -1,4 +1,4 @@
-"""The time to collision with accelerations: by hand, and against small steps of time."""
+"""The nearest approach and the time to collision with accelerations: by hand, and against small steps of time."""
 
 import math
 
@@ -7,15 +7,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit.interactions import gaps_of_pairs, modified_ttc, time_to_collision
+from deepaccident_devkit.interactions import gaps_of_pairs, modified_ttc, nearest_approach, time_to_collision
 
 CAR = np.array([0.0, 0.0, 4.0, 2.0, 0.0])
 AHEAD = np.array([24.0, 0.0, 4.0, 2.0, 0.0])
 TURNED = np.array([24.0, 0.0, 4.0, 2.0, math.pi])
+STILL, TEN = np.zeros(2), np.array([10.0, 0.0])
 
 
 def seconds(first, second, *motion: float) -> float:
     return modified_ttc(first, second, *map(np.float64, motion)).item()
+
+
+def test_passing_by_the_gap_is_least_beside_the_other() -> None:
+    beside = np.array([24.0, 5.0, 4.0, 2.0, 0.0])
+    assert nearest_approach(CAR, beside, TEN, STILL) == (pytest.approx(3), pytest.approx(2))
+    assert nearest_approach(CAR, beside, TEN, STILL, horizon=1.0) == (pytest.approx(math.hypot(10, 3)), 1)
+    assert nearest_approach(CAR, beside, -TEN, STILL) == (pytest.approx(math.hypot(20, 3)), 0)
+    assert nearest_approach(CAR, AHEAD, TEN, STILL) == (0, pytest.approx(2))
+    assert nearest_approach(CAR, AHEAD, TEN, STILL, horizon=1.0) == (pytest.approx(10), 1)
+    assert nearest_approach(CAR, AHEAD, TEN, TEN) == (pytest.approx(20), 0)
+    assert np.isnan(nearest_approach(CAR, AHEAD, TEN, np.full(2, np.nan))).all()
 
 
 def test_one_that_brakes_stops_and_stays() -> None:
@@ -79,6 +91,23 @@ def test_without_accelerations_it_is_the_time_to_collision(first, second, one, o
         speed * np.array([math.cos(box[4]), math.sin(box[4])]) for box, speed in ((first, one), (second, other))
     ]
     expected = time_to_collision(first, second, *velocity)
-    larger = time_to_collision(first + np.array([0, 0, 1e-6, 1e-6, 0]), second, *velocity)
-    if np.isfinite(expected) == np.isfinite(larger):  # else it is neither a touch nor none
+    gap, _ = nearest_approach(first, second, *velocity, horizon=1e6)
+    if not 0 < gap < 1e-6:  # neither a touch nor none
         assert seconds(first, second, one, other, 0, 0) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+@given(boxes, boxes, speeds, speeds, st.floats(0.5, 20))
+def test_the_nearest_approach_is_the_least_of_many_moments(first, second, one, other, horizon) -> None:
+    velocity = [
+        speed * np.array([math.cos(box[4]), math.sin(box[4])]) for box, speed in ((first, one), (second, other))
+    ]
+    gap, time = nearest_approach(first, second, *velocity, horizon)
+    times = np.append(np.linspace(0, horizon, 200), time)
+    moved = [
+        np.column_stack([box[:2] + times[:, None] * each, np.tile(box[2:], (len(times), 1))])
+        for box, each in zip((first, second), velocity, strict=True)
+    ]
+    gaps = gaps_of_pairs(*moved)
+    assert 0 <= time <= horizon
+    assert gaps[-1] == pytest.approx(gap, abs=1e-6)
+    assert gap <= gaps.min() + 1e-9

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit.interactions import gaps_of_pairs, post_encroachment_time, time_to_collision
+from deepaccident_devkit.interactions import conflict_area_pet, gaps_of_pairs, post_encroachment_time, time_to_collision
 
 EAST = np.array([-20.0, 0.0, 4.0, 2.0, 0.0])
 NORTH = np.array([0.0, -40.0, 4.0, 2.0, math.pi / 2])
@@ -18,11 +18,14 @@ def test_one_crosses_two_seconds_after_the_other() -> None:
     # the first is on x −1..1 between 1.7 s and 2.3 s, the second on y −1..1 between 3.7 s and 4.3 s
     assert post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH) == pytest.approx(1.4)
     assert post_encroachment_time(NORTH, EAST, TEN_NORTH, TEN_EAST) == pytest.approx(-1.4)
+    assert conflict_area_pet(EAST, NORTH, TEN_EAST, TEN_NORTH) == pytest.approx(1.4)
+    assert conflict_area_pet(NORTH, EAST, TEN_NORTH, TEN_EAST) == pytest.approx(1.4)
 
 
 def test_the_window_ends_what_counts() -> None:
     assert post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.6) == math.inf
     assert post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.8) == pytest.approx(1.4)
+    assert math.isnan(conflict_area_pet(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.6))
 
 
 def test_who_stands_is_always_there() -> None:
@@ -31,6 +34,8 @@ def test_who_stands_is_always_there() -> None:
     assert post_encroachment_time(standing, standing, STILL, STILL) == 0
     aside = np.array([0.0, 9.0, 4.0, 2.0, 0.3])
     assert post_encroachment_time(EAST, aside, TEN_EAST, STILL) == math.inf
+    assert math.isnan(conflict_area_pet(EAST, aside, TEN_EAST, STILL))
+    assert conflict_area_pet(EAST, standing, TEN_EAST, STILL) < 0
     assert math.isnan(post_encroachment_time(EAST, NORTH, TEN_EAST, np.full(2, np.nan)))
 
 
@@ -71,3 +76,6 @@ def test_it_is_0_where_they_touch_and_turns_with_the_pair(first, second, one, ot
     )
     if time_to_collision(first, second, one, other) < WINDOW - 1e-6:
         assert found == pytest.approx(0, abs=1e-6)
+    area = conflict_area_pet(first, second, one, other, WINDOW)
+    if found == math.inf:
+        assert math.isnan(area) or area > 0
