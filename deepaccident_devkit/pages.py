@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.taxonomy import short_name
-from deepaccident_devkit.text import counted, number_text, size_text
+from deepaccident_devkit.text import counted, number_text
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -47,7 +47,6 @@ def environment() -> Environment:
         "png": png_address,
         "result": result_text,
         "scalar": scalar,
-        "size": lambda count: "unknown" if count is None else size_text(count),
         "thousands": "{:,}".format,
     }
     made.globals["version"] = __version__

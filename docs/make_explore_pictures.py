@@ -79,7 +79,6 @@ def keep_all(served: Served, explorer: Explorer) -> None:
         "compare": ("compare/ego_alone/five_agents/", "", COMPUTED),
         "compare_sample": (f"compare/ego_alone/five_agents/sample/{worst}", "", LOADED),
         "release": ("release/", "", COMPUTED),
-        "findings": ("release/findings", "", COMPUTED),
     }
     options = webdriver.ChromeOptions()
     for option in ("--headless=new", "--no-sandbox", "--hide-scrollbars", "--disable-gpu"):

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -133,7 +133,9 @@ class Found:
 
 
 def command(*arguments: str) -> None:
-    """Run a command of the devkit in this process, silently."""
+    """Run a command of the devkit in this process, silently; older checkouts spell some options otherwise."""
+    import click
+
     from deepaccident_devkit.cli import deepaccident
 
     with (
@@ -141,7 +143,16 @@ def command(*arguments: str) -> None:
         contextlib.redirect_stdout(nowhere),
         contextlib.redirect_stderr(nowhere),
     ):
-        deepaccident.main(list(arguments), standalone_mode=False)
+        try:
+            deepaccident.main(list(arguments), standalone_mode=False)
+        except click.UsageError:
+            deepaccident.main(_as_before(arguments), standalone_mode=False)
+
+
+def _as_before(arguments: Sequence[str]) -> list[str]:
+    """A command as it was written before November 2026; every spelling that went gets a line here."""
+    size = {"synth": "--image-size", "cache": "--resize"}.get(arguments[0], "--size")
+    return "\0".join(arguments).replace("--sensors\0none", "--no-sensors").replace("--size", size).split("\0")
 
 
 def digests_of_files(folder: Path) -> Digests:
@@ -337,7 +348,17 @@ def digests_in(checkout: Path, python: str, releases: Path, folder: Path) -> Dig
 def make_releases(checkout: Path, python: str, folder: Path) -> None:
     """Make the releases by a checkout."""
     for name, words in RELEASES.items():
-        run_in(checkout, python, "-m", "deepaccident_devkit.cli", "synth", str(folder / name), *words, folder=folder)
+        call = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from digests import command"
+        run_in(
+            checkout,
+            python,
+            "-c",
+            f"{call}; command(*sys.argv[1:])",
+            "synth",
+            str(folder / name),
+            *words,
+            folder=folder,
+        )
 
 
 def differences(before: Digests, after: Digests) -> dict[str, str]:

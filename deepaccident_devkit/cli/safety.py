@@ -21,8 +21,8 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.pictures import write_figure
-from deepaccident_devkit.render.safety import render_lead_times, render_twins, save_safety_report
-from deepaccident_devkit.render.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, TWINS_SIZE, render_avoidability
+from deepaccident_devkit.render.safety import render_lead_times, save_safety_report
+from deepaccident_devkit.render.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability
 from deepaccident_devkit.render.safety.report import REPLAYS
 from deepaccident_devkit.safety import (
     ObservationRule,
@@ -30,7 +30,6 @@ from deepaccident_devkit.safety import (
     lead_time_ledger,
     safety_report,
     stories,
-    twin_diff,
     twin_report,
 )
 from deepaccident_devkit.safety.avoidability import GROUPS
@@ -71,23 +70,19 @@ def _avoidability(dataset: DeepAccident, chosen: Scenarios, **engine: Any) -> tu
     }
 
 
-def _twins(dataset: DeepAccident, chosen: Scenarios, *, scenario: str | None, **engine: Any) -> tuple[Any, Files]:
-    diff = None if scenario is None else twin_diff(dataset, scenario)
-    report = twin_report(dataset, chosen if diff is None else [diff.accident], **engine)
-    if diff is None:
-        return report, {}
-    return report, {"twins_over_time.csv": diff.to_csv, "twins.png": _picture(render_twins, TWINS_SIZE, diff)}
+def _twins(dataset: DeepAccident, chosen: Scenarios, **engine: Any) -> tuple[Any, Files]:
+    return twin_report(dataset, chosen, **engine), {}
 
 
-_TABLES: Final[dict[str, tuple[Callable[..., tuple[Any, Files]], str, tuple[str, ...]]]] = {
-    "lead-time": (_lead_time, "lead_times.json", ("kind",)),
-    "avoidability": (_avoidability, "avoidability.json", ()),
-    "twins": (_twins, "twins.json", ("scenario",)),
+_TABLES: Final[dict[str, tuple[Callable[..., tuple[Any, Files]], str]]] = {
+    "lead-time": (_lead_time, "lead_times.json"),
+    "avoidability": (_avoidability, "avoidability.json"),
+    "twins": (_twins, "twins.json"),
 }
-"""Topic → what makes its report and further files, the report's JSON file, and the options that it takes."""
+"""Topic → what makes its report and further files, and the report's JSON file."""
 _OF_TOPIC: Final = {
     "kind": ("lead-time",),
-    "scenario": ("describe", "twins"),
+    "scenario": ("describe",),
     "replays": ("report",),
     "as_json": ("describe", *_TABLES),
 }
@@ -134,8 +129,8 @@ def safety(topic: str, where: tuple[str, ...], out: str | None, as_json: bool, *
     avoidability  Until when braking of either collider, or of both, would have avoided the accident.
     twins         When accidents and their normal twins part, and who acts differently.
 
-    SCENARIO, a token of the form TYPE/NAME, makes `describe` and `twins` tell of this one alone. All is computed from
-    labels and meta. What cannot be told is named with its reason, or left out. docs/safety.md says what numbers mean.
+    SCENARIO, a token of the form TYPE/NAME, makes `describe` tell of this one alone. All is computed from labels and
+    meta. What cannot be told is named with its reason, or left out. docs/safety.md says what numbers mean.
     """  # noqa: D301, D415 - \b is click's mark of lines that are not wrapped
     for name, topics in _OF_TOPIC.items():
         if topic not in topics:
@@ -151,9 +146,9 @@ def safety(topic: str, where: tuple[str, ...], out: str | None, as_json: bool, *
     dataset, engine = DeepAccident(**options), engine_of(options)
     chosen = dataset.find(*where) if where else None
     if topic in _TABLES:
-        make, name, taken = _TABLES[topic]
-        own = {"kind": kind, "scenario": scenario}
-        report, files = make(dataset, chosen, **{each: own[each] for each in taken}, **engine)
+        make, name = _TABLES[topic]
+        own = {"kind": kind} if topic in _OF_TOPIC["kind"] else {}
+        report, files = make(dataset, chosen, **own, **engine)
         written = write_report(report, target, name)
         if target is not None:
             written += [write(target / file) for file, write in files.items()]

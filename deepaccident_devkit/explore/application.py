@@ -12,7 +12,7 @@ from starlette.responses import Response
 
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError, NotAvailableError, TokenError
 from deepaccident_devkit.explore.explorer import Explorer
-from deepaccident_devkit.explore.pages import models, pictures, release, scenario, scenarios, statistics
+from deepaccident_devkit.explore.pages import models, pictures, release, scenario, scenarios
 from deepaccident_devkit.explore.pages.answers import page, static_routes
 
 logger = logging.getLogger(__name__)
@@ -32,7 +32,6 @@ def make_app(explorer: Explorer) -> Starlette:
             *pictures.routes(),
             *models.routes(),
             *release.routes(),
-            *statistics.routes(),
         ],
         exception_handlers={HTTPException: _refused, DeepAccidentError: _failed},
     )

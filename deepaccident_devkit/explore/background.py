@@ -80,10 +80,6 @@ class Jobs:
             self._jobs[name].asked = next(self._asked)
             return self._jobs[name]
 
-    def get(self, name: str) -> Job | None:
-        """The job of a name; None if nobody asked for it."""
-        return self._jobs.get(name)
-
     def all(self) -> list[Job]:
         """All jobs, in the order in which they were asked for."""
         with self._changed:

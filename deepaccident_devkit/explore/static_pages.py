@@ -14,17 +14,15 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError, NotAvailableError, ResultsError
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.explore.background import Jobs
-from deepaccident_devkit.explore.choices import SCORE, find_call, where_words
-from deepaccident_devkit.explore.evaluations import verdict
+from deepaccident_devkit.explore.choices import find_call, where_words
 from deepaccident_devkit.explore.explorer import thumbnail
 from deepaccident_devkit.explore.models import Model, open_models
 from deepaccident_devkit.explore.pages.answers import assets
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_context
-from deepaccident_devkit.explore.pages.scenarios import SLOW, Cell, cell, entry, score_cell, sort_key
+from deepaccident_devkit.explore.pages.scenarios import SLOW, cell, entry
 from deepaccident_devkit.explore.scenarios import accident_columns
 from deepaccident_devkit.files import (
     path_of,
@@ -35,7 +33,7 @@ from deepaccident_devkit.files import (
     write_bytes,
 )
 from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.pages import rendered, result_text
+from deepaccident_devkit.pages import rendered
 from deepaccident_devkit.parallel import Engine, Places, run_batch
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.replay import recording_of, tried_replay
@@ -43,7 +41,6 @@ from deepaccident_devkit.render.replay.replay import facts
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.selection import find
 from deepaccident_devkit.selection.fields import measures_of_moving_pairs
-from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -67,10 +64,6 @@ _POLICY: Final = (
     "frame-src 'self' file:; base-uri 'none'; form-action 'none'"
 )
 """Nothing is loaded but the files of the export, from a disk or from a server."""
-_WHICH: Final = ("agent", "frame", "time_to_impact", "accident_visibility")
-"""Columns of an evaluation's rows that say which sample it is."""
-_SAME: Final = ("token", "scenario")
-"""Columns that are the same for all samples of a scenario, or stand in others."""
 
 
 def target_folder(folder: str | os.PathLike[str]) -> Path:
@@ -213,9 +206,9 @@ def export_pages(
         dataset: the release.
         folder: where; new, empty, or an earlier export, which is replaced.
         where: filters as of `find`, all of which hold.
-        bundles: folders that `save_run` wrote: what they say of the samples stands on the pages.
-        results: files or folders of results; those of a bundle join it. A replay shows the predictions of the first
-            ones that tell of the scenario.
+        bundles: folders that `save_run` wrote with their results.
+        results: files or folders of results. A replay shows the predictions of the first ones that tell of the
+            scenario, those of bundles before others.
         scenarios: tokens or records, of which those that match are written, in this order; None for all.
         **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
@@ -235,7 +228,7 @@ def export_pages(
     given = None if scenarios is None else [dataset.get("scenario", each)["token"] for each in scenarios]
     records = _chosen(dataset, where, given)
     target = target_folder(folder)
-    models = _scored_models(bundles, results)
+    models = open_models(bundles, results, Jobs())
     filters = [*where, *([] if given is None else [f"token={','.join(given)}"])]
     with exported(target) as made:
         _Pages(dataset, made, records, models).write(filters, **how)
@@ -253,19 +246,6 @@ def _chosen(dataset: Dataset, where: Sequence[str], given: Sequence[str] | None)
     if len(records) > MOST:
         raise ConfigError(f"{len(records)} scenarios match, and at most {MOST} are exported; narrow --where")
     return records
-
-
-def _scored_models(bundles: Iterable[Path], results: Iterable[Path]) -> Mapping[str, Model]:
-    """The models, whose scores are computed; raises ResultsError."""
-    jobs = Jobs()
-    models = open_models(bundles, results, jobs)
-    scores = [model.job for model in models.values() if model.bundle is not None]
-    jobs.wait()
-    jobs.end()
-    for job in scores:
-        if job.state == "failed":
-            raise ResultsError(f"{job.title}: {job.error}")
-    return models
 
 
 def _folders(records: Sequence[ScenarioRecord]) -> dict[str, str]:
@@ -317,13 +297,8 @@ class _Pages:
         )
 
     def _write_index(self, filters: Sequence[str], told: Sequence[Told]) -> None:
-        scored = {f"{SCORE}{name}": model for name, model in self._models.items() if model.bundle is not None}
         entries = [
-            entry(
-                record,
-                {name: cell(value) for name, value in each.measures.items()},
-                {name: score_cell(model, record["token"]) for name, model in scored.items()},
-            )
+            entry(record, {name: cell(value) for name, value in each.measures.items()}, {})
             for record, each in zip(self._records, told, strict=True)
         ]
         self._write_page(
@@ -355,7 +330,6 @@ class _Pages:
             model=told.model,
             reason=told.reason,
             replay=REPLAY,
-            verdicts=[each for each in (_verdicts(model, token) for model in self._models.values()) if each["rows"]],
         )
 
     def _write_page(self, name: str, template: str, root: str, **context: Any) -> None:
@@ -376,37 +350,3 @@ class _Pages:
             **context,
         )
         write_bytes(self._folder / name, text.encode())
-
-
-def _verdicts(model: Model, token: str) -> dict[str, Any]:
-    """What a bundle says of a scenario's samples, by frame and agent, as a table."""
-    rows = [row for sample, row in model.rows.items() if scenario_of(sample) == token]
-    rank: Mapping[Any, int] = {agent: place for place, agent in enumerate(AGENTS)}
-    rows.sort(key=lambda row: (row.get("frame") or 0, rank.get(row.get("agent"), len(rank))))
-    known = [name for name in (rows or [{}])[0] if any(row[name] is not None for row in rows)]
-    which, others = (
-        [name for name in _WHICH if name in known],
-        [name for name in known if name not in (*_WHICH, *_SAME)],
-    )
-    return {
-        "name": model.name,
-        "rules": f"{model.setup.task}, protocol {model.setup.protocol}",
-        "columns": [*which, "verdict", *others],
-        "rows": [
-            [
-                *(_cell(name, row[name]) for name in which),
-                Cell(verdict(model.setup.task, row), None),
-                *(_cell(name, row[name]) for name in others),
-            ]
-            for row in rows
-        ],
-    }
-
-
-def _cell(column: str, value: Any) -> Cell:
-    """A number, with its key, or a word."""
-    if isinstance(value, str):
-        return Cell(short_name(value) if column == "agent" else value, None)
-    if isinstance(value, bool):
-        return Cell(result_text(value), None)
-    return Cell(result_text(value), sort_key(value))

@@ -208,8 +208,8 @@ class LeadTimes(FrozenArrays):
 
     @property
     def from_the_start(self) -> bool:
-        """Whether all agents that are there observe both as early as the rule lets them: the recording may cut it."""
-        return 0 < int(self.first_frames[self._everyone]) <= self.rule.sustained
+        """Whether all agents that are there observe both from the first frame on: the recording may cut it."""
+        return int(self.first_frames[self._everyone]) == 1
 
     @property
     def gains(self) -> FloatArray:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, IntArray, checked_number, checked_whole
+from deepaccident_devkit.arrays import BoolArray, IntArray, checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.tables import visible_mask
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, INFRASTRUCTURE, AgentName
+from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, AgentName
 from deepaccident_devkit.text import settle_choices
 
 ObservationKind = Literal["points", "released", "annotated"]
-_FRAMES_PER_SECOND: Final = round(1 / FRAME_PERIOD)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,54 +29,23 @@ class ObservationRule:
             visibility rule, by points, cameras and distance (docs/released_code.md). `annotated`: the label has the
             actor; the real labels have all that is near, hidden or not, so that this says little there.
         least_points: LiDAR points that are enough for `points`.
-        memory: seconds for which an agent still knows an actor that it does not observe any more, in steps of 0.1.
-        sustained: frames in a row at which an agent must observe an actor before it counts; 1 for at once.
     """
 
     kind: ObservationKind = "points"
     least_points: int = 5
-    memory: float = 0.0
-    sustained: int = 1
 
     def __post_init__(self) -> None:
         """Check the values."""
         settle_choices(self, {"kind": get_args(ObservationKind)})
-        for name in ("least_points", "sustained"):
-            number = checked_whole(name, getattr(self, name), error=ConfigError)
-            if number < 1:
-                raise ConfigError(f"{name}: expected a whole number from 1, found {number}")
-            object.__setattr__(self, name, number)
-        memory = checked_number("memory", self.memory, "seconds", ConfigError)
-        if not (0 <= memory < np.inf and abs(memory * _FRAMES_PER_SECOND - round(memory * _FRAMES_PER_SECOND)) < 1e-9):
-            raise ConfigError(f"memory: expected seconds from 0 in steps of 0.1, found {self.memory!r}")
-        object.__setattr__(self, "memory", memory)
+        number = checked_whole("least_points", self.least_points, error=ConfigError)
+        if number < 1:
+            raise ConfigError(f"least_points: expected a whole number from 1, found {number}")
+        object.__setattr__(self, "least_points", number)
 
     @property
     def text(self) -> str:
-        """The rule in words, such as `annotated; at 3 frames in a row; remembered for 1 s`."""
-        words = [f"at least {self.least_points} LiDAR points" if self.kind == "points" else self.kind]
-        if self.sustained > 1:
-            words.append(f"at {self.sustained} frames in a row")
-        if self.memory:
-            words.append(f"remembered for {self.memory:g} s")
-        return "; ".join(words)
-
-
-def sustained_only(observed: BoolArray, frames: int) -> BoolArray:
-    """Of observations (…, F), those that are the last of so many in a row, or follow these."""
-    result = observed.copy()
-    for back in range(1, frames):
-        result[..., back:] &= observed[..., :-back]
-        result[..., :back] = False
-    return result
-
-
-def remembered(observed: BoolArray, frames: int) -> BoolArray:
-    """Observations (…, F), each of them held for so many frames more."""
-    count = np.cumsum(observed, axis=-1)
-    before = np.zeros_like(count)
-    before[..., frames + 1 :] = count[..., : -frames - 1]
-    return np.asarray(count > before)
+        """The rule in words, such as `at least 5 LiDAR points`."""
+        return f"at least {self.least_points} LiDAR points" if self.kind == "points" else self.kind
 
 
 def observed_actors(
@@ -112,7 +80,6 @@ def observed_actors(
     frame = (samples["frame_row"][of_scenario] - dataset.columns("scenario")["first_frame_row"][row])[at]
     observed[there.searchsorted(codes[at[seen]]), position[seen], frame[seen]] = True
     observed[_themselves(dataset, row, there, actor_ids)] = True
-    observed = remembered(sustained_only(observed, rule.sustained), round(rule.memory * _FRAMES_PER_SECOND))
     return tuple(AGENTS[code] for code in there.tolist()), observed
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -18,7 +16,7 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntA
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
-from deepaccident_devkit.reports import Report, Row, write_csv
+from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.accidents import (
     Skipped,
     accident_of,
@@ -38,17 +36,6 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 _OTHER_ENDING: Final[Mapping[str, str]] = {"normal": "accident", "accident": "normal"}
-_OVER_TIME: Final = (
-    "actor_id",
-    "twin_id",
-    "frame",
-    *("x", "y", "yaw"),
-    *("twin_x", "twin_y", "twin_yaw"),
-    "speed",
-    "twin_speed",
-    "distance",
-    "heading_difference",
-)
 _OF_TWINS: Final = (
     "accident",
     "twin",
@@ -301,19 +288,6 @@ class TwinDiff(FrozenArrays):
             "actors": [self._actor(row) for row in self.order.tolist()],
         }
 
-    def to_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write a row for each actor and frame at which either recording has it, over a file that is there.
-
-        Metres, m/s and radians, with all their digits; a cell is empty where nothing is known. Returns the path.
-        """
-        there = ~np.isnan(self.poses[..., 0]).all(axis=0)
-        rows, frames = np.nonzero(there)
-        columns = [*self.actor_ids[rows].T.tolist(), (frames + 1).tolist()]
-        values = [*self.poses[:, rows, frames].transpose(0, 2, 1).reshape(6, -1), *self.speeds[:, rows, frames]]
-        values += [self.distances[rows, frames], self.heading_differences[rows, frames]]
-        columns += [known(each) for each in values]
-        return write_csv(path, [_OVER_TIME, *zip(*columns, strict=True)])
-
     def _actor(self, row: int) -> dict[str, Any]:
         ids: list[int] = self.actor_ids[row].tolist()
         frame = int(self.parting_frames[row])
@@ -464,11 +438,9 @@ class TwinReport(Report):
         }
 
     def to_text(self) -> str:
-        """A line for each accident; of a single one, one for each actor."""
+        """A line for each accident."""
         blocks = [f"Twins: DeepAccident {self.version} at {self.dataroot}"]
-        if len(self.diffs) == 1:
-            blocks.append(diff_text(self.diffs[0]))
-        elif self.diffs:
+        if self.diffs:
             heading = ("accident", "parts at", "to impact", "first", "acting differently", "in one alone", "nearest")
             rows = [heading, *map(_line, self.diffs)]
             notes = "seconds from the first frame, and to the impact; nearest: the colliders' least gap in the twin (m)"
@@ -519,30 +491,6 @@ def twins_of(dataset: Dataset, found: Sequence[TwinDiff | Skipped | None]) -> Tw
     )
 
 
-def diff_text(diff: TwinDiff) -> str:
-    """Where an accident and its twin part, and what each actor does, for a terminal."""
-    parting, nearest = diff.parting_frame, diff.nearest_in_twin
-    when = "they never part"
-    if parting is not None:
-        ahead = (diff.num_frames[0] - parting) / 10
-        when = f"they part at frame {parting}, {frame_timestamp(parting):.1f} s after the start, {ahead:.1f} s before"
-        when += f" the impact: {_first_to_part(diff)}"
-    if not diff.begins_together:
-        when += f"\n{_APART}"
-    gap = "the twin never shows the colliders at once"
-    if nearest is not None:
-        gap = f"the colliders' least gap in the twin: {nearest.gap:.2f} m at frame {nearest.frame}"
-    limits = f"{diff.parting.distance:g} m or {np.degrees(diff.parting.heading):.0f}°"
-    heading = ("actor", "in twin", "who", "matched by", "parts at", "distance", "turn", "faster")
-    told = {(each["actor_id"], each["twin_id"]): each for each in diff.to_dict()["actors"]}
-    rows = [heading, *(_actor_line(each) for each in told.values())]
-    notes = (
-        f"an actor parts from {limits} on; the largest distance (m), turn to the left (°) and speed more in the twin"
-    )
-    step = "" if not diff.shift else f"\nthe same moment has a number that is {diff.shift:+d} in the twin"
-    return f"{diff.accident}\n{diff.twin}{step}\n{when}\n{gap}\n\n{columns_text(rows, left=4)}\n{notes}"
-
-
 def diff_of_accident(dataset: Dataset, scenario: Any, parting: Parting) -> TwinDiff | None:
     """`twin_diff` of a scenario's record; None if the meta file names no collision."""
     return None if scenario["collision"] is None else twin_diff(dataset, scenario, parting)
@@ -571,18 +519,4 @@ def _line(diff: TwinDiff) -> tuple[str, ...]:
         str(np.count_nonzero(diff.parting_frames)),
         str(np.count_nonzero(~diff.in_both)),
         number_text(None if nearest is None else nearest.gap, 2),
-    )
-
-
-def _actor_line(actor: dict[str, Any]) -> tuple[str, ...]:
-    turn, frame = actor["largest_heading_difference"], actor["parting_frame"]
-    who = actor["category"] if actor["agent"] is None else short_name(actor["agent"])
-    return (
-        *("–" if actor[name] is None else str(actor[name]) for name in ("actor_id", "twin_id")),
-        f"{who}, collides" if actor["collides"] else who,
-        actor["matched_by"] or "–",
-        "–" if frame is None else f"{frame_timestamp(frame):.1f}",
-        number_text(actor["largest_distance"], 2),
-        number_text(None if turn is None else float(np.degrees(turn)), 0),
-        number_text(actor["largest_speed_difference"], 1),
     )

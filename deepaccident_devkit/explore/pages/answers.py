@@ -28,8 +28,6 @@ from deepaccident_devkit.render.replay import replay_script, replay_style
 KEPT: Final = "private, max-age=600"
 """A browser may keep pictures for some minutes: files of a release seldom change."""
 _FOREVER: Final = "private, max-age=31536000, immutable"
-LISTED: Final = 100
-"""Entries of a long list on one page."""
 _LAST_PAGE: Final = 1_000_000
 _KINDS: Final = {"css": "text/css", "js": "text/javascript"}
 
@@ -147,7 +145,7 @@ class Part:
     after: str
 
 
-def part_of(request: Request, items: Sequence[Any], size: int = LISTED) -> Part:
+def part_of(request: Request, items: Sequence[Any], size: int) -> Part:
     """The page of a list that the address names by `page`, with so many entries."""
     given = request.query_params.get("page", "")
     pages = max(1, -(-len(items) // size))

@@ -36,7 +36,6 @@ from deepaccident_devkit.explore.pages.samples import (
 if TYPE_CHECKING:
     from deepaccident_devkit.evaluation.runs import Bundle
     from deepaccident_devkit.explore.explorer import Explorer
-    from deepaccident_devkit.explore.models import Model
 
 Better = Literal["", "a", "b"]
 _BETTER: Final = ("a", "b")

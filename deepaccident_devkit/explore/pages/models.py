@@ -3,103 +3,26 @@
 from __future__ import annotations
 
 import shlex
-from collections import Counter
-from collections.abc import Iterator
-from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from deepaccident_devkit.evaluation.runs import (
-    Bundle,
-    SampleSelection,
-    coverage,
-    default_selection,
-    results_text,
-    scenario_hashes,
-)
-from deepaccident_devkit.explore.background import Job
+from deepaccident_devkit.evaluation.runs import Bundle, results_text
 from deepaccident_devkit.explore.evaluations import evaluated
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.models import Model
 from deepaccident_devkit.explore.pages import comparison, samples
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, with_slash
-from deepaccident_devkit.explore.pages.samples import model_of, models_of_task, rows_of, titles
+from deepaccident_devkit.explore.pages.samples import model_of, models_of_task, rows_of
 from deepaccident_devkit.explore.sample_lists import SampleChoices, listed
-from deepaccident_devkit.taxonomy import SPLITS
 
-if TYPE_CHECKING:
-    from deepaccident_devkit.dataset import Dataset
-    from deepaccident_devkit.evaluation.results import Results
-    from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-    from deepaccident_devkit.explore.explorer import Explorer
-    from deepaccident_devkit.explore.models import Model
-
-_USUAL_VERSION: Final = "v1"
 _WORST: Final = 12
 """Samples on a model's page."""
-_FEW: Final = 64
-"""Scenarios up to which their files are read without being asked to."""
 _FIRST: Final = 3
 """Headline numbers in the list of models."""
-
-
-def command_job(explorer: Explorer, model: Model, results: Results) -> Job:
-    """The work that gives the `evaluate_command` of results: it looks for the samples that they were made for."""
-    return explorer.jobs.ask(
-        f"command {model.name}",
-        f"how {model.name} is evaluated",
-        lambda: evaluate_command(explorer.dataset, results, model.setup, f"{model.name}_bundle"),
-    )
-
-
-def evaluate_command(dataset: Dataset, results: Results, setup: EvaluationSetup, out: str) -> dict[str, str]:
-    """The command that makes a bundle of results.
-
-    Args:
-        dataset: the release.
-        results: of the task.
-        setup: task and rules.
-        out: the bundle's folder.
-
-    Returns:
-        `text`, the command for a shell; and `note`, what the results lack of the samples, or have besides: empty if
-        they have just these.
-
-    Raises:
-        NotAvailableError: the release has no labelled samples of the split that most of the results are of.
-    """
-    selection = default_selection(setup, split_of(dataset, results))
-    found = coverage(dataset, results.tokens, selection)
-    if found.guess is not None:
-        selection = found.guess
-        found = coverage(dataset, results.tokens, selection)
-    words = ["deepaccident", "evaluate", setup.task, str(dataset.dataroot)]
-    words += ["--version", dataset.version] if dataset.version != _USUAL_VERSION else []
-    words += ["--results", str(results.path), *_selecting(setup, selection), "--protocol", setup.protocol]
-    words += ["--allow-partial"] * (not found.is_complete) + ["--out", out]
-    return {"text": shlex.join(words), "note": "" if found.is_complete else replace(found, guess=None).to_text()}
-
-
-def split_of(dataset: Dataset, results: Results) -> str:
-    """The split of most of the scenarios that results tell of; `val` if they are of none."""
-    scenarios = {token.rsplit("/", 2)[0] for token in results.tokens}
-    splits = Counter(each["split"] for each in dataset.scenario if each["token"] in scenarios)
-    known = {name: count for name, count in splits.items() if name in SPLITS}
-    return max(known, key=lambda name: known[name], default="val")
-
-
-def _selecting(setup: EvaluationSetup, selection: SampleSelection) -> Iterator[str]:
-    """The options that choose the samples."""
-    chosen = selection.choices()
-    if selection.samples == "all":  # which are those of all scenarios
-        del chosen["scope"]
-        chosen |= {} if setup.task == "detection" else {"horizon": f"{setup.horizon:g}"}
-    for name, value in chosen.items():
-        yield from (f"--{name}", ",".join(value) if name == "agents" else str(value))
 
 
 def routes() -> list[Route]:
@@ -148,24 +71,18 @@ def _model(request: Request) -> Response:
     }
     if model.bundle is None:
         return page(request, "model_results.html", **context, **_results_context(explorer, model))
-    asked = request.query_params.get("check") == "truth"
-    return page(request, "model.html", **context, **_bundle_context(explorer, model, model.bundle, asked=asked))
+    return page(request, "model.html", **context, **_bundle_context(explorer, model, model.bundle))
 
 
-def _bundle_context(explorer: Explorer, model: Model, bundle: Bundle, *, asked: bool) -> dict[str, Any]:
+def _bundle_context(explorer: Explorer, model: Model, bundle: Bundle) -> dict[str, Any]:
     choices = SampleChoices()
-    truth: Job | None = None
-    if asked or len(model.scenarios) <= _FEW:
-        truth = truth_job(explorer, model.name, bundle)
     worst = listed(explorer, model, choices)
     return {
         "told": evaluated(bundle),
-        "truth": truth,
         "worst": rows_of(explorer, model, worst.tokens[:_WORST]) if not worst.waits else [],
         "ranked": worst.ranked,
         "faults": worst.faults,
         "waits": [*worst.waits],
-        "checks": titles([truth] if truth is not None else []),
         "choices": choices,
         "path": bundle.summary["results"]["path"],
     }
@@ -174,26 +91,12 @@ def _bundle_context(explorer: Explorer, model: Model, bundle: Bundle, *, asked: 
 def _results_context(explorer: Explorer, model: Model) -> dict[str, Any]:
     if model.results is None:
         return {}
-    job = command_job(explorer, model, model.results)
+    setup, dataset = model.setup, explorer.dataset
+    command = ["deepaccident", "evaluate", setup.task, str(dataset.dataroot), "--version", dataset.version]
+    command += ["--results", str(model.results.path), "--protocol", setup.protocol, "--out", f"{model.name}_bundle"]
     return {
         "text": results_text(model.results),
-        "job": job,
-        "waits": titles([job]),
+        "command": shlex.join(command),
         "first": rows_of(explorer, model, sorted(model.tokens)[:_WORST]),
         "choices": SampleChoices(),
     }
-
-
-def truth_job(explorer: Explorer, name: str, bundle: Bundle) -> Job:
-    """The work that compares the truth of a model's bundle with the release's: it reads the files of all its scenarios.
-
-    It gives `checked`, how many scenarios both have, and `differing`, those whose label, meta or calib files differ.
-    """
-
-    def work() -> dict[str, Any]:
-        stated = bundle.scenarios()
-        found = scenario_hashes(explorer.dataset, stated, workers=explorer.workers)
-        differing = tuple(token for token, each in found.items() if each.as_dict() != stated[token])
-        return {"checked": len(found), "differing": differing}
-
-    return explorer.jobs.ask(f"truth {name}", f"whether the labels are those that {name} was evaluated with", work)

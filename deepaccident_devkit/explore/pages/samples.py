@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -26,10 +26,6 @@ from deepaccident_devkit.pages import path_in_address
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.outcomes import render_evaluation, render_outcome_in_cameras
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-
-if TYPE_CHECKING:
-    from deepaccident_devkit.explore.explorer import Explorer
-    from deepaccident_devkit.explore.models import Model
 
 Kind = Literal["above", "cameras"]
 Size = Literal["whole", "half"]

@@ -4,11 +4,10 @@ from deepaccident_devkit.render.evaluation.accident import (
     render_accuracy,
     render_alarms,
     render_errors,
-    render_outcomes,
 )
-from deepaccident_devkit.render.evaluation.detection import render_average_precisions, render_precision_recall
+from deepaccident_devkit.render.evaluation.detection import render_precision_recall
 from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
-from deepaccident_devkit.render.evaluation.motion import render_quality_by_time, render_ranges
+from deepaccident_devkit.render.evaluation.motion import render_quality_by_time
 from deepaccident_devkit.render.evaluation.panels import render_breakdown, render_comparison
 from deepaccident_devkit.render.evaluation.report import save_report
 from deepaccident_devkit.render.evaluation.warning import render_predictors, render_prevention
@@ -17,15 +16,12 @@ __all__ = [
     "draw_motion_outcome",
     "render_accuracy",
     "render_alarms",
-    "render_average_precisions",
     "render_breakdown",
     "render_comparison",
     "render_errors",
-    "render_outcomes",
     "render_precision_recall",
     "render_predictors",
     "render_prevention",
     "render_quality_by_time",
-    "render_ranges",
     "save_report",
 ]

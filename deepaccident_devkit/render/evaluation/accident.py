@@ -1,4 +1,4 @@
-"""Accident results as pictures: accuracy over the allowed distance, outcomes, errors, and alarms by their score."""
+"""Accident results as pictures: accuracy over the allowed distance, errors, and alarms by their score."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, AccidentResult, Alarm
+from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, Alarm
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.boxes import write_beside
-from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free
-from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.chips import keep_free
+from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
@@ -57,36 +57,6 @@ def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> 
     apa = "nothing to count" if np.isnan(result.apa) else f"APA {result.apa:.3f}"
     positives = f"{result.positives:,} of {result.samples:,} samples have an accident"
     set_title(ax, f"{apa}: mean of the three distances; {positives}", fontsize="medium")
-    return with_light_grid(ax, "y")
-
-
-@in_own_settings
-def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
-    """Render how many accidents are foreseen, predicted falsely and missed, at each allowed distance.
-
-    Args:
-        result: of `AccidentEvaluator.compute`.
-        ax: axes to render on; new ones if None.
-
-    Returns:
-        The axes.
-    """
-    from matplotlib.ticker import MaxNLocator
-
-    ax = axes_or_new(ax, PANEL)
-    kinds = {"right": ("foreseen (TP)", "tp"), "false": ("false (FP)", "fp"), "missed": ("missed (FN)", "fn")}
-    highest = 1
-    for offset, (kind, (label, field)) in enumerate(kinds.items()):
-        heights = [getattr(each, field) for each in result.within.values()]
-        places = [place + 0.27 * (offset - 1) for place in range(len(heights))]
-        parts = ax.bar(places, heights, width=0.25, color=OUTCOME_COLORS[kind], label=label)
-        ax.bar_label(parts, fontsize=SMALLEST_TEXT, padding=1)
-        highest = max(highest, *heights)
-    ax.set_xticks(range(len(result.within)), [f"within {distance:g} m" for distance in result.within])
-    ax.set(ylabel="accidents", ylim=(0, 1.25 * highest))
-    ax.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    ax.legend(fontsize=SMALLEST_TEXT, ncols=3, loc="upper center")
-    set_title(ax, f"Outcomes: {result.positives:,} accidents, {result.negatives:,} samples without", fontsize="medium")
     return with_light_grid(ax, "y")
 
 

@@ -1,4 +1,4 @@
-"""Detection results as pictures: precision over recall, and average precision by class."""
+"""Detection results as pictures: precision over recall."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import CATEGORY_COLORS, ESTIMATE_COLOR, SERIES_COLORS
-from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+from deepaccident_devkit.render.colors import SERIES_COLORS
+from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
 from deepaccident_devkit.text import choice
@@ -61,35 +61,6 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
     ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
     ax.legend(title="threshold", fontsize=SMALLEST_TEXT, title_fontsize=SMALLEST_TEXT, loc="best")
     return with_light_grid(ax, "both")
-
-
-@in_own_settings
-def render_average_precisions(result: DetectionResult, *, ax: Axes | None = None) -> Axes:
-    """Render each class's average precision as a bar, the mean over thresholds and ranges.
-
-    Args:
-        result: of `DetectionEvaluator.compute`.
-        ax: axes to render on; new ones if None.
-
-    Returns:
-        The axes, in percent; each bar has its value, and how many true boxes there are.
-    """
-    bars = [
-        Bar(
-            label=name,
-            below=f"{truths:,} true",
-            value=average if truths and math.isfinite(average) else None,
-            text=f"{average:.1f} %",
-            color=CATEGORY_COLORS.get(name, ESTIMATE_COLOR),
-        )
-        for (name, average), truths in zip(
-            result.class_average_precision.items(), result.truths.sum(axis=1).tolist(), strict=True
-        )
-    ]
-    ax = draw_bars(bars, axes_or_new(ax, PANEL), 100.0)
-    ax.set(xlabel="average precision (%)")
-    set_title(ax, "Average precision by class, mean over thresholds", fontsize="medium")
-    return ax
 
 
 def _ring_text(result: DetectionResult, ring: int) -> str:

@@ -140,12 +140,6 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
         alt=f"Accuracy {_listed((f'within {d:g} m', x.accuracy) for d, x in result.within.items())}.",
         draw=partial(accident.render_accuracy, evaluator),
     )
-    yield RunFigure(
-        name="outcomes",
-        caption="Accidents foreseen, false and missed, by the allowed distance.",
-        alt="; ".join(f"within {d:g} m {x.tp} foreseen, {x.fp} false, {x.fn} missed" for d, x in result.within.items()),
-        draw=partial(accident.render_outcomes, result),
-    )
     if not accident.has_alarms(evaluator):
         return
     yield RunFigure(
@@ -173,12 +167,6 @@ def _detection(run: EvaluationRun) -> Iterator[RunFigure]:
     result = run.result
     if not isinstance(run.evaluator, DetectionEvaluator):
         return
-    yield RunFigure(
-        name="average_precision",
-        caption="Average precision by class, the mean over the thresholds (and ranges, where there are several).",
-        alt=f"Average precision in percent: {_listed(result.class_average_precision.items())}.",
-        draw=partial(detection.render_average_precisions, result),
-    )
     unit = "metres" if run.setup.rules.measure.startswith("distance") else "share of overlap"
     several = len(result.ranges) > 1
     for row, ring in np.argwhere(result.truths).tolist():
@@ -194,19 +182,9 @@ def _detection(run: EvaluationRun) -> Iterator[RunFigure]:
 
 
 def _motion(run: EvaluationRun) -> Iterator[RunFigure]:
-    result = run.result
     if not isinstance(run.evaluator, MotionEvaluator):
         return
     form = run.results.form or {}
-    yield RunFigure(
-        name="ranges",
-        caption="Intersection over union, panoptic quality, and its two factors, within each range around the ego.",
-        alt="; ".join(
-            f"{name}: {_listed([('IoU', x.iou), ('PQ', x.pq), ('SQ', x.sq), ('RQ', x.rq)])} percent"
-            for name, x in result.ranges.items()
-        ),
-        draw=partial(motion.render_ranges, result),
-    )
     yield RunFigure(
         name="quality_by_time",
         caption="Panoptic quality frame by frame, from the present to the horizon.",

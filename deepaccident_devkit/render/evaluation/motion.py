@@ -1,12 +1,12 @@
-"""Motion results as pictures: quality by range and by time ahead."""
+"""Motion results as pictures: quality by time ahead."""
 
 from __future__ import annotations
 
 import math
 from itertools import cycle
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult
+from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.motion.evaluator import RANGES
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import panoptic_quality
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
@@ -18,36 +18,6 @@ from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-_PARTS: Final = {"iou": "IoU", "pq": "PQ", "sq": "SQ", "rq": "RQ"}
-
-
-@in_own_settings
-def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
-    """Render IoU and the panoptic quality with its two factors, within each range.
-
-    Args:
-        result: of `MotionEvaluator.compute`.
-        ax: axes to render on; new ones if None.
-
-    Returns:
-        The axes, in percent; a number with nothing to count has no bar.
-    """
-    ax, count = axes_or_new(ax, PANEL), len(result.ranges)
-    for offset, ((name, within), color) in enumerate(
-        zip(result.ranges.items(), cycle(SERIES_COLORS[1:]), strict=False)
-    ):
-        values = [getattr(within, part) for part in _PARTS]
-        places = [place + 0.8 / count * (offset - (count - 1) / 2) for place in range(len(_PARTS))]
-        heights = [0.0 if math.isnan(value) else value for value in values]
-        parts = ax.bar(places, heights, width=0.76 / count, color=color, label=f"{name} m")
-        labels = ["–" if math.isnan(value) else f"{value:.3g}" for value in values]
-        ax.bar_label(parts, labels, fontsize=SMALLEST_TEXT, padding=1)
-    ax.set_xticks(range(len(_PARTS)), list(_PARTS.values()))
-    ax.set(ylabel="%", ylim=(0, 118), yticks=range(0, 101, 20))
-    ax.legend(fontsize=SMALLEST_TEXT, ncols=max(1, count), loc="upper center")
-    set_title(ax, f"Within each range, {result.samples:,} samples, {result.frames:,} frames", fontsize="medium")
-    return with_light_grid(ax, "y")
 
 
 @in_own_settings

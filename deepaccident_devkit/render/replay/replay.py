@@ -39,7 +39,6 @@ from deepaccident_devkit.render.replay.sensors import (
     PictureSettings,
     camera_files,
     camera_pictures,
-    check_picture_settings,
     follow_pair,
     lidar_points,
 )
@@ -168,8 +167,6 @@ def render_replay(
     *,
     prediction: Foreseen | None = None,
     agents: Agents = None,
-    image_width: int | None = None,
-    quality: int | None = None,
     progress: bool = False,
 ) -> Path:
     """Write a scenario as one HTML file that plays in any browser: no server, no network, small enough for a mail.
@@ -178,7 +175,8 @@ def render_replay(
     pair best; from above the road, all actors and their trails; who sees whom by the released rule, the LiDAR of the
     first agent and the countdown to the impact. The road is what the agents' BEV cameras saw; where they have no files,
     that of a town map (`town_map`), if one is kept. The front cameras, and the cameras while they show the pair best,
-    have the larger pictures. What the release lacks (images, points, labels) is left out, and the page says so.
+    have the larger pictures; all are as large as the page's limit, `SIZE_LIMIT`, lets them be. What the release lacks
+    (images, points, labels) is left out, and the page says so.
 
     Args:
         dataset: the release.
@@ -189,8 +187,6 @@ def render_replay(
             foresee and whether it is right by the accident protocol `boxes`. None for none.
         agents: whose cameras, views and predictions are shown, as in `v2x.cooperating_agents`; None for all that are
             there.
-        image_width: of the pictures, in pixels; None chooses it so that the page is within `SIZE_LIMIT`.
-        quality: of the pictures' JPEG, 1 to 95; None chooses it in the same way. If both are given, there is no limit.
         progress: whether to show a bar.
 
     Returns:
@@ -199,7 +195,6 @@ def render_replay(
     Raises:
         TokenError: no such scenario.
         ChoiceError: no such agent, or `path` is a folder.
-        ConfigError: the width or quality is not possible.
         NotAvailableError: the release has no scenario, lacks one of the agents, or the prediction is of other samples.
         EvaluationError: the prediction is neither of motion nor of accidents.
         SensorFileError: an image or a point cloud cannot be read.
@@ -207,21 +202,13 @@ def render_replay(
     target = path_of(path)
     if target.is_dir():
         raise ChoiceError(f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}")
-    check_picture_settings(image_width, quality)
     recording = recording_of(dataset, scenario, agents)
     files = camera_files(recording)
     data, followed = _data(recording, prediction, files)
     data["points"] = lidar_points(recording, recording.agents[0])
     free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
     free -= _BESIDE * len(recording.frames) * len(files)
-    settings, jpegs = camera_pictures(
-        files,
-        followed,
-        math.inf if image_width and quality else free,
-        width=image_width,
-        quality=quality,
-        progress=progress,
-    )
+    settings, jpegs = camera_pictures(files, followed, free, progress=progress)
     said = notes(recording, files, settings, points=data["points"] is not None)
     data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], jpegs)}
     title = f"Accident replay: {recording.scenario['name']}"

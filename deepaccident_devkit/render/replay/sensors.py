@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray, as_floats
-from deepaccident_devkit.errors import ConfigError, MissingFileError
+from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.parallel import own_threads, run_batch
@@ -35,17 +35,12 @@ _LAYERS: Final = as_floats([1, 2, 3]) / 3
 FRONT: Final = CAMERAS[0]
 _LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
 """Width in pixels and JPEG quality; the first pair that fits is taken."""
-_WIDTHS: Final = (960, 800, 640, 560, 480, 400, 320, 256)
-_QUALITIES: Final = (80, 70, 60, 50, 40, 30)
-"""The widths to try if the quality is given, and the qualities to try if the width is given."""
 _OTHERS: Final = (1, 2, 2, 2, 4)
-"""For each step of a ladder, one of how many frames has a picture of the other cameras; the last is for the rest."""
+"""For each step of the ladder, one of how many frames has a picture of the other cameras; the last is for the rest."""
 _LEAST_OTHER: Final = 256
 """Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this."""
 _PROBED: Final = 12
 """The number of pictures from which the size of all is estimated."""
-_QUALITY_RANGE: Final = (1, 95)
-_LEAST_WIDTH: Final = 32
 _CELL: Final = 0.4
 """Metres: side of a square; of the points in it one is kept."""
 _MOST: Final = 1500
@@ -161,19 +156,6 @@ class PictureSettings:
         return min(self.width, max(self.width // 2, _LEAST_OTHER))
 
 
-def check_picture_settings(width: int | None, quality: int | None) -> None:
-    """Raise ConfigError if pictures cannot have a width or quality; None stands for a value that fits."""
-    if width is not None and width < _LEAST_WIDTH:
-        raise ConfigError(
-            f"image_width: expected at least {_LEAST_WIDTH} pixels, or None for a fitting width, found {width!r}"
-        )
-    least, most = _QUALITY_RANGE
-    if quality is not None and not least <= quality <= most:
-        raise ConfigError(
-            f"quality: expected a JPEG quality from {least} to {most}, or None for a fitting one, found {quality!r}"
-        )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Image:
     """An image file, and whether its picture is one of the larger ones."""
@@ -199,8 +181,6 @@ def camera_pictures(
     followed: Followed,
     limit: float,
     *,
-    width: int | None = None,
-    quality: int | None = None,
     progress: bool = False,
 ) -> tuple[PictureSettings | None, Jpegs]:
     """The pictures of the agents' cameras, and how they are written; None if there is no picture.
@@ -210,8 +190,6 @@ def camera_pictures(
         followed: the cameras that follow the pair: while they do, their pictures are as large as the front cameras'.
         limit: the most bytes of all pictures together: the largest pictures within it are taken. If the smallest ones
             do not fit, there are fewer pictures.
-        width: pixels; None for a width that fits.
-        quality: of JPEG; None for a quality that fits.
         progress: whether to show a bar.
 
     Raises:
@@ -225,7 +203,7 @@ def camera_pictures(
         for (agent, channel), paths in files.items()
     }
     frames = max(map(len, files.values()))
-    return _fitting(images, limit, _ladder(width, quality, frames), progress=progress)
+    return _fitting(images, limit, _ladder(frames), progress=progress)
 
 
 def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePath]:
@@ -233,18 +211,13 @@ def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePa
     return (recording.dataset.sensor_path(f"{sample}/{channel}") for sample in samples)
 
 
-def _ladder(width: int | None, quality: int | None, frames: int) -> Iterator[PictureSettings]:
+def _ladder(frames: int) -> Iterator[PictureSettings]:
     """Ways to write pictures, each smaller than the one before."""
-    steps: Sequence[tuple[int, int]] = _LADDER
-    if width is not None:
-        steps = [(width, each) for each in (_QUALITIES if quality is None else [quality])]
-    elif quality is not None:
-        steps = [(each, quality) for each in _WIDTHS]
-    for number, (pixels, each) in enumerate(steps):
-        yield PictureSettings(width=pixels, quality=each, others=_OTHERS[min(number, len(_OTHERS) - 1)])
+    for number, (width, quality) in enumerate(_LADDER):
+        yield PictureSettings(width=width, quality=quality, others=_OTHERS[min(number, len(_OTHERS) - 1)])
     every = 1
     while every < 2 * frames:
-        yield PictureSettings(width=steps[-1][0], quality=steps[-1][1], every=every, others=0)
+        yield PictureSettings(width=width, quality=quality, every=every, others=0)
         every *= 2
 
 

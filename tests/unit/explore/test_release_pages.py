@@ -1,12 +1,10 @@
 """The pages of a release: what they show is what the devkit computes; slow work is for those who wait for it."""
 
-import io
 import json
 import re
 import shutil
 import threading
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin
@@ -14,7 +12,6 @@ from urllib.parse import urljoin
 import pytest
 from asgi import get
 from damaged_releases import Damaged, damaged_release
-from PIL import Image
 from shown_page import Shown
 
 from deepaccident_devkit import DeepAccident
@@ -22,12 +19,9 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.explore import Explorer, make_app
 from deepaccident_devkit.explore.pages import release
-from deepaccident_devkit.explore.pages.answers import part_of
-from deepaccident_devkit.explore.pages.release import ANY, TABS, kinds_of
-from deepaccident_devkit.maps import kept_town_map, town_map, towns_of
+from deepaccident_devkit.explore.pages.release import TABS
+from deepaccident_devkit.maps import town_map, towns_of
 from deepaccident_devkit.overview import overview
-from deepaccident_devkit.statistics import dataset_statistics
-from deepaccident_devkit.validation import CODES, ValidationReport, release_completeness, validate_release
 
 pytestmark = pytest.mark.slow
 
@@ -75,11 +69,6 @@ def of_damaged(damaged: Damaged) -> Iterator[Reader]:
     reader.explorer.jobs.end()
 
 
-@pytest.fixture(scope="module")
-def report(damaged: Damaged) -> ValidationReport:
-    return validate_release(damaged.dataset.dataroot, workers=1)
-
-
 @pytest.fixture
 def mapped(da: DeepAccident, tmp_path: Path) -> Iterator[Reader]:
     """Of a release with BEV cameras and without a kept map."""
@@ -102,22 +91,19 @@ def test_all_links_lead_somewhere(of_damaged: Reader) -> None:
         named = [address for address, _ in page.links if not address.startswith("#")]
         assert not [address for address in named if re.match(r"[a-z]+:|/", address)]
         found = {urljoin(here, address) for address in [*named, *page.loads] if not address.startswith("data:")}
-        statistics = {address for address in found if address.endswith(".png")}  # rendered in a test of their own
-        for address in sorted(found - seen - statistics):
+        for address in sorted(found - seen):
             assert get(of_damaged.app, address).status in (200, 307), address
         seen |= found
     assert "/release/" in seen
     assert any("/scenario/" in address for address in seen)
 
 
-@pytest.mark.parametrize("tab", [tab for tab in TABS if tab not in ("maps", "conventions")])
-def test_a_page_waits_for_its_work(reader: Reader, tab: str) -> None:
+def test_a_page_waits_for_its_work(reader: Reader) -> None:
     go_on = threading.Event()
     reader.explorer.jobs.ask("other", "something slow", go_on.wait)
     try:
-        page = reader.page(f"/release/{tab}")
+        page = reader.page("/release/")
         assert "This page loads itself again" in page.text
-        assert "Before it: something slow" in page.text
         (place,) = (each for _, each in page.tags if "data-titles" in each)
         (title,) = json.loads(place["data-titles"])
         assert place["data-waiting"] == "../waiting.json"
@@ -126,23 +112,10 @@ def test_a_page_waits_for_its_work(reader: Reader, tab: str) -> None:
         assert not page.tables
     finally:
         go_on.set()
-    ready = reader.ready(f"/release/{tab}")
+    ready = reader.ready("/release/")
     assert "loads itself again" not in ready.text
     assert not [each for _, each in ready.tags if "data-titles" in each]
     assert len(ready.text) > len(page.text)
-
-
-def test_work_is_begun_for_who_opens_its_page(reader: Reader) -> None:
-    assert reader.begun == []
-    for address, names in {
-        "/release/conventions": [],
-        "/release/": ["overview"],
-        "/release/files": ["overview", "files"],
-        "/release/findings": ["overview", "files", "findings"],
-        "/release/findings?severity=note": ["overview", "files", "findings"],
-    }.items():
-        reader.ready(address)
-        assert reader.begun == names
 
 
 def test_what_fails_is_told(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,215 +175,34 @@ def test_hostile_names_are_text(own_release: Path) -> None:
         if path.parent.name in ("split_txt_files", own_release.name):
             path.write_text(path.read_text().replace(first["name"], first["name"].replace("Town", "<i>&Town")))
     reader = Reader(DeepAccident("v1", own_release, verbose=False))
-    for tab in ("", "findings", "files", "statistics", "maps"):
+    for tab in ("", "maps"):
         page = reader.ready(f"/release/{tab}")
         assert not page.all("i")
         assert all("src" in each for each in page.all("script"))
-        if tab in ("", "statistics", "maps"):
-            assert "<i>&Town" in page.text
+        assert "<i>&Town" in page.text
     page = reader.page("/release/")
     assert hostile in page.text
     found = reader.page(urljoin("/release/", page.address_of(hostile)))
     assert "1 of 6 scenarios" in " ".join(found.text.split())
 
 
-# missing files
-
-
-def test_missing_files_are_counted(da_partial: DeepAccident) -> None:
-    reader = Reader(da_partial)
-    told, page = release_completeness(da_partial.dataroot, workers=1), reader.ready("/release/files")
-    assert f"{told.total.here:,} of their {told.total.expected:,} files" in page.text
-    assert f"{told.total.missing:,} are missing" in page.text
-    assert [row[:4] for row in page.table("split")] == [
-        [name, str(split.scenarios), str(split.expected), str(split.whole)] for name, split in told.splits.items()
-    ]
-    lidar = next(row for row in page.table("kind") if row[0] == "lidar01")
-    samples = len(da_partial.sample)
-    absent = samples // 4
-    assert lidar[1:] == ["–", "–", "–", "all", "all", str(2 * absent), str(samples + absent)]
-    rows = page.table("scenario")
-    assert [row[0] for row in rows] == [each.scenario for each in told.lacking]
-    assert {row[2] for row in rows} == {"other behind"}
-    assert rows[0][3] == "Camera_Front (6), lidar01 (6)"
-    assert page.address_of(rows[0][0]) == f"../scenario/{rows[0][0]}/"
-
-
-def test_a_whole_release_lacks_nothing(da: DeepAccident) -> None:
-    page = Reader(da).ready("/release/files")
-    assert "4 of them whole" in page.text
-    assert len(page.tables) == 1
-
-
-# findings
-
-
-def test_findings_are_those_of_validate(of_damaged: Reader, report: ValidationReport) -> None:
-    page = of_damaged.ready("/release/findings")
-    shown = [each for each in report.findings if each.severity != "note"]
-    assert [row[0] for row in page.table("scenario")] == [each.scenario or "the release" for each in shown]
-    for row, finding in zip(page.table("scenario"), shown, strict=True):
-        assert row[2:] == [finding.code, finding.where, finding.what, finding.remedy]
-        assert row[1].startswith(finding.severity)
-    assert {row[0]: row[2] for row in page.table("kind")} == {
-        kind["code"]: str(kind["count"]) for kind in kinds_of(report.findings)
-    }
-    assert all(CODES[row[0]].meaning in row[3] for row in page.table("kind"))
-    notes = report.counts["note"]
-    assert notes
-    assert f"{notes} note{'' if notes == 1 else 's'} not shown" in page.text
-
-
-@pytest.mark.parametrize("severity", ["error", "warning", "note", ANY, "odd", "<b>"])
-@pytest.mark.parametrize("code", ["", "label-unreadable", "unlabelled", "<b>"])
-def test_findings_are_filtered(of_damaged: Reader, report: ValidationReport, severity: str, code: str) -> None:
-    page = of_damaged.ready(f"/release/findings?severity={severity}&code={code}")
-    wanted = [each for each in report.findings if severity in (each.severity, ANY) and code in (each.code, "")]
-    assert len(page.tables) == 1 + bool(wanted)
-    if wanted:
-        assert [row[4] for row in page.table("scenario")] == [each.what for each in wanted]
-    assert "not shown" not in page.text
-    assert re.search(r"(\d+) finding", page.text.rpartition("loads")[2])
-
-
-def test_long_lists_have_pages(of_damaged: Reader, report: ValidationReport, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(release, "part_of", partial(part_of, size=1))
-    page, whats = of_damaged.ready(f"/release/findings?severity={ANY}"), []
-    for number in range(1, len(report.findings) + 1):
-        whats += [row[4] for row in page.table("scenario")]
-        assert f"page {number} of {len(report.findings)}" in page.text
-        following = [each["href"] for each in page.all("a") if each.get("rel") == "next"]
-        if following:
-            page = of_damaged.page(f"/release/findings{following[0]}")
-    assert not following
-    assert whats == [each.what for each in report.findings]
-    for odd, number in {"0": 1, "-1": 1, "x": 1, "²": 1, "9" * 5: len(report.findings), "9" * 99: 1}.items():
-        page = of_damaged.page(f"/release/findings?severity={ANY}&page={odd}")
-        assert f"page {number} of " in page.text
-
-
-def test_a_release_without_findings_says_so(da: DeepAccident) -> None:
-    assert "None: the files are all there, and agree." in Reader(da).ready("/release/findings").text
-
-
-# statistics
-
-
-def test_statistics_are_the_devkits(reader: Reader, da_b: DeepAccident) -> None:
-    told, page = dataset_statistics(da_b), reader.ready("/release/statistics")
-    (sums,) = [table for table in page.tables if table[0][0] == ""]
-    assert sums[0][1:] == list(told.groups)
-    assert sums[1] == ["scenarios", *(str(told.scenarios[group]) for group in told.groups)]
-    shown = page.tables[1 : 1 + len(told.tables)]
-    assert [table[0] for table in shown] == [[str(each) for each in table.rows()[0]] for table in told.tables]
-    for table, whole in zip(shown, told.tables, strict=True):
-        assert len(table) == len(whole.rows())
-    towns = next(table for table in shown if table[0][0] == "town")
-    assert towns[1:] == [[str(each) for each in row] for row in told.counts["towns"].rows()[1:]]
-    assert [row[0] for row in page.tables[-1][1:]] == [each.scenario for each in told.collisions]
-
-
-def test_its_figures_are_pictures(reader: Reader) -> None:
-    assert get(reader.app, "/release/statistics/ends.png").status == 404
-    page = reader.ready("/release/statistics")
-    figures = [each for each in page.all("img") if "statistics/" in each["src"]]
-    assert len(figures) == 7
-    ends = next(each for each in figures if "ends" in each["src"])
-    answer = get(reader.app, urljoin("/release/statistics", ends["src"]))
-    assert answer.headers["content-type"] == "image/png"
-    assert Image.open(io.BytesIO(answer.body)).size == (int(ends["width"]), int(ends["height"]))
-    assert get(reader.app, "/release/statistics/other.png").status == 404
-
-
-def test_statistics_of_a_selection(reader: Reader, da_b: DeepAccident) -> None:
-    town = da_b.scenario[0]["town"]
-    chosen = da_b.find(town=town)
-    assert 0 < len(chosen) < len(da_b.scenario)
-    address = f"/release/statistics?town={town}&view=table&page=1"
-    page = reader.ready(address)
-    assert f"{len(chosen)} scenarios: town={town}" in " ".join(page.text.split())
-    (sums,) = [table for table in page.tables if table[0][0] == ""]
-    assert sums[1][1] == str(len(chosen))
-    assert page.address_of("Show them") == f"../?town={town}"
-    figure = next(each["src"] for each in page.all("img") if "ends" in each["src"])
-    assert figure == f"statistics/ends.png?town={town}"
-    of_all = get(reader.app, "/release/statistics/ends.png")
-    assert of_all.status == 404  # nobody has asked for those of all
-    assert get(reader.app, f"/release/{figure}").status == 200
-    before = reader.begun
-    reader.ready(f"/release/statistics?q=town={town}")  # the same scenarios
-    assert reader.begun == before
-
-
-def test_a_selection_that_makes_no_sense_is_told(reader: Reader) -> None:
-    for query, said in {
-        "q=tonw=Town03": "scenarios cannot be found by 'tonw'",
-        "q=length>=1000": "No scenario matches.",
-        "q=<b>": "<b>",
-    }.items():
-        page = reader.page(f"/release/statistics?{query}")
-        assert said in page.text
-        assert not [name for name in reader.begun if name.startswith("statistics")]
-        assert get(reader.app, f"/release/statistics/ends.png?{query}").status == 404
-        assert not page.all("b") or page.all("b") == [{"id": "count"}]
-
-
 # maps
 
 
-def test_a_map_is_made_for_who_asks_for_it(mapped: Reader) -> None:
+def test_maps_that_are_kept_are_shown(mapped: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = mapped.explorer.dataset
-    towns = towns_of(dataset)
+    town, *others = towns_of(dataset)
     page = mapped.page("/release/maps")
-    assert [each["value"] for each in page.all("button")] == towns
-    assert mapped.begun == []
-    town = towns[0]
+    assert page.text.count("Not made yet") == len(others) + 1
     assert get(mapped.app, f"/release/map/{town}.png").status == 404
-    answer = get(mapped.app, f"/release/maps?make={town}")
-    assert (answer.status, answer.headers["location"]) == (303, "maps")
-    assert mapped.explorer.jobs.wait(60)
-    made = kept_town_map(dataset, town)
-    assert made is not None
-    assert f"It reads up to {made.looks} pictures of {made.scenarios} scenario" in page.text
+    made = town_map(dataset, town)
     page = mapped.page("/release/maps")
-    assert [each["value"] for each in page.all("button")] == towns[1:]
+    assert page.text.count("Not made yet") == len(others)
     assert f"Read: {made.looks} pictures of {made.scenarios} scenario" in page.text
-    picture = get(mapped.app, f"/release/map/{town}.png")
-    assert picture.headers["content-type"] == "image/png"
-    other = Reader(dataset)
-    assert f"map/{town}.png" in other.page("/release/maps").loads
-    assert get(other.app, f"/release/map/{town}.png").body == picture.body
-
-
-def test_a_map_that_cannot_be_kept_is_shown(mapped: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(release, "kept_town_map", lambda *_: None)
-    town = towns_of(mapped.explorer.dataset)[0]
-    get(mapped.app, f"/release/maps?make={town}")
-    assert mapped.explorer.jobs.wait(60)
-    assert f"map/{town}.png" in mapped.page("/release/maps").loads
-    assert get(mapped.app, f"/release/map/{town}.png").status == 200
-
-
-def test_no_picture_makes_a_map_anew(mapped: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file that has come since is no reason to read all of them while a reader waits for a picture."""
-    dataset = mapped.explorer.dataset
-    town = towns_of(dataset)[0]
-    path = next(Path(dataset.dataroot).rglob("BEV_instance_camera/*/*_001.npz"))
-    path.rename(path.with_suffix(".later"))
-    town_map(dataset, town)
-    path.with_suffix(".later").rename(path)
-    monkeypatch.setattr(release, "town_map", lambda *_, **__: pytest.fail("made"))
-    assert get(mapped.app, f"/release/map/{town}.png").status == 200
-
-
-def test_where_no_picture_is_there_is_no_map(reader: Reader, da_b: DeepAccident) -> None:
-    town = towns_of(da_b)[0]
-    get(reader.app, f"/release/maps?make={town}")
-    assert "Being made" in reader.page("/release/maps").text or reader.explorer.jobs.all()[0].is_done
-    page = reader.ready("/release/maps")
-    assert f"{town}: none of its" in page.text
-    assert get(reader.app, "/release/maps?make=Town99").status == 404
-    assert get(reader.app, "/release/map/Town99.png").status == 404
+    assert f"map/{town}.png" in page.loads
+    assert get(mapped.app, f"/release/map/{town}.png").headers["content-type"] == "image/png"
+    assert get(mapped.app, "/release/map/Town99.png").status == 404
+    assert mapped.begun == []
 
 
 # conventions

@@ -15,13 +15,11 @@ from shown_page import Shown, shown
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.evaluation.results import read_results
-from deepaccident_devkit.evaluation.runs import read_rows, save_run
+from deepaccident_devkit.evaluation.runs import save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.explore import Explorer, export_pages, static_pages
-from deepaccident_devkit.explore.evaluations import verdict
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_html
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.taxonomy import short_name
 
 pytestmark = pytest.mark.slow
 
@@ -127,11 +125,8 @@ def test_the_list_has_the_scenarios_and_their_values(made: Made, da_motion: Deep
         assert row[6] == (visibility or "–")
         assert row[7] == ("–" if lead is None else f"{lead:.1f}")
     explorer.jobs.end()
-    (head,) = [table[0] for table in told.tables]
-    assert head[-2:] == ["score:boxes", "score:first"]
-    assert [row[-1] for row in rows].count("–") == 1  # nothing to count where nobody collides
     keys = [each["data-key"] for each in told.all("td") if "data-key" in each]
-    assert len(keys) == 2 * 6
+    assert len(keys) == 2 * 4
     assert all(not key or float(key) >= 0 for key in keys)
 
 
@@ -173,25 +168,6 @@ def test_a_replay_shows_the_first_model_that_can(made: Made, da_motion: DeepAcci
     without = render_replay(da_motion, normal(da_motion), tmp_path / "b.html")
     assert (made.index.parent / normal(da_motion) / "replay.html").read_bytes() == without.read_bytes()
     assert "predictions of" not in made.page(normal(da_motion)).text
-
-
-def test_verdicts_are_the_bundles_rows(made: Made, da_motion: DeepAccident) -> None:
-    page = made.page(accident(da_motion))
-    rows, _ = read_rows(made.bundle / "samples.parquet")
-    tables = [table for table in page.tables if table[0][0] == "agent"]
-    assert len(tables) == 2  # of both bundles
-    shown_rows = tables[1][1:]
-    assert {(row[0], row[1]) for row in shown_rows} == {(short_name(row["agent"]), str(row["frame"])) for row in rows}
-    assert [int(row[1]) for row in shown_rows] == sorted(row["frame"] for row in rows)
-    head = tables[1][0]
-    for name in ("positive", "tp 5m", "position error"):
-        assert name in head
-    found = {(row[0], row[1]): row[head.index("tp 5m")] for row in shown_rows}
-    assert found == {(short_name(row["agent"]), str(row["frame"])): str(row["tp_5m"]) for row in rows}
-    words = {(row[0], row[1]): row[head.index("verdict")] for row in shown_rows}
-    assert words == {(short_name(row["agent"]), str(row["frame"])): verdict("accident", row) for row in rows}
-    assert "accident, protocol boxes" in page.text
-    assert [table for table in made.page(normal(da_motion)).tables if table[0][0] == "agent"] == []
 
 
 def test_the_same_call_gives_the_same_bytes(made: Made, da_motion: DeepAccident, tmp_path: Path) -> None:

@@ -15,11 +15,11 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.notebook import png_of
 from deepaccident_devkit.render.pictures import save_picture
-from deepaccident_devkit.render.safety import render_lead_times, render_twins
+from deepaccident_devkit.render.safety import render_lead_times
 from deepaccident_devkit.render.statistics import render_statistics
 from deepaccident_devkit.render.training import render_curve
 from deepaccident_devkit.render.video import Scene, views_of
-from deepaccident_devkit.safety import lead_time_ledger, twin_diff
+from deepaccident_devkit.safety import lead_time_ledger
 from deepaccident_devkit.statistics import dataset_statistics
 
 HOSTILE: dict[str, Any] = {
@@ -80,7 +80,6 @@ PICTURES: dict[str, Draw] = {
     "motion labels": lambda da, sample: da.render_motion_labels(sample),
     "town map": lambda da, sample: da.render_town_map(da.get("scenario", scenario(sample))["town"]),
     "lead times": lambda da, _: render_lead_times(lead_time_ledger(da)),
-    "twins": lambda da, sample: render_twins(twin_diff(da, scenario(sample))),
     "statistics": lambda da, _: render_statistics(dataset_statistics(da, workers=1), "scenarios"),
     "curve": lambda *_: render_curve([1, 2, 3], [-1.0, 2.0, -3.0], "loss"),
 }

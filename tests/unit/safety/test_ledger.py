@@ -64,7 +64,6 @@ def test_gains_and_losses_are_differences_of_sets() -> None:
     assert replace(times, first_frames=np.arange(16)[::-1] + 1).from_the_start
     assert not replace(times, first_frames=np.arange(16)[::-1] + 2).from_the_start
     assert not replace(times, first_frames=np.zeros(16, dtype=int)).from_the_start
-    assert replace(times, first_frames=np.full(16, 3), rule=ObservationRule(sustained=3)).from_the_start
     lacking = replace(times, missing=("infrastructure",))
     assert lacking.together == 4.5
     assert lacking.losses.tolist()[:3] == [0.5, 1.5, 2.25]

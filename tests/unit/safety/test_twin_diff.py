@@ -13,8 +13,7 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
-from deepaccident_devkit.safety import Parting, TwinDiff, twin_diff, twin_report
-from deepaccident_devkit.safety.twins import diff_text
+from deepaccident_devkit.safety import Parting, TwinDiff, TwinReport, twin_diff, twin_report
 
 TOKENS = {"accident": "type1_subtype1_accident/a", "twin": "type1_subtype1_normal/a"}
 
@@ -67,13 +66,13 @@ def test_when_who_and_how_far() -> None:
 def test_twins_that_do_not_begin_together_are_told() -> None:
     diff = made_diff()
     assert diff.begins_together
-    assert "do not begin together" not in diff_text(diff)
     poses = diff.poses.copy()
     poses[1, 0, :, 0] += 0.8
     apart = replace(diff, poses=poses)
     assert not apart.begins_together
+    report = TwinReport(dataroot="", version="v1", diffs=(diff, apart), skipped=(), torn=())
+    assert "1 of them: the recordings do not begin together" in report.to_text()
     assert apart.to_dict()["begins_together"] is False
-    assert "do not begin together" in diff_text(apart)
     poses[1, 0] = np.nan
     assert replace(diff, poses=poses).begins_together, "no agent is there to tell"
 
@@ -105,30 +104,6 @@ def test_the_pairs_least_gap_in_the_twin() -> None:
     assert made_diff(shift=2).nearest_in_twin == pytest.approx((8, 1.5))
     assert made_diff(pair=(0, 2)).nearest_in_twin is None
     assert made_diff().to_dict()["gap_at_impact"] == pytest.approx(1)
-
-
-def test_values_over_time_as_a_file(tmp_path: Path) -> None:
-    path = made_diff().to_csv(tmp_path / "over_time.csv")
-    with path.open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 6 + 6 + 5
-    row = next(each for each in rows if (each["actor_id"], each["frame"]) == ("5", "5"))
-    assert {name: float(value) for name, value in row.items()} == {
-        "actor_id": 5,
-        "twin_id": 15,
-        "frame": 5,
-        "x": 4,
-        "y": 0,
-        "yaw": 0,
-        "twin_x": 2.75,
-        "twin_y": 0,
-        "twin_yaw": 0,
-        "speed": 10,
-        "twin_speed": 8,
-        "distance": 1.25,
-        "heading_difference": 0,
-    }
-    assert next(each for each in rows if each["actor_id"] == "7")["twin_x"] == ""
 
 
 def test_limits_are_checked() -> None:
@@ -204,17 +179,17 @@ def test_the_command(da_motion: DeepAccident, tmp_path: Path) -> None:
     root, normal = str(da_motion.dataroot), da_motion.find(collision=False)[0]["token"]
     all_of_them = CliRunner().invoke(deepaccident, ["safety", "twins", root], catch_exceptions=False)
     assert all_of_them.exit_code == 0
-    one = CliRunner().invoke(deepaccident, ["safety", "twins", root, normal, "--out", str(tmp_path)])
-    assert (one.exit_code, "an actor parts from 1 m or 10° on" in one.output) == (0, True)
-    names = {"twins.csv", "twin_actors.csv", "torn_twins.csv", "skipped.csv", "twins.json", "twins.png"}
-    assert {path.name for path in tmp_path.iterdir()} == {*names, "twins_over_time.csv"}
+    chosen = ["--where", "collision=true", "--out", str(tmp_path)]
+    CliRunner().invoke(deepaccident, ["safety", "twins", root, *chosen], catch_exceptions=False)
+    names = {"twins.csv", "twin_actors.csv", "torn_twins.csv", "skipped.csv", "twins.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
     told = json.loads((tmp_path / "twins.json").read_text(encoding="utf-8"))
     diff = twin_diff(da_motion, normal)
     assert told["twins"] == [diff.to_dict()]
     with (tmp_path / "twin_actors.csv").open(encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == len(diff.categories)
-    wrong = CliRunner().invoke(deepaccident, ["safety", "twins", root, normal, "--where", "town=Town03"])
-    assert (wrong.exit_code, "--where changes nothing with a scenario" in wrong.output) == (2, True)
+    wrong = CliRunner().invoke(deepaccident, ["safety", "twins", root, normal])
+    assert (wrong.exit_code, "SCENARIO changes nothing with twins" in wrong.output) == (2, True)
 
 
 def test_a_report_of_several_lists_torn_twins(da_b: DeepAccident) -> None:

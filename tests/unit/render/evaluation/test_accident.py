@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation import AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
-from deepaccident_devkit.render.evaluation import render_accuracy, render_alarms, render_errors, render_outcomes
+from deepaccident_devkit.render.evaluation import render_accuracy, render_alarms, render_errors
 from deepaccident_devkit.render.evaluation.accident import accuracy_by_distance, alarm_precision_recall
 
 LEFT_OUT = {"unjudged": 0, "beyond": 0, "at_impact": False, "unplaced": False}
@@ -80,13 +80,7 @@ def test_equally_sure_alarms_come_in_together() -> None:
     assert [each.tolist() for each in alarm_precision_recall(evaluator)] == [[1.0], [0.5]]
 
 
-def test_outcomes_and_errors_are_counted() -> None:
-    result = boxes().compute()
-    ax = render_outcomes(result, ax=new_axes())
-    assert_array_equal(
-        [[bar.get_height() for bar in kind] for kind in ax.containers],
-        [[getattr(each, case) for each in result.within.values()] for case in ("tp", "fp", "fn")],
-    )
+def test_errors_are_counted() -> None:
     ax = render_errors(boxes(), "position", ax=new_axes())
     drawn = {round(bar.get_x()): bar.get_height() for bar in ax.patches if bar.get_height()}
     assert drawn == {3: 1, 12: 1}  # of the surest alarm of each accident

@@ -1,15 +1,12 @@
 """Panels of detection results: what they draw is what the result says."""
 
-from dataclasses import replace
-
 from drawing import new_axes, words
 from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
 from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult
-from deepaccident_devkit.render.evaluation import render_average_precisions, render_precision_recall
+from deepaccident_devkit.render.evaluation import render_precision_recall
 
 
 def test_precision_is_drawn_up_to_the_recall_that_is_reached(detected: DetectionResult) -> None:
@@ -28,13 +25,3 @@ def test_precision_is_drawn_up_to_the_recall_that_is_reached(detected: Detection
         ),
         (lambda: render_precision_recall(detected, "car", ring=1), ChoiceError, "ring: expected 0 to 0, found 1"),
     )
-
-
-def test_bars_are_average_precisions(detected: DetectionResult) -> None:
-    ax = render_average_precisions(detected, ax=new_axes())
-    assert [bar.get_width() for bar in ax.patches] == [62.5, 25.0]
-    assert [text.get_text() for text in ax.texts] == ["62.5 %", "25.0 %", "–"]
-    assert [label.get_text() for label in ax.get_yticklabels()] == ["car\n8 true", "van\n4 true", "truck\n0 true"]
-    zeros = replace(detected, class_average_precision={**detected.class_average_precision, "truck": 0.0})
-    assert "–" in words(render_average_precisions(zeros, ax=new_axes()))  # also where the rules count it as 0
-    render_average_precisions(DetectionEvaluator("paper").compute(), ax=new_axes()).figure.draw_without_rendering()

@@ -5,7 +5,7 @@ from drawing import new_axes, words
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit.evaluation import MotionEvaluator
-from deepaccident_devkit.render.evaluation import render_quality_by_time, render_ranges
+from deepaccident_devkit.render.evaluation import render_quality_by_time
 
 
 def moving() -> MotionEvaluator:
@@ -25,12 +25,7 @@ def moving() -> MotionEvaluator:
     return evaluator
 
 
-def test_motion_is_drawn_by_range_and_frame() -> None:
-    ax = render_ranges(moving().compute(), ax=new_axes())
-    near, far = [[bar.get_height() for bar in kind] for kind in ax.containers]
-    assert_allclose(near[:2], (75.0, 100 * 2.4 / 4))
-    assert far == [0, 0, 0, 0]
-    assert [text.get_text() for text in ax.texts][4:] == ["–"] * 4
+def test_motion_is_drawn_by_frame() -> None:
     ax = render_quality_by_time(moving(), ax=new_axes())
     assert_allclose(ax.lines[0].get_xydata(), [(0, 80), (0.5, 40)])
     assert np.isnan(ax.lines[1].get_ydata()).all()

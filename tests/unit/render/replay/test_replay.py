@@ -14,7 +14,7 @@ from replay_page import accident, data_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.render import replay
-from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
+from deepaccident_devkit.errors import ChoiceError, TokenError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.render.replay import render_replay
@@ -55,16 +55,6 @@ def test_text_stays_text() -> None:
     [
         ({"scenario": "type1_subtype1_accident/nowhere"}, TokenError, "nowhere"),
         ({"agents": ["pedestrian"]}, ChoiceError, "agent: expected one of ego_vehicle"),
-        (
-            {"image_width": 4},
-            ConfigError,
-            "image_width: expected at least 32 pixels, or None for a fitting width, found 4",
-        ),
-        (
-            {"quality": 0},
-            ConfigError,
-            "quality: expected a JPEG quality from 1 to 95, or None for a fitting one, found 0",
-        ),
         ({"path": "."}, ChoiceError, "is a folder; name a file in it, such as replay.html"),
     ],
 )

@@ -47,33 +47,30 @@ def test_each_agent_has_six_cameras(da: DeepAccident, data: dict[str, Any]) -> N
     assert any("have smaller pictures, up to 480 pixels wide, of every frame." in note for note in data["notes"])
 
 
-def test_width_and_quality_are_as_asked(da: DeepAccident, tmp_path: Path) -> None:
-    path = render_replay(da, accident(da), tmp_path / "a.html", agents=["infrastructure"], image_width=40, quality=30)
-    data = data_of(path)
+def test_agents_are_as_asked(da: DeepAccident, tmp_path: Path) -> None:
+    data = data_of(render_replay(da, accident(da), tmp_path / "a.html", agents=["infrastructure"]))
     assert [agent["name"] for agent in data["agents"]] == ["infrastructure"]
     assert [camera["title"] for camera in data["cameras"][0]] == [each.removeprefix("Camera_") for each in CAMERAS]
-    assert picture(data["cameras"][0][0]["pictures"][0]).size == (40, 22)
-    assert "Pictures are up to 40 pixels wide, of JPEG quality 30." in data["notes"]
+    assert "Pictures are up to 960 pixels wide, of JPEG quality 80." in data["notes"]
     assert "Agents not shown: ego, ego behind, other, other behind." in data["notes"]
 
 
-def taken(dataset: DeepAccident, limit: float, **how: int) -> tuple[PictureSettings | None, Jpegs]:
+def taken(dataset: DeepAccident, limit: float) -> tuple[PictureSettings | None, Jpegs]:
     """The pictures of a page on which each agent's back camera follows the pair from frame 4 on."""
     files = camera_files(recording_of(dataset, accident(dataset), None))
     channels = (*[CAMERAS[0]] * 3, *["Camera_Back"] * 3)
     followed = Followed(channels=dict.fromkeys(AGENTS, channels), agents=(AGENTS[0],) * 6)
-    return camera_pictures(files, followed, limit, **how)
+    return camera_pictures(files, followed, limit)
 
 
 def weight(jpegs: Jpegs) -> int:
     return sum(len(each) for cameras in jpegs.values() for all_ in cameras.values() for each in all_ if each)
 
 
-@pytest.mark.parametrize("how", [{}, {"width": 48}, {"quality": 60}])
-def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident, how: dict[str, int]) -> None:
+def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident) -> None:
     sizes = []
     for limit in (math.inf, 145_000, 45_000, 20_000, 12_000):
-        settings, jpegs = taken(da, limit, **how)
+        settings, jpegs = taken(da, limit)
         assert settings is not None
         assert weight(jpegs) <= limit
         sizes.append(weight(jpegs))
@@ -86,12 +83,13 @@ def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident, how:
         assert given.get("Camera_Back", [False] * 6) == others[:3] + follows
     assert sizes == sorted(sizes, reverse=True)
     assert (settings.others, settings.every > 1) == (0, True)
-    assert taken(da, 10, **how)[1] == {}
+    assert taken(da, 10)[1] == {}
 
 
 def test_other_cameras_have_smaller_pictures(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sensors, "_LEAST_OTHER", 8)
-    jpegs = taken(da, math.inf, width=40, quality=60)[1]["other_vehicle"]
+    monkeypatch.setattr(sensors, "_LADDER", [(40, 60)])
+    jpegs = taken(da, math.inf)[1]["other_vehicle"]
     assert [size_of(each) for each in jpegs["Camera_Front"]] == [(40, 22)] * 6
     assert [size_of(each) for each in jpegs["Camera_Back"]] == [(20, 11)] * 3 + [(40, 22)] * 3
     assert [size_of(each) for each in jpegs["Camera_FrontRight"]] == [(20, 11)] * 6
