@@ -233,7 +233,7 @@ class _Run:
         }
 
     def _losses(self, step: nn.Module, batch: Mapping[str, Any], number: int) -> dict[str, Tensor]:
-        seeds = (self.config.seed, number, 0, self.place.rank)  # the 0 keeps the draws of earlier versions
+        seeds = (self.config.seed, number, 0, self.place.rank)  # the 0 keeps the draws of published runs
         generator = generator_of(*seeds)
         torch.manual_seed(generator_of(*seeds).initial_seed())  # dropout, and the latents' noise
         inputs, targets = training_batch(batch, self.moments.model, self.config, generator)
