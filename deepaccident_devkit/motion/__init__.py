@@ -17,11 +17,12 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 | boxes along the paths | linked instances → their redrawn maps | `postprocessing.redrawing` |
 
 A `MotionLabelConfig` (`config`) says what is rasterised, a `LabelProtocol` how (`protocols`: every quirk of the
-released code is a switch), and a grid's orientation how cells lie (`orientations`). `model.warps` warps a
+released code is a switch), and a grid's orientation how cells lie (`orientations`). `warps.feature_warps` warps a
 model's own maps as labels are warped.
 """
 
 from deepaccident_devkit.motion.augmentation import Augmentation
+from deepaccident_devkit.motion.batch_names import config_from_names
 from deepaccident_devkit.motion.bev_segmentation import (
     BEV_CLASSES,
     BevSegmentation,
@@ -45,6 +46,7 @@ from deepaccident_devkit.motion.postprocessing.predict import (
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.motion.sample_lists import evaluation_samples, samples, training_samples
+from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
 
 __all__ = [
     "BEV_CLASSES",
@@ -65,11 +67,14 @@ __all__ = [
     "MotionLabelConfig",
     "MotionLabels",
     "PostProcessing",
+    "agents_to_ego",
     "bev_segmentation",
+    "config_from_names",
     "evaluation_samples",
     "labels_from_polygons",
     "motion_labels",
     "motion_labels_from_boxes",
+    "past_to_present",
     "predict_instances",
     "samples",
     "segmentation_of",

@@ -1,4 +1,4 @@
-"""The names and axes that the codes of FIERY, BEVerse and DeepAccident have for labels.
+"""The names and axes that the codes of FIERY, BEVerse and DeepAccident have for labels, and back.
 
 | ours | FIERY's batch | BEVerse's and DeepAccident's batch | heads of their models |
 |---|---|---|---|
@@ -21,11 +21,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from types import MappingProxyType
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.arrays import AnyArray, checked
+from deepaccident_devkit.errors import ConfigError, FieldError
+from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.geometry.handedness import flip_six_vector
 from deepaccident_devkit.motion.config import MotionLabelConfig
@@ -35,6 +38,15 @@ from deepaccident_devkit.text import choice
 BatchNames = Literal["fiery", "beverse", "deepaccident"]
 MAPS: Final = ("segmentation", "instance", "centerness", "offset", "flow")
 VECTOR_MAPS: Final = ("offset", "flow")
+HEADS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "segmentation": "segmentation",
+        "centerness": "instance_center",
+        "offset": "instance_offset",
+        "flow": "instance_flow",
+    }
+)
+"""Our label → the model's output that learns it, in all three codes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +86,7 @@ def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: B
     Raises:
         ChoiceError: no such code.
     """
-    batch = _BATCHES[choice("names", names, _BATCHES)]
+    batch = _batch(names)
     result = {}
     for ours in MAPS:
         values = to_orientation(
@@ -99,3 +111,118 @@ def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: B
         result["img_is_valid"] = np.array(labels["valid"])
         result["has_invalid_frame"] = np.array(not labels["valid"].all())
     return result
+
+
+def from_batch(batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames) -> dict[str, AnyArray]:
+    """Our maps, `future_egomotion` and `valid` from one sample of another code: the reverse of `to_batch`.
+
+    Args:
+        batch: a sample, without a batch axis, of any framework's arrays (`arrays.as_numbers`).
+        config: what the labels were made with.
+        names: the code whose names they are.
+
+    Raises:
+        ChoiceError: no such code.
+        FieldError: the batch lacks an array.
+        GeometryError: an array has another shape than the configuration says.
+    """
+    code = _batch(names)
+    missing = sorted(set(code.names.values()) - set(batch))
+    if missing:
+        raise FieldError(f"batch: {names} labels have {missing[0]!r}; there are {', '.join(sorted(batch))}")
+    shape = config.grid.with_orientation(code.orientation).shape
+    past = config.receptive_field - 1 if code.past_frames else 0
+    result = {}
+    for ours in MAPS:
+        theirs = code.names[ours]
+        channels = {"segmentation": (1,) if code.past_frames else (), "instance": (), "centerness": (1,)}.get(
+            ours, (2,)
+        )
+        dtype = {"segmentation": np.uint8, "instance": np.int32}.get(ours, np.float32)
+        values = checked(theirs, batch[theirs], (past + config.label_frames, *channels, *shape), dtype)[past:]
+        if ours == "segmentation" and channels:
+            values = values[:, 0]
+        result[ours] = to_orientation(
+            values,
+            vectors=ours in VECTOR_MAPS,
+            source=code.orientation,
+            target=config.grid.orientation,
+            ignore=config.ignore_index,
+        )
+    theirs = code.names["future_egomotion"]
+    motion = checked(theirs, batch[theirs], (config.frames, 6), np.float32)
+    result["future_egomotion"] = flip_six_vector(motion).astype(np.float32) if code.left_handed else motion
+    known = batch["img_is_valid"] if "img_is_valid" in batch else np.ones(config.frames, dtype=bool)
+    result["valid"] = checked("img_is_valid", known, (config.frames,), np.bool_)
+    return result
+
+
+def config_from_names(settings: Mapping[str, Any], names: BatchNames) -> MotionLabelConfig:
+    """A code's preset, changed as the code's own settings say.
+
+    FIERY's settings are its `cfg` as nested dictionaries (TIME_RECEPTIVE_FIELD, N_FUTURE_FRAMES, LIFT.X_BOUND,
+    LIFT.Y_BOUND, DATASET.IGNORE_INDEX, DATASET.FILTER_INVISIBLE_VEHICLES). BEVerse's and DeepAccident's are
+    `receptive_field`, `future_frames`, and the arguments of ConvertMotionLabels: `grid_conf` (xbound, ybound),
+    `ignore_index`, `only_vehicle`, `filter_invisible`. What is not given stays as in the preset; keys that do not
+    concern labels are ignored.
+
+    Raises:
+        ChoiceError: no such code.
+        ConfigError: an impossible value.
+    """
+    names = choice("names", names, get_args(BatchNames))
+    found = {ours: _setting(settings, path) for ours, path in _SETTINGS[names].items()}
+    changes: dict[str, Any] = {ours: value for ours, value in found.items() if value is not None}
+    preset = MotionLabelConfig.preset(names)
+    bounds = {axis: changes.pop(axis) for axis in ("x", "y") if axis in changes}
+    if bounds:
+        grid = {"x": preset.grid.x, "y": preset.grid.y, **bounds}
+        if names == "deepaccident" and "y" in bounds:  # left-handed
+            low, high, size = _bound(grid["y"])
+            grid["y"] = (-high, -low, size)
+        changes["grid"] = BevGrid(grid["x"], grid["y"])
+    return MotionLabelConfig.preset(names, **changes)
+
+
+_CONVERTER: Final = {
+    "receptive_field": ("receptive_field",),
+    "future_frames": ("future_frames",),
+    "x": ("grid_conf", "xbound"),
+    "y": ("grid_conf", "ybound"),
+    "ignore_index": ("ignore_index",),
+    "only_vehicle": ("only_vehicle",),
+    "filter_invisible": ("filter_invisible",),
+}
+_SETTINGS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
+    "fiery": {
+        "receptive_field": ("TIME_RECEPTIVE_FIELD",),
+        "future_frames": ("N_FUTURE_FRAMES",),
+        "x": ("LIFT", "X_BOUND"),
+        "y": ("LIFT", "Y_BOUND"),
+        "ignore_index": ("DATASET", "IGNORE_INDEX"),
+        "filter_invisible": ("DATASET", "FILTER_INVISIBLE_VEHICLES"),
+    },
+    "beverse": _CONVERTER,
+    "deepaccident": _CONVERTER,
+}
+
+
+def _setting(settings: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+    value: Any = settings
+    for name in path:
+        if not isinstance(value, Mapping) or name not in value:
+            return None
+        value = value[name]
+    return value
+
+
+def _bound(given: Any) -> tuple[float, float, float]:
+    try:
+        low, high, size = (float(number) for number in given)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"ybound: expected start, end and cell size in metres, found {given!r}") from error
+    return low, high, size
+
+
+def _batch(names: str) -> _Batch:
+    return _BATCHES[choice("names", names, _BATCHES)]

@@ -11,8 +11,8 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.motion.batch_names import MAPS, BatchNames, to_batch
-from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.batch_names import MAPS, BatchNames, from_batch, to_batch
+from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.warps.to_present import maps_to_present
 from deepaccident_devkit.motion.warps.warping import WarpMode
 from deepaccident_devkit.text import Pictured
@@ -105,6 +105,21 @@ class MotionLabels(FrozenArrays, Pictured):
         warped: dict[str, Any] = maps_to_present(maps, self.label_egomotion, ~self.label_valid, self.config, centerness)
         return replace(self, **warped, at_present=True)
 
+    @property
+    def instance_center(self) -> AnyArray:
+        """`centerness`, under the name of the models' output."""
+        return self.centerness
+
+    @property
+    def instance_offset(self) -> AnyArray:
+        """`offset`, under the name of the models' output."""
+        return self.offset
+
+    @property
+    def instance_flow(self) -> AnyArray:
+        """`flow`, under the name of the models' output."""
+        return self.flow
+
     def as_batch(self, names: BatchNames) -> dict[str, AnyArray]:
         """The labels as a sample of FIERY's, BEVerse's or DeepAccident's own loader: names, axes, orientation, types.
 
@@ -112,6 +127,27 @@ class MotionLabels(FrozenArrays, Pictured):
         """
         arrays = {name: getattr(self, name) for name in (*MAPS, "future_egomotion", "valid")}
         return to_batch(arrays, self.config, names)
+
+    @classmethod
+    def from_batch(
+        cls, batch: Mapping[str, Any], config: MotionLabelConfig | str, names: BatchNames, *, at_present: bool = False
+    ) -> MotionLabels:
+        """Labels from a sample of another code's loader, the reverse of `as_batch`; the ids' actors are not known.
+
+        Args:
+            batch: arrays or tensors of one sample, without a batch axis.
+            config: what they were made with, or the name of a preset; its orientation is that of the result.
+            names: the code whose names they have.
+            at_present: whether they were warped to the present.
+
+        Raises:
+            ChoiceError: no such code.
+            FieldError: the batch lacks an array.
+            GeometryError: an array has another shape than the configuration says.
+        """
+        chosen = label_config(config)
+        arrays: dict[str, Any] = from_batch(batch, chosen, names)
+        return cls(config=chosen, id_map={}, at_present=at_present, **arrays)
 
 
 def _remade(values: dict[str, Any]) -> MotionLabels:

@@ -1,4 +1,4 @@
-"""The golden warps (tests/data/golden: a_labels, g_poses, h_fiery) to the present; test_model has those of features.
+"""The golden warps (tests/data/golden: a_labels, g_poses, h_fiery): to the present, from the past and other agents.
 
 Made by the released functions and by FIERY's own under torch 2.13 (tests/data/golden/README.md); the rules are
 docs/released_code.md, Warps, and FIERY's own labels. No cell of a nearest warp of labels may differ; a dense field may
@@ -19,13 +19,8 @@ from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import to_orientation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
 from deepaccident_devkit.motion.warps.chains import present_from_frames
-from deepaccident_devkit.motion.warps.warping import (
-    blend_cells,
-    nearest_indices,
-    sample_points,
-    sampling_matrix,
-    take_cells,
-)
+from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
+from deepaccident_devkit.motion.warps.warping import sample_points, sampling_matrix, warp
 
 RELEASED = BevGrid(orientation="released")
 PROTOCOL = LABEL_PROTOCOLS["released"]
@@ -71,7 +66,7 @@ def test_labels_equal_fierys(golden) -> None:
 @pytest.mark.golden_rows("g_poses", "identity_warp_nearest")
 def test_standing_still_samples_as_the_released_code(golden_row, mode) -> None:
     channel = whole(golden_row)["warp_pattern"][golden_row.index].astype(np.float32)
-    warped = sampled(channel, np.eye(4), mode)
+    warped = warp(channel, np.eye(4), RELEASED, PROTOCOL, mode)
     assert_warped(warped, golden_row[f"identity_warp_{mode}"], mode)
 
 
@@ -91,16 +86,34 @@ def test_future_frames_are_warped_as_by_the_released_code(golden_row, mode) -> N
     arrays, frame = whole(golden_row), golden_row.index
     pattern = arrays["warp_pattern"].astype(np.float32)
     transform = present_from_frames(flip_six_vector(chain_of(golden_row)[2:]), PROTOCOL)[frame]
-    warped = sampled(pattern, sampling_matrix(transform[None], PROTOCOL)[0], mode)
+    warped = warp(pattern, sampling_matrix(transform[None], PROTOCOL)[0], RELEASED, PROTOCOL, mode)
     assert_warped(warped if frame else pattern, golden_row[f"future_warp_{mode}"], mode)
 
 
-def sampled(raster: np.ndarray, source_from_target: np.ndarray, mode: str) -> np.ndarray:
-    """A raster in the released orientation, at the released sample points."""
-    if mode == "bilinear":
-        return blend_cells(raster, sample_points(source_from_target, RELEASED, PROTOCOL))
-    flat = raster.reshape(*raster.shape[:-2], -1)
-    return take_cells(flat, nearest_indices(source_from_target, RELEASED, PROTOCOL)).reshape(raster.shape)
+@MODES
+@ORIENTATIONS
+@pytest.mark.golden_rows("g_poses", "past_warp_nearest")
+def test_past_frames_are_warped_as_by_the_released_code(golden_row, mode, orientation) -> None:
+    grid = BevGrid(orientation=orientation)
+    pattern = RELEASED.reorient(whole(golden_row)["warp_pattern"].astype(np.float32), orientation)
+    motion = flip_six_vector(chain_of(golden_row))
+    warped = past_to_present(
+        np.stack([pattern] * len(whole(golden_row)["past_warp_nearest"])), motion, grid=grid, mode=mode
+    )[golden_row.index]
+    assert_warped(grid.reorient(warped, "released"), golden_row[f"past_warp_{mode}"], mode)
+
+
+@MODES
+@ORIENTATIONS
+@pytest.mark.golden_rows("g_poses", "v2x_warp_nearest_0")
+def test_agents_maps_are_warped_as_by_the_released_code(golden_row, mode, orientation) -> None:
+    grid = BevGrid(orientation=orientation)
+    arrays = whole(golden_row)
+    pattern = RELEASED.reorient(arrays["warp_pattern"].astype(np.float32), orientation)
+    for name in (each for each in arrays if each.startswith("v2x_warp_pose_")):
+        pose = flip_six_vector(arrays[name])
+        warped = agents_to_ego(np.stack([pattern] * len(pose)), pose, grid=grid, mode=mode)[golden_row.index]
+        assert_warped(grid.reorient(warped, "released"), golden_row[name.replace("pose", mode)], mode)
 
 
 def scene_of(golden) -> dict[str, np.ndarray]:

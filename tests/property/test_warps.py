@@ -7,40 +7,30 @@ from numpy.testing import assert_allclose, assert_array_equal
 from strategies import grids
 
 from deepaccident_devkit.geometry import BevGrid, six_vectors
-from deepaccident_devkit.geometry.handedness import flip_pose
+from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
-from deepaccident_devkit.motion.warps.warping import (
-    blend_cells,
-    nearest_indices,
-    rounded_points,
-    sample_points,
-    sampling_matrix,
-    take_cells,
-)
+from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
+from deepaccident_devkit.motion.warps.to_present import agents_to_ego
+from deepaccident_devkit.motion.warps.warping import nearest_indices, sample_points, sampling_matrix, warp
 
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
 RULES = st.sampled_from(list(LABEL_PROTOCOLS.values()))
 ORIENTATIONS = st.sampled_from(("devkit", "released", "fiery"))
 STEPS = st.tuples(*(st.floats(-5, 5) for _ in range(2)), st.just(0.0), st.just(0.0), st.just(0.0), st.floats(-3, 3))
 """Motions in the plane."""
+AUGMENTATIONS = st.builds(Augmentation, rotation=st.floats(-3, 3), scale=st.floats(0.9, 1.1), flip=st.booleans())
 
 
 def noise(grid: BevGrid) -> np.ndarray:
     return np.random.default_rng(0).random((2, *grid.shape)).astype(np.float32)
 
 
-def warp(raster: np.ndarray, matrix: np.ndarray, grid: BevGrid, rules, orientation) -> np.ndarray:
-    """The nearest cells' values, of rasters that lie in `orientation`."""
-    indices = rounded_points(sample_points(matrix, grid, rules), grid, rules, orientation)
-    return take_cells(raster.reshape(*raster.shape[:-2], -1), indices).reshape(raster.shape)
-
-
 @given(grids(), RULES, ORIENTATIONS)
 def test_standing_still_keeps_every_cell(grid, rules, orientation) -> None:
-    raster = noise(grid.with_orientation(orientation))
-    assert_array_equal(warp(raster, np.eye(4), grid, rules, orientation), raster)
-    exact = noise(grid.with_orientation(CLEAN.native))
-    assert_array_equal(blend_cells(exact, sample_points(np.eye(4), grid, CLEAN)), exact)
+    grid = grid.with_orientation(orientation)
+    raster = noise(grid)
+    assert_array_equal(warp(raster, np.eye(4), grid, rules, orientation=orientation), raster)
+    assert_array_equal(warp(raster, np.eye(4), grid, CLEAN, "bilinear", orientation=orientation), raster)
 
 
 @given(grids())
@@ -55,8 +45,8 @@ def test_all_orientations_warp_alike(step, rules, orientation) -> None:
     matrix = sampling_matrix(six_vectors.to_matrices(step)[None], rules)[0]
     native, raster = nearest_indices(matrix, grid, rules), noise(grid)
     lying = rules.native
-    expected = warp(grid.reorient(raster, lying), matrix, grid, rules, lying)
-    found = warp(grid.reorient(raster, orientation), matrix, grid, rules, orientation)
+    expected = warp(grid.reorient(raster, lying), matrix, grid, rules)
+    found = warp(grid.reorient(raster, orientation), matrix, grid, rules, orientation=orientation)
     assert_array_equal(grid.with_orientation(orientation).reorient(found, lying), expected)
     assert ((native >= -1) & (native < grid.cells)).all()
 
@@ -67,11 +57,28 @@ def test_there_and_back_brings_smooth_maps_home(step) -> None:
     grid = BevGrid((-20, 20, 0.5), (-20, 20, 0.5), "released")
     there = six_vectors.to_matrices(step)
     column = np.broadcast_to(np.arange(grid.shape[1], dtype=np.float64) + 1000, grid.shape)
-    away = warp(column, there, grid, CLEAN, "released")
-    home = warp(away, np.linalg.inv(there), grid, CLEAN, "released")
+    away = warp(column, there, grid, CLEAN, orientation="released")
+    home = warp(away, np.linalg.inv(there), grid, CLEAN, orientation="released")
     seen = home > 0
     assert (np.abs(home - column)[seen] <= 2).all()
     assert seen[30:50, 30:50].all()
+
+
+@given(st.lists(STEPS, min_size=1, max_size=4), AUGMENTATIONS, RULES)
+def test_past_and_future_undo_each_other(steps, augmentation, rules) -> None:
+    """Of one motion: a past frame's transform is the inverse of the future frame's; augmented or not."""
+    for given_one in (None, augmentation):
+        forward = present_from_past(steps[:1], rules, given_one)[0]
+        backward = present_from_frames([steps[0], steps[0]], rules, given_one)[1]
+        assert_allclose(forward @ backward, np.eye(4), atol=1e-4)
+
+
+@given(st.lists(STEPS, min_size=2, max_size=5))
+def test_exact_chains_are_the_products_of_their_steps(steps) -> None:
+    past = present_from_past(steps, CLEAN)
+    assert_allclose(past[0], past[1] @ present_from_past(steps[:1], CLEAN)[0], atol=1e-9)
+    future = present_from_frames(steps, CLEAN)
+    assert_allclose(future[-1] @ present_from_past(steps[:-1], CLEAN)[0], np.eye(4), atol=1e-9)
 
 
 @given(STEPS, ORIENTATIONS)
@@ -79,7 +86,6 @@ def test_a_cell_lands_where_its_centre_goes(step, orientation) -> None:
     """Right-handed metres in, right-handed metres out, in every orientation; a cell's neighbours at most."""
     grid = BevGrid((-20, 20, 0.5), (-20, 20, 0.5), orientation)
     blob = np.linalg.norm(grid.centers() - (3.25, -2.25), axis=-1) < 1.1
-    source_from_target = sampling_matrix(flip_pose(six_vectors.to_matrices(step))[None], CLEAN)[0]
-    found = warp(blob, source_from_target, grid, CLEAN, orientation)
+    found = agents_to_ego(np.stack([blob] * 2), [[0] * 6, step], grid=grid, protocol="clean")[1]
     expected = (six_vectors.to_matrices(step) @ [3.25, -2.25, 0, 1])[:2]
     assert_allclose(grid.centers()[found].mean(axis=0), expected, atol=0.26)

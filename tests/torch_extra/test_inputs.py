@@ -13,6 +13,10 @@ from deepaccident_devkit.geometry import SE3, BevGrid, Boxes
 from deepaccident_devkit.motion import (
     MotionHeads,
     MotionLabelConfig,
+    MotionLabels,
+    agents_to_ego,
+    motion_labels_from_boxes,
+    past_to_present,
 )
 
 CONFIG = MotionLabelConfig(grid=BevGrid(x=(-4, 4, 1), y=(-3, 3, 1)), receptive_field=1, future_frames=1)
@@ -27,9 +31,20 @@ def heads_in_order(tensor: torch.Tensor) -> Any:
     return MotionHeads.from_arrays(*(tensor.expand(shape) for shape in SHAPES.values())).flow
 
 
+def labels_of_a_batch(tensor: torch.Tensor) -> Any:
+    batch: dict[str, Any] = motion_labels_from_boxes([None, None], np.zeros((2, 6)), CONFIG).as_batch("beverse")
+    batch["instance_offset"] = tensor.expand(batch["instance_offset"].shape)
+    return MotionLabels.from_batch(batch, CONFIG, "beverse").offset
+
+
 ENTRIES: list[Callable[[torch.Tensor], Any]] = [
     heads,
     heads_in_order,
+    labels_of_a_batch,
+    lambda tensor: agents_to_ego(tensor.expand(2, 6, 8), np.zeros((2, 6)), grid=CONFIG.grid),
+    lambda tensor: agents_to_ego(np.zeros((2, 6, 8)), tensor.expand(2, 6), grid=CONFIG.grid),
+    lambda tensor: past_to_present(tensor.expand(2, 3, 6, 8), np.zeros((1, 6)), grid=CONFIG.grid),
+    lambda tensor: past_to_present(np.zeros((2, 6, 8)), tensor.expand(2, 6), grid=CONFIG.grid),
     lambda tensor: SE3.identity().apply(tensor.expand(4, 3)),
     lambda tensor: Boxes.from_arrays(tensor.expand(1, 3), np.ones((1, 3)), np.zeros(1)),
     lambda tensor: CONFIG.grid.index_of(tensor.expand(4, 2)),
@@ -58,7 +73,7 @@ def test_others_are_refused_with_the_remedy(entry: Callable[[torch.Tensor], Any]
         entry(tensor)
 
 
-@pytest.mark.parametrize("entry", [heads, heads_in_order])
+@pytest.mark.parametrize("entry", [heads, heads_in_order, labels_of_a_batch])
 def test_numbers_beyond_float32_are_refused(entry: Callable[[torch.Tensor], Any]) -> None:
     with pytest.raises(GeometryError, match="expected numbers within float32's range, found 1e"):
         entry(torch.full((), 1e300, dtype=torch.float64))

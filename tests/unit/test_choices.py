@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import click
+import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
@@ -18,13 +19,20 @@ from deepaccident_devkit.evaluation.runs import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.export.mcap import McapConfig
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.motion import MotionLabelConfig, agents_to_ego, config_from_names
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.render.axes import layers_of
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.testing import SmallRelease
 from deepaccident_devkit.text import choice, meant_text
 from deepaccident_devkit.v2x import AgentConfig, PoseNoise, cooperating_agents
+
+SETTINGS = {"grid_conf": {"xbound": (-50.0, 50.0, 0.5), "ybound": (-30.0, 50.0, 0.5)}}
+
+
+def warped(mode: str) -> np.ndarray:
+    return agents_to_ego(np.zeros((2, 200, 200), dtype=np.int16), np.zeros((2, 6)), mode=mode)
+
 
 CALLS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[DeepAccident, str], Any]]] = [
     ("LIDAR", "lidar", "lidarr", ChoiceError, lambda da, word: da.boxes(da.sample[0], word).frame),
@@ -61,6 +69,15 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
     ("Other", "other", "othr", ChoiceError, lambda word: AgentConfig("mine", (word,))),
     ("Hidden", "hidden", "hiden", ConfigError, lambda word: SynthConfig(view=word)),
     ("INFRASTRUCTURE", "infrastructure", "infra", ConfigError, lambda w: SmallRelease(agents=(w,))),
+    ("BEVerse", "beverse", "bevers", ChoiceError, lambda word: config_from_names(SETTINGS, word)),
+    ("DeepAccident", "deepaccident", "accident", ChoiceError, lambda word: config_from_names(SETTINGS, word)),
+    (
+        "Bilinear",
+        "bilinear",
+        "linear",
+        ChoiceError,
+        lambda word: warped(word).dtype,
+    ),
     ("Constant_Turn_Rate", "constant_turn_rate", "constant_turn", ChoiceError, lambda word: Baseline(model=word)),
     ("Infrastructure", "infrastructure", "infra", ChoiceError, lambda word: agent_names((word,))),
     ("VEHICLES", "vehicles", "vehicle", ChoiceError, lambda word: names_or_configuration((word,))),

@@ -15,7 +15,7 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells
 from deepaccident_devkit.motion.protocols import LabelProtocol
-from deepaccident_devkit.motion.warps.warping import SamplingLine, nearest_indices, sampling_lines, take_cells
+from deepaccident_devkit.motion.warps.warping import SamplingLine, nearest_indices, sampling_lines
 
 _MARGIN: Final = 0.75
 """In cells, around a footprint: half a cell for the nearest sampling, and some for the rounding of the points."""
@@ -94,7 +94,8 @@ def _seen_anywhere(
     """Footprints that cells of the frames before sample, and the cells' rows and columns; all cells are looked at."""
     maps = footprints.top.reshape(-1, grid.cells)[1:]
     sampled = [
-        take_cells(top, nearest_indices(matrix, grid, rules)) for matrix, top in zip(matrices, maps, strict=True)
+        np.append(top, np.int32(0)).take(nearest_indices(matrix, grid, rules))
+        for matrix, top in zip(matrices, maps, strict=True)
     ]
     joined = np.concatenate([np.zeros(0, dtype=np.int64), *sampled])
     cell = np.flatnonzero(joined)

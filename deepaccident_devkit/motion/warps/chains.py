@@ -1,4 +1,4 @@
-"""Which transform a frame is warped with: products of the motions in between.
+"""Which transform a frame, a past moment or an agent is warped with: products of the motions in between.
 
 All 6-vectors and matrices that go in are right-handed; what comes out has the handedness of the protocol's native
 orientation, as `warping` takes it. The warps `stretched` and `fiery` compute in float32 as their codes do, `exact` in
@@ -101,6 +101,39 @@ def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: A
     """
     inverse = _arithmetic(rules).inverse(_native_matrices(egomotion, rules))
     return _augmented(inverse, rules, augmentation)
+
+
+def present_from_past(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
+    """Transforms of each past moment to the present.
+
+    The released code and FIERY multiply the motions in the order of time, E_0 E_1, and so are wrong from the second
+    moment before the present on; `exact` multiplies E_1 E_0.
+
+    Args:
+        egomotion: (P, 6) right-handed, `next_from_this` of the P moments before the present, the oldest first.
+        rules: whose arithmetic, handedness and order.
+        augmentation: of both frames; the product becomes A · product · A⁻¹.
+
+    Returns:
+        (P, 4, 4), the oldest first.
+
+    Raises:
+        GeometryError: another shape.
+    """
+    arithmetic = _arithmetic(rules)
+    steps = _native_matrices(egomotion, rules)
+    chain = list(steps[-1:])
+    for step in steps[-2::-1]:
+        pair = (chain[-1], step) if rules.warp == "exact" else (step, chain[-1])
+        chain.append(arithmetic.product(*pair))
+    return _augmented(np.reshape(chain[::-1], steps.shape), rules, augmentation)
+
+
+def ego_from_agents(
+    relative_pose: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
+) -> AnyArray:
+    """Transforms (K, 4, 4) of agents' frames to the ego's from right-handed 6-vectors (K, 6); raises GeometryError."""
+    return _augmented(_native_matrices(relative_pose, rules), rules, augmentation)
 
 
 def _arithmetic(rules: LabelProtocol) -> _Arithmetic:

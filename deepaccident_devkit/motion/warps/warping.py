@@ -57,8 +57,10 @@ def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyA
     return result
 
 
-def nearest_indices(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol) -> CellIndices:
-    """The source cell of each target cell, in the protocol's native orientation.
+def nearest_indices(
+    source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol, *, orientation: Orientation | None = None
+) -> CellIndices:
+    """The source cell of each target cell.
 
     Points half-way between two cells go to the even one.
 
@@ -66,6 +68,7 @@ def nearest_indices(source_from_target: ArrayLike, grid: BevGrid, rules: LabelPr
         source_from_target: (4, 4) metres, in the protocol's handedness.
         grid: the cells of both rasters; its own orientation does not matter.
         rules: the protocol that says how to sample.
+        orientation: of the rasters that the indices are for; None for the protocol's native orientation.
 
     Returns:
         (H·W,) intp, row · W + column of the source cell, in the order of the target's cells; −1 (`OUTSIDE`) where the
@@ -74,13 +77,13 @@ def nearest_indices(source_from_target: ArrayLike, grid: BevGrid, rules: LabelPr
     Raises:
         GeometryError: the matrix has another shape or is not finite, or the grid has more than 2²⁴ cells.
     """
-    return rounded_points(sample_points(source_from_target, grid, rules), grid, rules, rules.native)
+    return rounded_points(sample_points(source_from_target, grid, rules), grid, rules, orientation)
 
 
 def rounded_points(
-    points: tuple[AnyArray, AnyArray], grid: BevGrid, rules: LabelProtocol, orientation: Orientation
+    points: tuple[AnyArray, AnyArray], grid: BevGrid, rules: LabelProtocol, orientation: Orientation | None = None
 ) -> CellIndices:
-    """`nearest_indices` from the sample points, of rasters in an orientation."""
+    """`nearest_indices` from the sample points."""
     if grid.cells > _COUNTABLE:
         raise GeometryError(f"grid: {grid.cells} cells are more than a warp can number; choose at most {_COUNTABLE}")
     row, column = (np.rint(point) for point in points)
@@ -89,30 +92,73 @@ def rounded_points(
     beside |= column < 0
     beside |= column >= columns
     native = rules.native
-    first, down, along = _numbering(grid.with_orientation(orientation), native)
+    lying = native if orientation is None else orientation
+    first, down, along = _numbering(grid.with_orientation(lying), native)
     row *= down
     column *= along
     row += column
     row += first
     np.copyto(row, OUTSIDE, where=beside)
     cells = row.astype(np.int32)  # first to int32, then to intp: three times as fast
-    return grid.with_orientation(native).reorient(cells, orientation).astype(np.intp).ravel()
+    return grid.with_orientation(native).reorient(cells, lying).astype(np.intp).ravel()
 
 
-def take_cells(cells: AnyArray, indices: CellIndices) -> AnyArray:
-    """The cells (…, H·W) that `nearest_indices` says, 0 where it says `OUTSIDE`."""
+def warp(
+    raster: ArrayLike,
+    source_from_target: ArrayLike,
+    grid: BevGrid,
+    rules: LabelProtocol,
+    mode: WarpMode = "nearest",
+    *,
+    fill: float = 0,
+    orientation: Orientation | None = None,
+) -> AnyArray:
+    """Rasters in another frame; all of them (leading axes) the same way.
+
+    Args:
+        raster: (…, H, W) in `orientation`.
+        source_from_target: (4, 4) metres, in the protocol's handedness.
+        grid: the cells; its own orientation does not matter.
+        rules: the protocol that says how to sample.
+        mode: the value of the nearest cell, or of the four around the sample point, weighted.
+        fill: the value outside the grid; if the mode is bilinear, it mixes with the border's cells.
+        orientation: how the rasters lie; None for the protocol's native orientation. Only cells change places: vectors
+            do not turn.
+
+    Returns:
+        The same shape and orientation; of the same dtype if `nearest`, float32 if `bilinear`.
+
+    Raises:
+        GeometryError: a shape that does not fit, or a matrix that is not finite.
+        ChoiceError: no such mode.
+    """
+    native = rules.native
+    lying = grid.with_orientation(orientation or native)
+    source = np.asarray(raster)
+    by_native_rows = lying.reorient(source, native)  # a view; refuses other shapes
+    if checked_mode(mode) == "nearest":
+        indices = nearest_indices(source_from_target, grid, rules, orientation=orientation)
+        return take_cells(source.reshape(*source.shape[:-2], -1), indices, fill).reshape(source.shape)
+    result = np.empty(source.shape, dtype=np.float32)
+    points = sample_points(source_from_target, grid, rules)
+    lying.reorient(result, native)[...] = blend_cells(by_native_rows, points, fill)
+    return result
+
+
+def take_cells(cells: AnyArray, indices: CellIndices, fill: float = 0) -> AnyArray:
+    """The cells (…, H·W) that `nearest_indices` says, `fill` where it says `OUTSIDE`."""
     padded = np.empty((*cells.shape[:-1], cells.shape[-1] + 1), dtype=cells.dtype)
     padded[..., :-1] = cells
-    padded[..., OUTSIDE] = 0
+    padded[..., OUTSIDE] = fill
     taken: AnyArray = padded.take(indices, axis=-1)
     return taken
 
 
-def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray]) -> Float32Array:
-    """The values (…, H, W) of a raster at sample points: weighted means of the four cells around, 0 beside the grid."""
+def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float = 0) -> Float32Array:
+    """The values (…, H, W) of a raster at sample points, each the weighted mean of the four cells around."""
     rows, columns = raster.shape[-2:]
     wide = columns + 3
-    padded = np.zeros((*raster.shape[:-2], rows + 3, wide), dtype=np.float32)
+    padded = np.full((*raster.shape[:-2], rows + 3, wide), fill, dtype=np.float32)
     padded[..., 1:-2, 1:-2] = raster
     cells = padded.reshape(*raster.shape[:-2], -1)
     above, down = _parted(points[0], rows)

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.handedness import flip_six_vector
 from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, MotionLabels, motion_labels_from_boxes
-from deepaccident_devkit.motion.batch_names import MAPS
+from deepaccident_devkit.motion.batch_names import HEADS, MAPS, config_from_names
 
 NAMES = ("fiery", "beverse", "deepaccident")
 
@@ -30,12 +30,17 @@ def made(**changes) -> MotionLabels:
     return motion_labels_from_boxes([*frames, None], motion, config)
 
 
-@pytest.mark.parametrize("orientation", ["released", "fiery"])
+@pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
 @pytest.mark.parametrize("names", NAMES)
-def test_a_batch_is_the_same_from_any_orientation(names, orientation) -> None:
-    expected = made().as_batch(names)
-    for name, array in made(orientation=orientation).as_batch(names).items():
-        assert_array_equal(array, expected[name])
+def test_a_batch_read_back_is_the_same_labels(names, orientation) -> None:
+    labels = made(orientation=orientation)
+    back = MotionLabels.from_batch(labels.as_batch(names), labels.config, names)
+    for name in (*MAPS, "future_egomotion"):
+        assert_array_equal(getattr(back, name), getattr(labels, name))
+        assert getattr(back, name).dtype == getattr(labels, name).dtype
+    assert_array_equal(back.valid, labels.valid if names != "fiery" else np.ones(7))
+    assert not back.at_present
+    assert MotionLabels.from_batch(labels.as_batch(names), labels.config, names, at_present=True).at_present
 
 
 @pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
@@ -89,7 +94,46 @@ def test_beverses_and_deepaccidents_batches() -> None:
     assert_array_equal(deepaccident["future_egomotions"], flip_six_vector(labels.future_egomotion).astype(np.float32))
 
 
-def test_other_codes_are_refused() -> None:
+def test_labels_answer_to_the_names_of_the_heads() -> None:
     labels = made()
+    for ours, head in HEADS.items():
+        assert getattr(labels, head) is getattr(labels, ours)
+
+
+def test_batches_that_do_not_fit_are_refused() -> None:
+    labels = made()
+    batch = labels.as_batch("beverse")
     with pytest.raises(ChoiceError, match="names: expected one of fiery, beverse, deepaccident, found 'stp3'"):
         labels.as_batch("stp3")
+    with pytest.raises(FieldError, match="batch: fiery labels have 'centerness'; there are future_egomotions"):
+        MotionLabels.from_batch(batch, labels.config, "fiery")
+    with pytest.raises(GeometryError, match=r"motion_segmentation: expected shape \(5, 80, 100\)"):
+        MotionLabels.from_batch(
+            {**batch, "motion_segmentation": batch["motion_instance"][None]}, labels.config, "beverse"
+        )
+
+
+def test_settings_of_the_other_codes() -> None:
+    fiery = {
+        "TIME_RECEPTIVE_FIELD": 3,
+        "N_FUTURE_FRAMES": 6,
+        "LIFT": {"X_BOUND": [-40.0, 40.0, 0.5], "Y_BOUND": [-50.0, 50.0, 0.5], "D_BOUND": [2.0, 50.0, 1.0]},
+        "DATASET": {"IGNORE_INDEX": 200, "FILTER_INVISIBLE_VEHICLES": False},
+        "BATCHSIZE": 3,
+    }
+    config = config_from_names(fiery, "fiery")
+    assert config == MotionLabelConfig.preset(
+        "fiery",
+        grid=BevGrid((-40, 40, 0.5), orientation="fiery"),
+        future_frames=6,
+        ignore_index=200,
+        filter_invisible=False,
+    )
+    converter = {"grid_conf": {"xbound": [0, 30, 0.15], "ybound": [-15, 30, 0.15]}, "only_vehicle": False}
+    assert config_from_names(converter, "beverse").grid == BevGrid((0, 30, 0.15), (-15, 30, 0.15))
+    assert config_from_names(converter, "deepaccident").grid == BevGrid((0, 30, 0.15), (-30, 15, 0.15))
+    assert config_from_names({}, "beverse") == MotionLabelConfig.preset("beverse")
+    with pytest.raises(ConfigError, match="ybound: expected start, end and cell size in metres, found 3"):
+        config_from_names({"grid_conf": {"ybound": 3}}, "deepaccident")
+    with pytest.raises(ConfigError, match="future_frames: expected a whole number from 1"):
+        config_from_names({"future_frames": 0}, "beverse")

@@ -1,4 +1,4 @@
-"""Warps: the three rules on small grids, and labels to the present."""
+"""Warps: the three rules on small grids, labels to the present, and maps of past moments and of agents."""
 
 from typing import Any
 
@@ -8,19 +8,14 @@ from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError
 from deepaccident_devkit.geometry import BevGrid, six_vectors
+from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
-from deepaccident_devkit.motion.warps.chains import present_from_frames
-from deepaccident_devkit.motion.warps.warping import (
-    blend_cells,
-    nearest_indices,
-    rounded_points,
-    sample_points,
-    sampling_matrix,
-    take_cells,
-)
+from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
+from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
+from deepaccident_devkit.motion.warps.warping import nearest_indices, rounded_points, sampling_matrix, warp
 
 GRID = BevGrid((-4, 4, 1), (-4, 4, 1))
 RELEASED, CLEAN, FIERY = (LABEL_PROTOCOLS[name] for name in ("released", "clean", "fiery"))
@@ -37,35 +32,97 @@ def at(x: float, y: float, grid: BevGrid = GRID, value: float = 1) -> np.ndarray
     return raster
 
 
+@ORIENTATIONS
+@pytest.mark.parametrize("protocol", ["clean", "fiery"])
+def test_an_agent_that_stands_ahead_sees_things_further_ahead(protocol: str, orientation: Any) -> None:
+    grid = GRID.with_orientation(orientation)
+    maps = np.stack([at(0.5, 1.5, grid), at(0.5, 1.5, grid)])
+    found = agents_to_ego(maps, [[0] * 6, ONE_AHEAD], grid=grid, protocol=protocol)
+    assert_array_equal(found, [maps[0], at(1.5, 1.5, grid)])
+
+
+@ORIENTATIONS
+def test_an_agent_that_looks_left_sees_ahead_what_the_ego_sees_on_its_left(orientation: Any) -> None:
+    grid = GRID.with_orientation(orientation)
+    for protocol in ("clean", "fiery"):
+        found = agents_to_ego(np.stack([at(2.5, 0.5, grid)] * 2), [[0] * 6, QUARTER_LEFT], grid=grid, protocol=protocol)
+        assert_array_equal(found[1], at(-0.5, 2.5, grid), protocol)
+
+
+def test_fierys_sideways_shift_has_the_wrong_sign() -> None:
+    to_the_left = [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
+    maps = np.stack([at(0.5, 0.5)] * 2)
+    assert_array_equal(agents_to_ego(maps, to_the_left, grid=GRID, protocol="clean")[1], at(0.5, 1.5))
+    assert_array_equal(agents_to_ego(maps, to_the_left, grid=GRID, protocol="fiery")[1], at(0.5, -0.5))
+
+
 @RULES
-def test_indices_outside_are_minus_one_and_cells_are_0_there(rules: LabelProtocol) -> None:
+def test_indices_outside_are_minus_one_and_warps_fill_there(rules: LabelProtocol) -> None:
     far = np.eye(4)
     far[0, 3] = 1e7
     assert_array_equal(nearest_indices(far, GRID, rules), np.full(64, -1))
-    assert not take_cells(np.ones((2, 64)), nearest_indices(far, GRID, rules)).any()
-    assert not blend_cells(np.ones((2, 8, 8)), sample_points(far, GRID, rules)).any()
+    for mode in ("nearest", "bilinear"):
+        assert_array_equal(warp(np.ones((2, 8, 8)), far, GRID, rules, mode, fill=7), np.full((2, 8, 8), 7))  # type: ignore[arg-type]
 
 
 @RULES
 def test_oblong_grids_that_are_not_centred_keep_their_cells_where_nothing_moves(rules: LabelProtocol) -> None:
     for grid in (BevGrid((0, 30, 0.5), (-10, 20, 1.5)), BevGrid((-1, 0, 1), (-20, 20, 0.1))):
-        assert_array_equal(nearest_indices(np.eye(4), grid, rules), np.arange(grid.cells), str(grid))
+        for orientation in (None, "devkit", "released", "fiery"):
+            assert_array_equal(
+                nearest_indices(np.eye(4), grid, rules, orientation=orientation), np.arange(grid.cells), str(grid)
+            )
 
 
 def test_released_bilinear_sampling_blurs_without_motion_and_the_exact_one_does_not() -> None:
     raster = np.random.default_rng(0).random(GRID.shape).astype(np.float32)
-    assert_array_equal(blend_cells(raster, sample_points(np.eye(4), GRID, CLEAN)), raster)
-    blurred = blend_cells(raster, sample_points(np.eye(4), GRID, RELEASED))
+    assert_array_equal(warp(raster, np.eye(4), GRID, CLEAN, "bilinear"), raster)
+    blurred = warp(raster, np.eye(4), GRID, RELEASED, "bilinear")
     assert not np.allclose(blurred, raster, atol=0.05)
+    assert warp(raster.astype(np.int16), np.eye(4), GRID, RELEASED).dtype == np.int16
 
 
 def test_what_does_not_fit_is_refused() -> None:
+    raster = np.zeros(GRID.shape)
+    with pytest.raises(GeometryError, match=r"raster: expected shape \(…, 8, 8\), found \(8, 7\)"):
+        warp(raster[:, :7], np.eye(4), GRID, CLEAN)
     with pytest.raises(GeometryError, match=r"source_from_target: expected shape \(4, 4\)"):
-        sample_points(np.eye(3), GRID, CLEAN)
+        warp(raster, np.eye(3), GRID, CLEAN)
     with pytest.raises(GeometryError, match="not all numbers are finite"):
-        sample_points(np.full((4, 4), np.nan), GRID, RELEASED)
+        warp(raster, np.full((4, 4), np.nan), GRID, RELEASED)
+    with pytest.raises(ChoiceError, match="mode: expected one of nearest, bilinear, found 'cubic'"):
+        warp(raster, np.eye(4), GRID, CLEAN, "cubic")  # type: ignore[arg-type]
     with pytest.raises(GeometryError, match="more than a warp can number"):
         nearest_indices(np.eye(4), BevGrid((-50, 50, 0.02), (-50, 50, 0.02)), CLEAN)
+    with pytest.raises(GeometryError, match="egomotion: expected at least 2 rows for 3 maps"):
+        past_to_present(np.zeros((3, 8, 8)), np.zeros((1, 6)), grid=GRID)
+    with pytest.raises(GeometryError, match=r"relative_pose: expected shape \(3, 6\)"):
+        agents_to_ego(np.zeros((3, 8, 8)), np.zeros((2, 6)), grid=GRID)
+
+
+def test_past_motions_are_multiplied_in_the_order_of_time_as_released_and_rightly_if_exact() -> None:
+    first, second = ONE_AHEAD, QUARTER_LEFT
+    exact = present_from_past([first, second], CLEAN)
+    released = present_from_past([first, second], RELEASED)
+    # left-handed: turning is the other way round
+    ahead, turn = six_vectors.to_matrices(first), six_vectors.to_matrices(np.negative(second))
+    np.testing.assert_allclose(exact, [turn @ ahead, turn], atol=1e-12)
+    np.testing.assert_allclose(released, [ahead @ turn, turn], atol=1e-6)
+    assert present_from_past(np.zeros((0, 6)), RELEASED).shape == (0, 4, 4)
+
+
+def test_one_moment_alone_and_the_ego_alone_stay_as_they_are() -> None:
+    raster = np.arange(64.0).reshape(1, 8, 8)
+    assert_array_equal(past_to_present(raster, np.zeros((0, 6)), grid=GRID), raster)
+    assert_array_equal(agents_to_ego(raster, np.ones((1, 6)), grid=GRID), raster)
+
+
+def test_augmented_maps_move_along_the_augmented_axes() -> None:
+    """Mirrored maps of an agent one metre to the left stand one metre to the right."""
+    augmentation = Augmentation(flip=True)
+    pose = [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
+    found = agents_to_ego(np.stack([at(0.5, 0.5)] * 2), pose, grid=GRID, protocol="clean", augmentation=augmentation)
+    assert_array_equal(found[1], at(0.5, -0.5))
 
 
 def test_single_precision_inverses_are_inverses() -> None:
@@ -177,4 +234,10 @@ def test_more_cells_than_a_warp_can_number_are_refused() -> None:
     huge = BevGrid((-2100, 2100, 1), (-2100, 2100, 1))
     points = (np.zeros((2, 2)), np.zeros((2, 2)))
     with pytest.raises(GeometryError, match="cells are more than a warp can number"):
-        rounded_points(points, huge, CLEAN, "devkit")
+        rounded_points(points, huge, LABEL_PROTOCOLS["clean"])
+
+
+@pytest.mark.parametrize("shape", [(0, 3, 4, 4), (4, 4)])
+def test_no_map_is_no_feature(shape: tuple[int, ...]) -> None:
+    with pytest.raises(GeometryError, match="features: expected at least one map"):
+        agents_to_ego(np.zeros(shape), np.zeros((shape[0], 6)))
