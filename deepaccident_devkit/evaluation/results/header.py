@@ -106,7 +106,7 @@ class MotionForm:
     """How motion results are stored: the same for all samples of a file.
 
     Attributes:
-        stored: `instances`: maps of ids, and paths; `heads`: the model's own maps.
+        stored: `instances`: maps of ids; `heads`: the model's own maps.
         grid: the cells; its orientation is how the maps lie.
         predictions: how many a sample has at most, K; of several, the last one is the mean.
         frames: T, the present one first.

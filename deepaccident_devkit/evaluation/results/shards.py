@@ -29,13 +29,13 @@ from deepaccident_devkit.evaluation.results.header import (
     told_of,
 )
 from deepaccident_devkit.evaluation.results.motion_arrays import (
-    PATHS,
-    check_sample,
+    NOT_READ,
     head_arrays,
     instance_arrays,
     member_name,
     members,
     put_array,
+    stored_output,
 )
 from deepaccident_devkit.evaluation.results.records import MotionFile, Shard, Stored
 from deepaccident_devkit.geometry import BevGrid
@@ -144,7 +144,7 @@ def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
             _check_members(archive, shard, form)
             for token in shard.tokens:
                 with at(token):
-                    check_sample(archive, token, form)
+                    stored_output(archive, token, form)
 
 
 def opened(root: Path, shard: Shard) -> zipfile.ZipFile:
@@ -156,7 +156,7 @@ def opened(root: Path, shard: Shard) -> zipfile.ZipFile:
 
 
 def _check_members(archive: zipfile.ZipFile, shard: Shard, form: MotionForm) -> None:
-    possible = {member_name(token, name) for token in shard.tokens for name in (*members(form), *PATHS)}
+    possible = {member_name(token, name) for token in shard.tokens for name in (*members(form), *NOT_READ)}
     for name, times in Counter(archive.namelist()).items():
         if name not in possible:
             raise ContentError(f"{name}: belongs to no sample of the shard; store the arrays of its tokens alone")
@@ -257,7 +257,7 @@ class ShardWriter:
         if output.instances is not None and output.instances.min() < 0:
             raise ResultsError(f"instances: expected ids from 1, and 0 elsewhere, found {output.instances.min()}")
         if self._store == "instances":
-            return instance_arrays(output, self._labels)
+            return instance_arrays(output)
         if output.heads is None:
             raise ResultsError("expected heads, found instance maps; write those with store='instances'")
         if any(heads.ignore_index is not None for heads in output.heads):
