@@ -424,8 +424,9 @@ def _covered_tokens(
 ) -> list[str]:
     if not covered.is_complete and not allow_partial:
         remedy = (
-            "; give results of these samples, choose the list that they are of, or evaluate the samples that have a "
-            "prediction with allow_partial=True (--allow-partial), which marks every number as partial"
+            "; give results of these samples, choose the list that they are of (--split, --agents, --samples, --scope, "
+            "--horizon; in Python a SampleSelection), or evaluate the samples that have a prediction with "
+            "allow_partial=True (--allow-partial), which marks every number as partial"
         )
         raise ResultsError(f"{results.path}: {covered.to_text()}{remedy if covered.missing or covered.unknown else ''}")
     tokens = [token for token in selection.tokens(dataset) if token in results]

@@ -6,8 +6,8 @@ import shlex
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -21,6 +21,7 @@ from deepaccident_devkit.evaluation.runs import (
     results_text,
     scenario_hashes,
 )
+from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.evaluations import evaluated
 from deepaccident_devkit.explore.explorer import Explorer
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.explore.models import Model
 
 _USUAL_VERSION: Final = "v1"
+_LISTS: Final = (get_args(SampleList), get_args(ScopeName))
 _WORST: Final = 12
 """Samples on a model's page."""
 _FEW: Final = 64
@@ -72,16 +74,18 @@ def evaluate_command(dataset: Dataset, results: Results, setup: EvaluationSetup,
     Raises:
         NotAvailableError: the release has no labelled samples of the split that most of the results are of.
     """
-    selection = default_selection(setup, split_of(dataset, results))
-    found = coverage(dataset, results.tokens, selection)
-    if found.guess is not None:
-        selection = found.guess
-        found = coverage(dataset, results.tokens, selection)
+    usual = default_selection(setup, split_of(dataset, results))
+    agents = coverage(dataset, results.tokens, usual).agents
+    if {agent["name"] for agent in dataset.agent} - set(agents):  # a partial release may lack some
+        usual = replace(usual, agents=agents or None)
+    lists = [usual, *(replace(usual, samples=samples, scope=scope) for samples, scope in product(*_LISTS))]
+    covered = [(coverage(dataset, results.tokens, each), each) for each in lists]
+    found, selection = min(covered, key=lambda each: len(each[0].missing) + len(each[0].extra))
     words = ["deepaccident", "evaluate", setup.task, str(dataset.dataroot)]
     words += ["--version", dataset.version] if dataset.version != _USUAL_VERSION else []
     words += ["--results", str(results.path), *_selecting(setup, selection), "--protocol", setup.protocol]
     words += ["--allow-partial"] * (not found.is_complete) + ["--out", out]
-    return {"text": shlex.join(words), "note": "" if found.is_complete else replace(found, guess=None).to_text()}
+    return {"text": shlex.join(words), "note": "" if found.is_complete else replace(found, agents=()).to_text()}
 
 
 def split_of(dataset: Dataset, results: Results) -> str:
@@ -94,12 +98,11 @@ def split_of(dataset: Dataset, results: Results) -> str:
 
 def _selecting(setup: EvaluationSetup, selection: SampleSelection) -> Iterator[str]:
     """The options that choose the samples."""
-    chosen = selection.choices()
-    if selection.samples == "all":  # which are those of all scenarios
-        del chosen["scope"]
-        chosen |= {} if setup.task == "detection" else {"horizon": f"{setup.horizon:g}"}
-    for name, value in chosen.items():
-        yield from (f"--{name}", ",".join(value) if name == "agents" else str(value))
+    yield from ("--split", selection.split, "--samples", selection.samples, "--scope", selection.scope)
+    if selection.agents is not None:
+        yield from ("--agents", ",".join(selection.agents))
+    if setup.task != "detection" or selection.samples == "evaluate":
+        yield from ("--horizon", f"{setup.horizon:g}")
 
 
 def routes() -> list[Route]:

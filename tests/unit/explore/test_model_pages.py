@@ -431,7 +431,7 @@ def test_the_command_makes_a_bundle(site: Site, tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("chosen", "expected"),
     [
-        ({"samples": "all", "scope": "all"}, ["--samples", "all", "--horizon", "2"]),
+        ({"samples": "all", "scope": "all"}, ["--samples", "all", "--scope", "all"]),
         ({"scope": "all"}, ["--samples", "evaluate", "--scope", "all"]),
         ({"agents": ("ego_vehicle",)}, ["--samples", "evaluate", "--scope", "accident", "--agents", "ego_vehicle"]),
         ({}, ["--samples", "evaluate", "--scope", "accident"]),
@@ -446,7 +446,7 @@ def test_the_command_asks_for_the_samples_that_the_results_have(
     words = command_of(site, "it's")
     site.explorer.jobs.end()
     start, end = words.index("--split") + 2, words.index("--protocol")
-    assert words[start:end] == expected
+    assert words[start:end] == [*expected, "--horizon", "2"]
     assert words[words.index("--results") + 1] == str(path)
     assert "--allow-partial" not in words
 

@@ -136,14 +136,16 @@ class TestRefused:
     ) -> None:
         results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
         missing = selection.tokens(da_b)[0]
-        with pytest.raises(ResultsError, match=rf"some.json: 1 of 6 samples have no prediction \({missing}\); give"):
+        with pytest.raises(
+            ResultsError, match=rf"some.json: 1 of 6 samples have no prediction \({missing}\); the pred"
+        ):
             evaluate_results(da_b, results, SETUP, selection)
 
     def test_nothing_in_common(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
     ) -> None:
         other = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
-        with pytest.raises(ResultsError, match=r"made for split train.*; nothing is left to evaluate"):
+        with pytest.raises(ResultsError, match=r"of the splits train .*; nothing is left to evaluate"):
             evaluate_results(da_b, other, SETUP, selection, allow_partial=True)
 
 
