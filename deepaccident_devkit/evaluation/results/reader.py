@@ -35,7 +35,7 @@ from deepaccident_devkit.evaluation.results.header import (
 )
 from deepaccident_devkit.evaluation.results.motion_arrays import stored_output
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, MotionFile, ResultsFile, ResultsTask
-from deepaccident_devkit.evaluation.results.shards import OpenShards, check_shard, read_manifest
+from deepaccident_devkit.evaluation.results.shards import check_shard, read_manifest, shared_archive
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import NO_NAME, fault_text, irregular_text, read_bytes
@@ -155,20 +155,19 @@ class MotionContents:
         """Check the manifest; raises ContentError."""
         self._path, self._root = path, path.parent
         self.meta = meta
-        self._manifest = read_manifest(document, self._root)
-        self.form: MotionForm = self._manifest.form
-        self._shards = OpenShards(self._root)
+        self._shards = document.shards
+        self.form, self._shard_of = read_manifest(document, self._root)
 
     @property
     def tokens(self) -> Collection[str]:
         """The samples."""
-        return self._manifest.shard_of.keys()
+        return self._shard_of.keys()
 
     def prediction(self, token: str) -> MotionOutput:
         """The prediction of a sample; raises ResultsError."""
-        shard = self._manifest.shards[self._manifest.shard_of[token]]
+        shard = self._shard_of[token]
         with told_of(self._path), at(shard.file):
-            archive = self._shards.archive(shard)
+            archive = shared_archive(self._root, shard, os.getpid())
             with at(token):
                 return stored_output(archive, token, self.form)
 
@@ -179,7 +178,7 @@ class MotionContents:
             ResultsError: names shard, token and array.
         """
         check = partial(check_shard, self._root, self.form)
-        run_batch(check, self._manifest.shards, label="shards", places=Places(reads=(self._root,)), **how)
+        run_batch(check, self._shards, label="shards", places=Places(reads=(self._root,)), **how)
 
 
 Contents = EntryContents | MotionContents

@@ -43,7 +43,6 @@ from deepaccident_devkit.evaluation.runs.selection import (
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
-from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
@@ -187,22 +186,8 @@ class EvaluationRun:
 
     def __repr__(self) -> str:
         """Task, protocol, whether it is partial, and the first headlines."""
-        return f"EvaluationRun({self._title}: {self.result!r})"
-
-    def _repr_html_(self) -> str:
-        """The headlines, with the intervals of the breakdown `all`."""
-        everyone = next((each for each in self.breakdowns if each.by == "all" and each.groups), None)
-        intervals = everyone.groups[0].intervals if everyone else {}
-        heading = f"{everyone.resampling.confidence:.0%} interval" if everyone and intervals else ""
-        ends = {path: f"[{low:.3f}, {high:.3f}]" for path, (low, high) in intervals.items()}
-        shown = headlines(self.setup.task, self.result)
-        rows = [(each.name, each.text(), ends.get(each.path, "")) for each in shown]
-        return table_html([("number", "value", heading), *rows], f"{self._title}, {len(self.evaluator):,} samples")
-
-    @property
-    def _title(self) -> str:
         mark = "" if self.partial is None else f", {self.partial.text()}"
-        return f"{self.setup.task}, protocol {self.setup.protocol}{mark}"
+        return f"EvaluationRun({self.setup.task}, protocol {self.setup.protocol}{mark}: {self.result!r})"
 
     @property
     def stamp(self) -> dict[str, Any]:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import replace
-from itertools import combinations, product
-from typing import TYPE_CHECKING, Any, Final, get_args
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -15,13 +13,10 @@ from starlette.routing import Route
 
 from deepaccident_devkit.evaluation.runs import (
     Bundle,
-    SampleSelection,
-    coverage,
-    default_selection,
     results_text,
     scenario_hashes,
 )
-from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
+from deepaccident_devkit.evaluation.runs.selection import agent_of
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.evaluations import evaluated
 from deepaccident_devkit.explore.explorer import Explorer
@@ -30,17 +25,15 @@ from deepaccident_devkit.explore.pages import comparison, samples
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, with_slash
 from deepaccident_devkit.explore.pages.samples import model_of, models_of_task, rows_of, titles
 from deepaccident_devkit.explore.sample_lists import SampleChoices, listed
-from deepaccident_devkit.taxonomy import SPLITS
+from deepaccident_devkit.taxonomy import AGENTS, SPLITS
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.evaluation.results import Results
-    from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
     from deepaccident_devkit.explore.explorer import Explorer
     from deepaccident_devkit.explore.models import Model
 
 _USUAL_VERSION: Final = "v1"
-_LISTS: Final = (get_args(SampleList), get_args(ScopeName))
 _WORST: Final = 12
 """Samples on a model's page."""
 _FEW: Final = 64
@@ -49,43 +42,17 @@ _FIRST: Final = 3
 """Headline numbers in the list of models."""
 
 
-def command_job(explorer: Explorer, model: Model, results: Results) -> Job:
-    """The work that gives the `evaluate_command` of results: it looks for the samples that they were made for."""
-    return explorer.jobs.ask(
-        f"command {model.name}",
-        f"how {model.name} is evaluated",
-        lambda: evaluate_command(explorer.dataset, results, model.setup, f"{model.name}_bundle"),
-    )
-
-
-def evaluate_command(dataset: Dataset, results: Results, setup: EvaluationSetup, out: str) -> dict[str, str]:
-    """The command that makes a bundle of results.
-
-    Args:
-        dataset: the release.
-        results: of the task.
-        setup: task and rules.
-        out: the bundle's folder.
-
-    Returns:
-        `text`, the command for a shell; and `note`, what the results lack of the samples, or have besides: empty if
-        they have just these.
-
-    Raises:
-        NotAvailableError: the release has no labelled samples of the split that most of the results are of.
-    """
-    usual = default_selection(setup, split_of(dataset, results))
-    agents = coverage(dataset, results.tokens, usual).agents
-    if {agent["name"] for agent in dataset.agent} - set(agents):  # a partial release may lack some
-        usual = replace(usual, agents=agents or None)
-    lists = [usual, *(replace(usual, samples=samples, scope=scope) for samples, scope in product(*_LISTS))]
-    covered = [(coverage(dataset, results.tokens, each), each) for each in lists]
-    found, selection = min(covered, key=lambda each: len(each[0].missing) + len(each[0].extra))
-    words = ["deepaccident", "evaluate", setup.task, str(dataset.dataroot)]
+def evaluate_command(dataset: Dataset, model: Model, results: Results) -> str:
+    """The command for a shell that makes a bundle of results: of their split and agents, with the usual samples."""
+    present = set(map(agent_of, results.tokens))
+    agents = [name for name in AGENTS if name in present]
+    words = ["deepaccident", "evaluate", model.setup.task, str(dataset.dataroot)]
     words += ["--version", dataset.version] if dataset.version != _USUAL_VERSION else []
-    words += ["--results", str(results.path), *_selecting(setup, selection), "--protocol", setup.protocol]
-    words += ["--allow-partial"] * (not found.is_complete) + ["--out", out]
-    return {"text": shlex.join(words), "note": "" if found.is_complete else replace(found, agents=()).to_text()}
+    words += ["--results", str(results.path), "--split", split_of(dataset, results)]
+    if agents and any(agent["name"] not in present for agent in dataset.agent):
+        words += ["--agents", ",".join(agents)]
+    words += ["--protocol", model.setup.protocol, "--horizon", f"{model.setup.horizon:g}"]
+    return shlex.join([*words, "--out", f"{model.name}_bundle"])
 
 
 def split_of(dataset: Dataset, results: Results) -> str:
@@ -94,15 +61,6 @@ def split_of(dataset: Dataset, results: Results) -> str:
     splits = Counter(each["split"] for each in dataset.scenario if each["token"] in scenarios)
     known = {name: count for name, count in splits.items() if name in SPLITS}
     return max(known, key=lambda name: known[name], default="val")
-
-
-def _selecting(setup: EvaluationSetup, selection: SampleSelection) -> Iterator[str]:
-    """The options that choose the samples."""
-    yield from ("--split", selection.split, "--samples", selection.samples, "--scope", selection.scope)
-    if selection.agents is not None:
-        yield from ("--agents", ",".join(selection.agents))
-    if setup.task != "detection" or selection.samples == "evaluate":
-        yield from ("--horizon", f"{setup.horizon:g}")
 
 
 def routes() -> list[Route]:
@@ -177,11 +135,9 @@ def _bundle_context(explorer: Explorer, model: Model, bundle: Bundle, *, asked: 
 def _results_context(explorer: Explorer, model: Model) -> dict[str, Any]:
     if model.results is None:
         return {}
-    job = command_job(explorer, model, model.results)
     return {
         "text": results_text(model.results),
-        "job": job,
-        "waits": titles([job]),
+        "command": evaluate_command(explorer.dataset, model, model.results),
         "first": rows_of(explorer, model, sorted(model.tokens)[:_WORST]),
         "choices": SampleChoices(),
     }

@@ -428,38 +428,15 @@ def test_the_command_makes_a_bundle(site: Site, tmp_path: Path, monkeypatch: pyt
     assert made.summary["counts"]["samples"] == len(model.results)
 
 
-@pytest.mark.parametrize(
-    ("chosen", "expected"),
-    [
-        ({"samples": "all", "scope": "all"}, ["--samples", "all", "--scope", "all"]),
-        ({"scope": "all"}, ["--samples", "evaluate", "--scope", "all"]),
-        ({"agents": ("ego_vehicle",)}, ["--samples", "evaluate", "--scope", "accident", "--agents", "ego_vehicle"]),
-        ({}, ["--samples", "evaluate", "--scope", "accident"]),
-    ],
-)
-def test_the_command_asks_for_the_samples_that_the_results_have(
-    da_motion: DeepAccident, tmp_path: Path, chosen: dict[str, Any], expected: list[str]
-) -> None:
-    tokens = default_selection(BOXES, "train", **chosen).tokens(da_motion)
-    path = written(tmp_path / "it's.json", (), tokens)
+def test_the_command_asks_for_the_agents_that_the_results_have(da_motion: DeepAccident, tmp_path: Path) -> None:
+    tokens = default_selection(BOXES, "train", agents=("ego_vehicle",)).tokens(da_motion)
+    path = written(tmp_path / "it's.json", (), [*tokens, "type9/none/ego_vehicle/001"])
     site = Site(Explorer(da_motion, results=[path], workers=1), {}, tmp_path)
     words = command_of(site, "it's")
-    site.explorer.jobs.end()
-    start, end = words.index("--split") + 2, words.index("--protocol")
-    assert words[start:end] == [*expected, "--horizon", "2"]
-    assert words[words.index("--results") + 1] == str(path)
-    assert "--allow-partial" not in words
-
-
-def test_the_command_of_other_samples_leaves_some_out(da_motion: DeepAccident, tmp_path: Path) -> None:
-    tokens = default_selection(BOXES, "train").tokens(da_motion)[::3]
-    path = written(tmp_path / "few.json", (), [*tokens, "type9/none/ego_vehicle/001"])
-    site = Site(Explorer(da_motion, results=[path], workers=1), {}, tmp_path)
-    assert "--allow-partial" in command_of(site, "few")
-    page = site.page("/model/few/")
-    site.explorer.jobs.end()
-    assert "have no prediction" in page
-    assert "1 scenario of these results is not in this release" in page
+    start, end = words.index("--results"), words.index("--out")
+    chosen = ["--split", "train", "--agents", "ego_vehicle", "--protocol", "boxes", "--horizon", "2"]
+    assert words[start:end] == ["--results", str(path), *chosen]
+    assert "1 scenario of these results is not in this release" in site.page("/model/it's/")
 
 
 # names and addresses of strangers
