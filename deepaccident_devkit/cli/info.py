@@ -1,4 +1,4 @@
-"""`deepaccident info`: what a release holds, its statistics, its index, and what scenarios can be found by."""
+"""`deepaccident info`: what a release holds, its statistics, and what scenarios can be found by."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ from deepaccident_devkit.cli.options import (
     refuse_unused,
     release_parameters,
     say_report,
-    was_given,
     where_parameter,
     write_report,
 )
@@ -48,20 +47,12 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     help="With --statistics: folder to write statistics.json, one CSV file per table, and figures into; earlier ones "
     "there are replaced.",
 )
-@click.option(
-    "--index",
-    "of_index",
-    is_flag=True,
-    help="Print instead where the indexes of all versions are, what they hold, and whether they are up to date. "
-    "Nothing is changed.",
-)
 @json_parameter
 def info(
     where: tuple[str, ...],
     statistics: bool,
     interactions: bool,
     out: str | None,
-    of_index: bool,
     as_json: bool,
     **release: Any,
 ) -> None:
@@ -71,10 +62,6 @@ def info(
     """
     if not statistics:
         refuse_unused("without --statistics", *_OF_STATISTICS)
-    if of_index:
-        refuse_unused("with --index, which makes none", "where", "statistics", "workers", "on_error")
-        _print_index(release, as_json=as_json)
-        return
     dataset = DeepAccident(**release)
     chosen = dataset.find(*where) if where else None
     if chosen == [] and out is not None:
@@ -102,11 +89,3 @@ def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None
     if folder:
         written += save_statistics(found, folder)
     say_report(found, written, folder, as_json=as_json)
-
-
-def _print_index(release: dict[str, Any], *, as_json: bool) -> None:
-    from deepaccident_devkit.tables import index_report
-
-    version = release["version"] if was_given("version") else None
-    report = index_report(release["dataroot"], version=version, index_dir=release["index_dir"])
-    click.echo(report.to_json() if as_json else report.to_text())
