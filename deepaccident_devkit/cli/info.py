@@ -1,5 +1,6 @@
 """`deepaccident info`: what a release holds, its statistics, and what scenarios can be found by."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from deepaccident_devkit.cli.options import (
 )
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.overview import overview
+from deepaccident_devkit.overview import overview, scenario_lines
 from deepaccident_devkit.selection.fields import fields_text
 
 _OF_STATISTICS = ("interactions", "out")
@@ -58,7 +59,7 @@ def info(
 ) -> None:
     """Print what the release in DATAROOT holds: tables, splits, agents, sensors, attributes.
 
-    With --where, it is about the scenarios that match all filters, and lists them.
+    With --where, list the scenarios that match all filters instead; with --json, their records.
     """
     if not statistics:
         refuse_unused("without --statistics", *_OF_STATISTICS)
@@ -69,13 +70,14 @@ def info(
     if statistics:
         _statistics(dataset, chosen, out, interactions=interactions, as_json=as_json, **engine_of(release))
         return
-    if chosen == [] and not as_json:
-        click.echo(f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for")
-        return
-    summary = overview(dataset, chosen)
-    click.echo(summary.to_json() if as_json else summary.to_text())
-    if chosen is not None and not as_json:
-        click.echo("\n".join(["", *(scenario["token"] for scenario in chosen)]))
+    if chosen is None:
+        summary = overview(dataset)
+        click.echo(summary.to_json() if as_json else summary.to_text())
+    elif as_json:
+        click.echo(json.dumps(chosen, indent=2, ensure_ascii=False))
+    else:
+        none = f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for"
+        click.echo("\n".join(scenario_lines(chosen)) or none)
 
 
 def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:

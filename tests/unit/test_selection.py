@@ -9,7 +9,7 @@ from tiny import META, NAME, TYPE, label_lines, write_tiny_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError
 from deepaccident_devkit.evaluation.metrics.breakdowns import ATTRIBUTES
-from deepaccident_devkit.overview import _counts, overview
+from deepaccident_devkit.overview import _counts
 from deepaccident_devkit.selection import Filter, fields, parse_where
 from deepaccident_devkit.selection.fields import FIELDS, group_texts
 from deepaccident_devkit.tables.records import CollisionRecord, ScenarioRecord
@@ -305,25 +305,6 @@ def test_an_arrays_error_says_how_to_give_it(da: DeepAccident) -> None:
 def test_a_text_that_is_none_is_our_error(da: DeepAccident, text) -> None:
     with pytest.raises(DeepAccidentError, match=r"expected a text such as town=Town03,Town05, found .*as keywords"):
         da.find(text)
-
-
-def test_an_overview_of_a_selection_counts_only_that(da: DeepAccident) -> None:
-    whole, some = overview(da), overview(da, da.find(town="Town03"))
-    assert (some.scenarios, some.selected, whole.selected) == (5, True, False)
-    tokens = {one["token"] for one in da.find(town="Town03")}
-    for name in ("agent", "frame", "sample", "instance", "track"):
-        by_hand = sum(row["scenario_token"] in tokens for row in getattr(da, name))
-        assert some.tables[name] == by_hand < whole.tables[name]
-    for name in ("annotation", "sample_data", "ego_pose", "calibrated_sensor"):
-        of_token = sum("/".join(row["token"].split("/")[:2]) in tokens for row in getattr(da, name))
-        assert some.tables[name] == of_token < whole.tables[name]
-    assert (some.tables["sensor"], some.tables["category"]) == (8, 6)
-    assert some.attributes["town"] == {"Town03": 3}
-    assert some.recordings == some.agents["ego_vehicle"] == some.labelled["ego_vehicle"] == 3
-    assert "selected: 3 of 5 scenarios" in some.to_text()
-    assert " of 483" not in some.to_text()
-    assert overview(da, da.find()).tables == whole.tables
-    assert overview(da, []).tables["annotation"] == 0
 
 
 # visibility
