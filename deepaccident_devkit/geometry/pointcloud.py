@@ -25,7 +25,6 @@ from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
-from deepaccident_devkit.nuscenes_names import CLOUD, without_names
 from deepaccident_devkit.reading import fault_text
 from deepaccident_devkit.text import Pictured
 
@@ -37,7 +36,6 @@ _FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare 
 """The errors of reading a damaged file or one of another kind."""
 
 
-@without_names(CLOUD)
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarPointCloud(FrozenArrays, Pictured):
     """N points in one right-handed coordinate frame; arrays are read-only views.
