@@ -230,7 +230,8 @@ def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
 def test_info_lists_the_scenarios_of_where(own_release: Path) -> None:
     some = json.loads(run("info", own_release, "--json", "--where", "designed_accident=true").stdout)
     assert [each["designed_accident"] for each in some] == [True] * 3
-    lines = run("info", own_release, "--where", "designed_accident=true").stdout.splitlines()
+    count, *lines = run("info", own_release, "--where", "designed_accident=true").stdout.splitlines()
+    assert count == "3 of 6 scenarios match"
     assert [line.split()[0] for line in lines] == [each["token"] for each in some]
     none = run("info", own_release, "--where", "length=1..2").stdout
     assert none == "no scenario matches length=1..2; deepaccident info --fields lists what can be asked for\n"

@@ -76,8 +76,9 @@ def info(
     elif as_json:
         click.echo(json.dumps(chosen, indent=2, ensure_ascii=False))
     else:
+        found = [f"{len(chosen)} of {len(dataset.scenario)} scenarios match", *scenario_lines(chosen)]
         none = f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for"
-        click.echo("\n".join(scenario_lines(chosen)) or none)
+        click.echo("\n".join(found) if chosen else none)
 
 
 def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:
