@@ -116,20 +116,20 @@ def check_splits(layout: ReleaseLayout) -> tuple[ReleaseLayout, list[Finding]]:
     readable: dict[str, ReleasePath] = {}
     for split, path in layout.split_files.items():
         try:
-            lines = read_split_file(path, raw=True)
+            tokens = read_split_file(path, raw=True)
         except ReleaseError as error:
             found.append(finding_of(error, "split-file-unreadable", None))
             continue
         readable[split] = path
-        found += _repeated(path, lines)
+        found += _repeated(path, tokens)
     layout = replace(layout, split_files=readable)
     splits = assign_splits(layout)
     return layout, [*found, *_assignment_findings(splits), *_twins(splits)]
 
 
-def _repeated(path: ReleasePath, lines: list[tuple[str, ...]]) -> Iterator[Finding]:
+def _repeated(path: ReleasePath, tokens: list[str]) -> Iterator[Finding]:
     """Scenarios that a file lists more than once; reading takes them once."""
-    repeated = [shortened(" ".join(words)) for words, count in Counter(lines).items() if count > 1]
+    repeated = [shortened(token.replace("/", " ", 1)) for token, count in Counter(tokens).items() if count > 1]
     if repeated:
         more = f" and {len(repeated) - _NAMED} more" if len(repeated) > _NAMED else ""
         what = f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"
