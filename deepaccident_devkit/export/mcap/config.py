@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.results import Prediction, Results
-from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.motion.config import label_config
-from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OnError
-from deepaccident_devkit.text import choice, possible_text, settle_choices, spelled
+from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
+from deepaccident_devkit.text import choice, possible_text, spelled
 from deepaccident_devkit.v2x import Agents
 
 EPOCH: Final = 1_704_067_200
 """Unix seconds of every scenario's first frame: recordings have no date, but viewers need one (2024-01-01 UTC)."""
 EXPORTED_CHANNELS: Final = (*CAMERAS, LIDAR)
-Predictions = Results | Mapping[str, Prediction]
-"""Predictions by sample token."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,27 +27,17 @@ class McapConfig:
         channels: sensors to export: cameras and `lidar01`; None for all of these.
         frames: numbers of frames, from 1; None for all.
         points: `all`, or n for every n-th point of a cloud.
-        labels: whether to write the boxes.
-        motion_labels: configuration of motion labels, or the name of a preset (`motion.PRESETS`); None for none.
-        on_missing: what to do about missing sensor files: `skip` leaves them out and logs their number, `raise` raises
-            MissingFileError.
     """
 
     agents: Agents = None
     channels: Iterable[str] | None = None
     frames: Iterable[int] | None = None
     points: Literal["all"] | int = "all"
-    labels: bool = True
-    motion_labels: MotionLabelConfig | str | None = None
-    on_missing: OnError = "skip"
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError."""
         object.__setattr__(self, "channels", _channel_names(self.channels))
         object.__setattr__(self, "frames", _frame_numbers(self.frames))
-        settle_choices(self, {"on_missing": get_args(OnError)})
-        if self.motion_labels is not None:
-            object.__setattr__(self, "motion_labels", label_config(self.motion_labels))
         _ = self.point_step
 
     @classmethod
