@@ -29,12 +29,11 @@ from deepaccident_devkit.validation import (
     Completeness,
     FileCount,
     Finding,
-    LackingScenario,
     ValidationReport,
     release_completeness,
     validate_release,
 )
-from deepaccident_devkit.validation.completeness_report import summed
+from deepaccident_devkit.validation.completeness import summed
 
 TABS: Final[Mapping[str, str]] = {
     "": "Contents",
@@ -291,7 +290,7 @@ def _files_context(request: Request, explorer: Explorer, told: Completeness) -> 
         "splits": {name: summed(split.files, name) for name, split in told.splits.items()},
         "kinds": {kind: _by_agent(counts, kind) for kind in dict.fromkeys(count.channel for count in counts)},
         "agents": AGENTS,
-        "lacking": part_of(request, [(each, _lacks(each)) for each in told.lacking]),
+        "lacking": part_of(request, list(told.lacking.items())),
         "known": pages_of(explorer),
     }
 
@@ -304,10 +303,3 @@ def _by_agent(counts: Sequence[FileCount], kind: str) -> list[FileCount | None]:
         own = [count for count in of_kind if count.agent == agent]
         cells.append(summed(own, kind, agent) if own else None)
     return [*cells, summed(of_kind, kind)]
-
-
-def _lacks(scenario: LackingScenario) -> str:
-    """What a scenario lacks of the agents that are not absent, by kind of file."""
-    kinds = dict.fromkeys(count.channel for count in scenario.files)
-    sums = [summed((count for count in scenario.files if count.channel == kind), kind) for kind in kinds]
-    return ", ".join(f"{each.channel} ({each.missing:,})" for each in sums)
