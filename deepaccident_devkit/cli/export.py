@@ -27,7 +27,7 @@ from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ExportError, NotAvailableError
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
-from deepaccident_devkit.text import choice, size_text, spelled
+from deepaccident_devkit.text import choice, size_text
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 if TYPE_CHECKING:
@@ -340,14 +340,6 @@ def _town_line(told: dict[str, Any]) -> str:
     )
 
 
-def _points(context: click.Context, parameter: click.Parameter, value: str) -> str | int:
-    """Parse `all`, or n."""
-    value = spelled(value, ("all",))
-    if value != "all" and not value.isdecimal():
-        raise click.BadParameter(f"expected all, or a number for every n-th point, found {value!r}", context, parameter)
-    return value if value == "all" else int(value)
-
-
 @verb("mcap", short_help=_LINES["mcap"])
 @release_parameters
 @click.argument("scenario", required=False)
@@ -357,11 +349,11 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
 @frame_range_parameter
 @click.option(
     "--points",
-    callback=_points,
-    metavar="all|N",
-    default="all",
+    type=click.IntRange(min=1),
+    metavar="N",
+    default=1,
     show_default=True,
-    help="all, or N for every N-th point of a cloud.",
+    help="Only every N-th point of a cloud.",
 )
 def _mcap(
     scenario: str | None,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
-from deepaccident_devkit.text import choice, possible_text, spelled
+from deepaccident_devkit.text import choice, possible_text
 from deepaccident_devkit.v2x import Agents
 
 EPOCH: Final = 1_704_067_200
@@ -26,19 +26,20 @@ class McapConfig:
             there (`v2x.Agents`).
         channels: sensors to export: cameras and `lidar01`; None for all of these.
         frames: numbers of frames, from 1; None for all.
-        points: `all`, or n for every n-th point of a cloud.
+        points: n for every n-th point of a cloud; 1 for all.
     """
 
     agents: Agents = None
     channels: Iterable[str] | None = None
     frames: Iterable[int] | None = None
-    points: Literal["all"] | int = "all"
+    points: int = 1
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError."""
         object.__setattr__(self, "channels", _channel_names(self.channels))
         object.__setattr__(self, "frames", _frame_numbers(self.frames))
-        _ = self.point_step
+        if checked_whole("points", self.points, "n for every n-th point", ChoiceError) < 1:
+            raise ChoiceError(f"points: expected a number from 1, for every n-th point, found {self.points!r}")
 
     @classmethod
     def of(cls, **choices: Any) -> McapConfig:
@@ -48,16 +49,6 @@ class McapConfig:
             if name not in names:
                 raise ChoiceError(f"export_mcap has no {name!r}; there are {possible_text(name, names)}")
         return cls(**choices)
-
-    @property
-    def point_step(self) -> int:
-        """The n of "every n-th point is written"."""
-        if spelled(self.points, ("all",)) == "all":
-            return 1
-        step = checked_whole("points", self.points, "'all', or n for every n-th point", ChoiceError)
-        if step < 1:
-            raise ChoiceError(f"points: expected 'all', or a number from 1 for every n-th point, found {self.points!r}")
-        return step
 
     def frame_numbers(self, last: int) -> tuple[int, ...]:
         """The wanted frames of a scenario with `last` frames, ascending; raises ChoiceError if one is not there."""

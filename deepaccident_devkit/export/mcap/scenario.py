@@ -171,7 +171,7 @@ class Sensors:
         """Prepare the sensor files of a release."""
         self._dataset = dataset
         self._channels = tuple(config.channels or ())
-        self._step = config.point_step
+        self._step = config.points
         self._files = MissingFiles(dataset.dataroot, "skip")
 
     def write(self, moment: Moment, recording: Recording) -> None:

@@ -111,8 +111,8 @@ def test_every_nth_point(da: DeepAccident, scenario: str, tmp_path: Path) -> Non
         ({"frames": []}, "frames: expected at least one frame number"),
         ({"frames": [6, 7]}, "frames: expected numbers from 1 to 6, found 7"),
         ({"frames": [0]}, "frames: expected numbers from 1 to 6, found 0"),
-        ({"points": 0}, "points: expected 'all', or a number from 1 for every n-th point, found 0"),
-        ({"points": "some"}, "points: expected 'all', or n for every n-th point, found 'some'"),
+        ({"points": 0}, "points: expected a number from 1, for every n-th point, found 0"),
+        ({"points": "some"}, "points: expected n for every n-th point, found 'some'"),
         ({"agents": ["ego"]}, "agent: expected one of ego_vehicle, .*found 'ego'"),
     ],
 )
@@ -204,17 +204,10 @@ def test_the_verb_takes_a_scenario(da: DeepAccident, tmp_path: Path) -> None:
     assert read_mcap(out).metadata["deepaccident_devkit"]["scenario"] == token
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--frame-range", "4..2"], "expected frame numbers such as 20..40, found '4..2'"),
-        (["--points", "few"], "expected all, or a number for every n-th point, found 'few'"),
-    ],
-)
-def test_the_verb_refuses_what_it_cannot_read(tmp_path: Path, options: list[str], sentence: str) -> None:
-    done = CliRunner().invoke(export, ["mcap", str(tmp_path), "--out", "a.mcap", *options])
+def test_the_verb_refuses_what_it_cannot_read(tmp_path: Path) -> None:
+    done = CliRunner().invoke(export, ["mcap", str(tmp_path), "--out", "a.mcap", "--frame-range", "4..2"])
     assert done.exit_code == 2
-    assert sentence in done.output
+    assert "expected frame numbers such as 20..40, found '4..2'" in done.output
 
 
 def test_the_verb_refuses_agents_that_do_not_exist(tmp_path: Path) -> None:
