@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -245,11 +246,10 @@ def _expected_in(split: str, count: FileCount) -> FileCount:
 
 
 def _missing_kinds(counts: Iterable[FileCount]) -> dict[str, int]:
-    kinds: dict[str, int] = {}
+    kinds: Counter[str] = Counter()
     for count in counts:
-        if count.missing:
-            kinds[count.channel] = kinds.get(count.channel, 0) + count.missing
-    return kinds
+        kinds[count.channel] += count.missing
+    return dict(+kinds)
 
 
 def _split_files(
