@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import permutations
 
 from deepaccident_devkit.errors import ReleaseError
@@ -24,15 +24,8 @@ Recording = tuple[str, str]
 """Agent and kind of file: `label`, `calib` or a channel."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Inventory:
-    """The sensor files of one scenario.
-
-    Attributes:
-        frames: agent and channel → frame numbers, for folders that have any.
-    """
-
-    frames: Mapping[Recording, list[int]]
+Inventory = Mapping[Recording, list[int]]
+"""Frame numbers of the sensor folders of a scenario that have any."""
 
 
 def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Inventory, list[Finding]]:
@@ -53,7 +46,7 @@ def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Invent
             if found:
                 frames[agent, channel] = found
                 findings += _frame_findings(scenario, scan, agent, channel, found)
-    return Inventory(frames=frames), findings
+    return frames, findings
 
 
 def absences(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[Finding]:

@@ -63,7 +63,6 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
     ("Motion", "motion", "motoin", ChoiceError, lambda word: EvaluationSetup(task=word)),
     ("Accident", "accident", "acident", ChoiceError, lambda word: SampleSelection(split="val", scope=word)),
     ("Lidar01", "lidar01", "lidar", ChoiceError, lambda word: McapConfig(channels=[word])),
-    ("Skip", "skip", "skipp", ChoiceError, lambda word: McapConfig(on_missing=word)),
     ("Boxes", "boxes", "box", ChoiceError, lambda word: layers_of([word], ())),
     ("Other", "other", "othr", ChoiceError, lambda word: AgentConfig("mine", (word,))),
     ("Hidden", "hidden", "hiden", ConfigError, lambda word: SynthConfig(view=word)),
