@@ -12,7 +12,6 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
 from deepaccident_devkit.synth.scenario import checked_text
-from deepaccident_devkit.synth.sensors.caster import has_embree
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, designs_text, read_spec
 
 _OF_FILES = (
@@ -119,8 +118,6 @@ def synth(context: click.Context, /, out: Path | None, *, check: bool, designs: 
     if options["spec"] is not None or options["view"] == "hidden":
         refuse_unused("with a scenario file or --view hidden, which ask for one certain accident", "unplanned")
     config = SynthConfig(**options)
-    if config.sensors == "none" and not has_embree():
-        click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
     made = make_release(out, config, progress=True, **how)
     scenarios = f"{config.scenarios} scenario{'s' if config.scenarios > 1 else ''}"
     frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"
