@@ -22,7 +22,6 @@ meet: {actors: [ego, other]}
 weather: [SoftRain, HardRain]
 ```
 
-    deepaccident synth --design mine.yaml --check             # what happens in it; a few seconds, nothing is written
     deepaccident synth OUT --design mine.yaml --scenarios 8   # four accidents and their normal twins
 
 Each pair is another draw from the file. In Python:
@@ -64,8 +63,8 @@ print(scenario.weather, scenario.actor("ego").max_speed)
 - The actors of `meet` are timed so that both come to the crossing of their paths, the second `offset` seconds later.
   In the accident they see each other too late, obey neither lights nor priority, and all others let them go first. The
   one of the two that does not ignore `signal` has green.
-- If the two miss each other, all values are drawn again. After 100 draws the command stops. Its message says how near
-  they came, when, and which field to change. If draws differ only in numbers and all miss by far, it stops after 25.
+- If the two miss each other, all values are drawn again. After 40 draws the command stops. Its message says how near
+  they came, and which fields to change.
 - All others obey the rules, except those in their `ignores`. Who ignores `signal` drives at red; `priority`, gives way
   to nobody; `crosswalk`, does not wait for pedestrians.
 - Cyclists and pedestrians are no agents: give them the role `background` or `pedestrian`, and write for example
@@ -83,14 +82,15 @@ Files are read with PyYAML's safe loader, without tags and aliases. Numbers are 
 
 ## Look at it
 
-`--check` prints who hits whom, when, how fast and with which sides, for the first pair that `synth` would make. Its
-exit status is 1 if the file gives no scenario. To see it:
+The first pair, without sensors:
 
     deepaccident synth OUT --design mine.yaml --scenarios 2 --sensors none
+    deepaccident safety describe OUT
     deepaccident render accident OUT --layers boxes --out countdown.png
 
-The picture shows the boxes at four moments, in the agents' cameras and from above. Both commands together take about 20
-seconds on two cores. With camera images it takes about a minute for the last 25 frames of one accident:
+`safety describe` says who hits whom, when, how fast and with which sides. The picture shows the boxes at four moments,
+in the agents' cameras and from above. All commands together take about 20 seconds on two cores. With camera images it
+takes about a minute for the last 25 frames of one accident:
 
     deepaccident synth OUT --design mine.yaml --scenarios 1 --frames 25
     deepaccident render accident OUT --out countdown.png

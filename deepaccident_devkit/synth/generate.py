@@ -228,10 +228,7 @@ def make_release(
     unfinished = Unfinished(out.absolute())
     with unfinished_release(unfinished, wanted) as alone:
         count = workers or _worker_count(wanted, len(plans))
-        draws = progress is True and count == 1 and executor is None
-        parts = {
-            name: part for plan in plans for name, part in _parts(unfinished, wanted, plan, progress=draws).items()
-        }
+        parts = {name: part for plan in plans for name, part in _parts(unfinished, wanted, plan).items()}
         places = Places(writes=(unfinished.folder,))
         how: dict[str, Any] = {"workers": count, "executor": executor, "progress": progress}
         try:
@@ -258,14 +255,12 @@ class _Part:
     job: RecordingJob
 
 
-def _parts(
-    unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan, *, progress: bool = False
-) -> dict[str, _Part]:
-    """The parts of a scenario by their names; `progress` shows the draws, where no other process writes too."""
+def _parts(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, _Part]:
+    """The parts of a scenario by their names."""
     parts = parts_of(config)
     names = {first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)}
     return {
-        name: _Part(unfinished, name, RecordingJob(unfinished.part(name), config, plan, first, parts, progress))
+        name: _Part(unfinished, name, RecordingJob(unfinished.part(name), config, plan, first, parts))
         for first, name in names.items()
     }
 

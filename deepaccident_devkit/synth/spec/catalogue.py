@@ -23,7 +23,6 @@ from deepaccident_devkit.synth.spec.model import (
     Role,
     ScenarioSpec,
     default_of,
-    has_list,
     key_of,
 )
 from deepaccident_devkit.synth.spec.reading import FieldType, field_types, parse_yaml, read_part, required_fields
@@ -68,19 +67,6 @@ class SpecTemplate:
     def place(self, field: str) -> str:
         """Where the file names a field, for messages, such as `mine.yaml:6: meet`."""
         return f"{self.root.line(field)}: {self.root.path_of(field)}"
-
-    @property
-    def draws_alike(self) -> bool:
-        """Whether only numbers differ between draws: nobody's way, kind or lane is drawn from several."""
-        if self.root.values("exchange")[0] or self._has_two_lanes:
-            return False
-        parts = (self.root.fields[name] for name in ("road", "view", "actors", "meet") if name in self.root.fields)
-        return not any(has_list(part) for part in parts)
-
-    @property
-    def _has_two_lanes(self) -> bool:
-        """Whether a draw can have a road with two lanes, of which a driver's lane may be drawn."""
-        return any(isinstance(road, Part) and road.values("lanes") != (1,) for road in self.root.values("road"))
 
 
 def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:

@@ -308,15 +308,6 @@ def _instances(choice: Choice) -> Iterator[Any]:
         yield from value.instances() if isinstance(value, Part) else (value,)
 
 
-def has_list(choice: Choice) -> bool:
-    """Whether a value in it is drawn from a list of several."""
-    if isinstance(choice, Items):
-        return any(has_list(item) for item in choice.items)
-    if isinstance(choice, Part):
-        return any(has_list(inner) for inner in choice.fields.values())
-    return isinstance(choice, OneOf)
-
-
 def key_of(name: str) -> str:
     """A field's key in a file: the field `from_arm` has the key `from`, which cannot be a name in Python."""
     return "from" if name == "from_arm" else name

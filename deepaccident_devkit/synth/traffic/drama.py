@@ -14,7 +14,7 @@ from deepaccident_devkit.synth.spec import ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
 from deepaccident_devkit.synth.traffic.casting import WARM_UP, Cast, cast_actors
-from deepaccident_devkit.synth.traffic.impact import Impact, Miss, impact_of, least_gap, measured_miss, touching_pairs
+from deepaccident_devkit.synth.traffic.impact import Impact, impact_of, least_gap, touching_pairs
 from deepaccident_devkit.synth.traffic.rights import AXIS_OF_ARM, SignalPlan, find_rights, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import Simulation, simulate
 from deepaccident_devkit.synth.traffic.users import RoadUser, middle_of
@@ -105,26 +105,22 @@ def _held(user: RoadUser, seconds: float) -> RoadUser:
     return user if seconds == 0 else replace(user, start_speed=0.0, delay=user.delay + seconds)
 
 
-def perform_accident(stage: Stage) -> Performance | None:
-    """What happens up to the contact of a pair that breaks its rules; None if they do not touch, or others do first."""
-    tried = try_accident(stage)
-    return tried if isinstance(tried, Performance) else None
+def try_accident(stage: Stage) -> Performance | float:
+    """What happens up to the contact of a pair that breaks its rules; if they do not touch, their least distance.
 
-
-def try_accident(stage: Stage) -> Performance | Miss:
-    """As `perform_accident`, but it says how the two missed each other."""
+    It is in metres; infinite if their paths do not cross, or if others touch before.
+    """
     pair = stage.cast.pair
     if pair is None:
-        return Miss()
+        return np.inf
     unruly = [replace(user, ignores=("signal", "priority")) for user in stage.cast.users]
     users = [unruly[row] if row in pair else user for row, user in enumerate(stage.users)]
     performance = _perform(stage, users, _LATEST, watched=pair)
-    if isinstance(performance, _Touching):
-        return Miss(gap=0.0, touched=performance.roles)
+    if performance is None:
+        return np.inf
     if performance.simulation.contact is not None:
         return performance
-    offset = stage.spec.meet.offset if stage.spec.meet else 0.0
-    return measured_miss(performance.simulation, pair, stage.cast.users, planned=(0.0, offset))
+    return least_gap(performance.simulation.poses, _sizes(stage.cast.users), list(pair), np.inf)
 
 
 def perform_twin(stage: Stage, end: float) -> Performance | None:
@@ -137,7 +133,7 @@ def perform_twin(stage: Stage, end: float) -> Performance | None:
     for late in _DELAYS:
         users = [_later(user.obeying(), late) if user.role in roles else user.obeying() for user in stage.users]
         performance = _perform(stage, users, end)
-        if isinstance(performance, _Touching):
+        if performance is None:
             continue
         if _keep_clear(stage, performance):
             return performance
@@ -167,24 +163,11 @@ def _keep_clear(stage: Stage, performance: Performance) -> bool:
     return least_gap(performance.simulation.poses, size, rows, _CLEAR) >= _CLEAR
 
 
-@dataclass(frozen=True, slots=True)
-class _Touching:
-    """Why a run is no performance: two touch, and none of the two can be left out.
-
-    Attributes:
-        roles: of the two.
-    """
-
-    roles: tuple[Role, Role]
-
-
 def _perform(
     stage: Stage, users: Sequence[RoadUser], end: float, watched: tuple[int, int] | None = None
-) -> Performance | _Touching:
-    """Simulate until nobody touches, each time without those of the background who did."""
+) -> Performance | None:
+    """Simulate until nobody touches, each time without those of the background who did; None if named ones touch."""
     present = list(range(len(users)))
-    named = len(stage.cast.users)
-    touching: tuple[Role, Role] = ("background", "background")
     for _ in range(_ROUNDS):
         there = [users[row] for row in present]
         rights = find_rights(there, minor=stage.spec.road.yielding_arms, blind=watched)
@@ -194,13 +177,11 @@ def _perform(
         pairs = set(_touching(stage, there, simulation)) - {tuple(sorted(watched or ()))}
         if not pairs:
             return Performance(simulation=simulation, present=tuple(present))
-        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j): (i, j) for i, j in sorted(pairs)}
-        first, second = leaving[min(leaving)]
-        touching = (there[first].role, there[second].role if second < len(there) else "parked")
-        if min(leaving) < named:
-            break
+        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j) for i, j in pairs}
+        if min(leaving) < len(stage.cast.users):
+            return None
         present = [row for place, row in enumerate(present) if place not in leaving]
-    return _Touching(touching)
+    return None
 
 
 def _touching(stage: Stage, users: Sequence[RoadUser], simulation: Simulation) -> list[tuple[int, int]]:

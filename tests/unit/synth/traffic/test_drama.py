@@ -8,7 +8,7 @@ import pytest
 from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import DESIGNS, draw
 from deepaccident_devkit.synth.traffic.casting import WARM_UP
-from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
+from deepaccident_devkit.synth.traffic.drama import Performance, perform_twin, set_stage, try_accident
 from deepaccident_devkit.synth.traffic.impact import least_gap, touching_pairs
 
 pytestmark = pytest.mark.slow
@@ -23,11 +23,12 @@ ANGLES = {
 
 @lru_cache(maxsize=64)
 def played(design, seed):
-    """A stage, and its accident."""
+    """A stage, and its accident; None if the two do not touch."""
     rng = np.random.default_rng([seed, design])
     spec = draw(DESIGNS[design], rng)
     stage = set_stage(rng, spec, Junction(spec.road), float(rng.uniform(5.5, 9.5)))
-    return stage, perform_accident(stage)
+    tried = try_accident(stage)
+    return stage, tried if isinstance(tried, Performance) else None
 
 
 def sizes(stage, performance):

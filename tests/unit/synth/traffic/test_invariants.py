@@ -11,7 +11,7 @@ from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction
 from deepaccident_devkit.synth.spec import DESIGNS
 from deepaccident_devkit.synth.stage import random_world
 from deepaccident_devkit.synth.traffic.casting import WARM_UP, unplanned
-from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
+from deepaccident_devkit.synth.traffic.drama import Performance, perform_twin, set_stage, try_accident
 from deepaccident_devkit.synth.traffic.driving import HARDEST_BRAKING, MAX_STEER, PERIOD
 from deepaccident_devkit.synth.traffic.impact import touching_pairs
 from deepaccident_devkit.synth.traffic.rights import GREEN, RED
@@ -68,8 +68,8 @@ def runs(design, kind):
         junction = Junction(spec.road)
         spec = unplanned(rng, spec, junction) if kind == "unplanned" else spec
         stage = set_stage(rng, spec, junction, 7.5)
-        accident = perform_accident(stage)
-        if accident is not None:
+        accident = try_accident(stage)
+        if isinstance(accident, Performance):
             twin = perform_twin(stage, stage.cast.begin + WARM_UP + 10.0)
             return Run(stage, accident, accident=True), Run(stage, twin, accident=False)
     raise AssertionError("nobody met in five draws")
