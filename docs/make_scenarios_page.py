@@ -66,11 +66,11 @@ print(scenario.weather, scenario.actor("ego").max_speed)
 - If the two miss each other, all values are drawn again. After 40 draws the command stops. Its message says how near
   they came, and which fields to change.
 - All others obey the rules, except those in their `ignores`. Who ignores `signal` drives at red; `priority`, gives way
-  to nobody; `crosswalk`, does not wait for pedestrians.
+  to nobody.
 - Cyclists and pedestrians are no agents: give them the role `background` or `pedestrian`, and write for example
   `meet: {actors: [ego, background]}`. `other` must still be there: it is one of the five that record.
-- The recording ends with the collision; without one, when ego arrives or at `end.time`. It has 40 frames (4 s) or more.
-  `--frames N` keeps the last N.
+- The recording ends with the collision; without one, when ego is 25 m past the middle of the junction, or after 10 s. It
+  has 40 frames (4 s) or more. `--frames N` keeps the last N.
 - The normal twin has the same scene and the same road users, but all of them pay attention and obey all rules.
 - A file without `meet` gives only normal scenarios.
 

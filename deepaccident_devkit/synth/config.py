@@ -30,8 +30,7 @@ class SynthConfig:
     Attributes:
         scenarios: how many; they alternate between an accident and its normal twin.
         frames: recorded frames of each scenario, at 10 Hz: the last ones before its end. None records from the moment
-            when the cars set off to the end, 40 to 100 frames; a normal one up to 200, if `end.time` of its file says
-            so.
+            when the cars set off to the end, 40 to 100 frames.
         image_size: width and height of the camera images, pixels; None for 480×270, or 1600×900 with
             `for_released_code`. The real images have 1600×900. The released code assumes this size: with another
             one it computes wrong camera geometry.

@@ -133,7 +133,7 @@ def _first_good_draw(
         junction = Junction(spec.road)
         if plan.unplanned:
             spec = unplanned(rng, spec, junction)
-        stage = set_stage(rng, spec, junction, usual_duration(rng, spec, config.frames))
+        stage = set_stage(rng, spec, junction, usual_duration(rng, config.frames))
         if spec.meet is None:
             return stage, None, draws
         tried = try_accident(stage)

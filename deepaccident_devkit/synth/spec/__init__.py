@@ -19,7 +19,6 @@ from deepaccident_devkit.synth.spec.catalogue import (
 from deepaccident_devkit.synth.spec.model import (
     ActorSpec,
     BackgroundSpec,
-    EndSpec,
     MeetSpec,
     ScenarioSpec,
     View,
@@ -30,7 +29,6 @@ __all__ = [
     "DESIGN_NUMBERS",
     "ActorSpec",
     "BackgroundSpec",
-    "EndSpec",
     "MeetSpec",
     "ScenarioSpec",
     "SpecTemplate",

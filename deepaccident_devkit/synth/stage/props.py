@@ -7,7 +7,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, TREE, Arm, GroundMap, RoadSpec, Terrain
-from deepaccident_devkit.synth.roads.layout import OUTWARD
+from deepaccident_devkit.synth.roads.layout import KERB_RADIUS, OUTWARD
 from deepaccident_devkit.synth.solids import Block, Color, Solids, build
 
 BASEMENT = 0.2
@@ -250,8 +250,8 @@ def kerb_house(spec: RoadSpec, corner: tuple[int, int]) -> Prop:
     Between it and the road there is only room for a mast.
     """
     near = spec.road_edge + KERB_INSET + _MAST_ROOM
-    kept = spec.kerb_radius - KERB_INSET - _MAST_ROOM
-    near = max(near, spec.road_edge + spec.kerb_radius - kept / float(np.sqrt(2)))
+    kept = KERB_RADIUS - KERB_INSET - _MAST_ROOM
+    near = max(near, spec.road_edge + KERB_RADIUS - kept / float(np.sqrt(2)))
     x, y = (_mirrored((near, near + _KERB_HOUSE_LENGTH), sign) for sign in corner)
     wall = _WALLS[0]
     return Prop(FIRST_BUILDING, (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), wall, facade=True),))

@@ -209,8 +209,10 @@ def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
 
 _LEAST_FRAMES, _MOST_FRAMES = 40, 100
 """The fewest and the most frames of a recording if no number is given, as in the release."""
-_EARLIEST = 5.5
-"""The least time from the beginning until the pair meets, seconds."""
+_EARLIEST, _LATEST_END = 5.5, 10.0
+"""The least time from the beginning until the pair meets, and the latest end of a normal scenario, seconds."""
+_ARRIVAL = 25.0
+"""A normal scenario also ends when ego is so many metres past the middle of the junction."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -230,15 +232,15 @@ class Recorded:
     impact: Impact | None
 
 
-def usual_duration(rng: np.random.Generator, spec: ScenarioSpec, frames: int | None) -> float:
+def usual_duration(rng: np.random.Generator, frames: int | None) -> float:
     """Seconds from the beginning until the pair meets: drawn, or as many as the wanted number of frames needs."""
-    natural = float(rng.uniform(_EARLIEST, max(spec.end.time, _EARLIEST) + 0.3))
+    natural = float(rng.uniform(_EARLIEST, _LATEST_END + 0.3))
     return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
 
 
 def latest_end(stage: Stage, frames: int | None) -> float:
     """The time until which a normal scenario is simulated, seconds."""
-    longest = max(stage.spec.end.time, (frames or 0) * FRAME_PERIOD)
+    longest = max(_LATEST_END, (frames or 0) * FRAME_PERIOD)
     return stage.cast.begin + WARM_UP + longest
 
 
@@ -253,7 +255,7 @@ def recorded_accident(stage: Stage, performance: Performance, frames: int | None
     pair = stage.cast.pair or (0, 0)
     size = np.array([stage.users[row].body.size[:2] for row in pair])
     impact = impact_of(performance.simulation, pair, size)
-    count = frames or _natural_frames(stage, impact.time, _MOST_FRAMES)
+    count = frames or _natural_frames(stage, impact.time)
     return Recorded(
         performance=performance, start=impact.time - FRAME_PERIOD * (count - 1), frames=count, impact=impact
     )
@@ -262,18 +264,16 @@ def recorded_accident(stage: Stage, performance: Performance, frames: int | None
 def recorded_normal(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
     """The recording that ends when ego has arrived, or when time is over; arguments as in `recorded_accident`."""
     begin = stage.cast.begin + WARM_UP
-    longest = round(stage.spec.end.time / FRAME_PERIOD)
-    arrival = _arrival_time(stage, performance)
-    natural = _natural_frames(stage, min(arrival, begin + stage.spec.end.time), max(longest, _LEAST_FRAMES))
+    natural = _natural_frames(stage, min(_arrival_time(stage, performance), begin + _LATEST_END))
     if frames is None:
         return Recorded(performance=performance, start=begin, frames=natural, impact=None)
     end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
     return Recorded(performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None)
 
 
-def _natural_frames(stage: Stage, end: float, most: int) -> int:
+def _natural_frames(stage: Stage, end: float) -> int:
     since = end - (stage.cast.begin + WARM_UP)
-    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, _LEAST_FRAMES, most))
+    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, _LEAST_FRAMES, _MOST_FRAMES))
 
 
 def _arrival_time(stage: Stage, performance: Performance) -> float:
@@ -284,5 +284,5 @@ def _arrival_time(stage: Stage, performance: Performance) -> float:
         return np.inf
     coarse = slice(None, None, 5)
     along, _ = ego.path.project(simulation.poses[coarse, performance.present.index(row), :2])
-    arrived = along > middle_of(ego.route) + stage.spec.end.arrival
+    arrived = along > middle_of(ego.route) + _ARRIVAL
     return float(simulation.time[coarse][arrived.argmax()]) if arrived.any() else np.inf

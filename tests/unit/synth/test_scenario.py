@@ -113,9 +113,7 @@ def build_own(tmp_path):
 def test_a_scenario_in_which_nobody_meets_is_given_up(build_own, monkeypatch):
     """The message names the line, says how near the two came, and what to change."""
     monkeypatch.setattr("deepaccident_devkit.synth.scenario.MAX_DRAWS", 2)
-    message = (
-        r"own.yaml:6: meet: the two did not collide in 2 draws; the least distance was 1\d\.\d m; choose"
-    )
+    message = r"own.yaml:6: meet: the two did not collide in 2 draws; the least distance was 1\d\.\d m; choose"
     with pytest.raises(ConfigError, match=message):
         build_own(LATE)
     walker = "  - {role: pedestrian, from: north}\nmeet: {actors: [ego, pedestrian]"

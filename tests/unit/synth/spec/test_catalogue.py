@@ -14,7 +14,6 @@ from deepaccident_devkit.synth.spec import (
     DESIGNS,
     ActorSpec,
     BackgroundSpec,
-    EndSpec,
     MeetSpec,
     ScenarioSpec,
     draw,
@@ -49,7 +48,6 @@ PARTS = {
     "actors[]": ActorSpec,
     "meet": MeetSpec,
     "background": BackgroundSpec,
-    "end": EndSpec,
 }
 
 

@@ -20,9 +20,9 @@ from deepaccident_devkit.synth.stage import LAMP_COLORS, random_world
 
 SPECS = {
     "four-way": RoadSpec(),
-    "three-way": RoadSpec(kind="three-way", parking=False),
+    "three-way": RoadSpec(kind="three-way"),
     "wide": RoadSpec(lanes=2, signalized=False),
-    "hilly": RoadSpec(parking=False, hump=Hump(arm="east", distance=60.0)),
+    "hilly": RoadSpec(hump=Hump(arm="east", distance=60.0)),
 }
 CORNERS = [("west", "north"), ("south", "west"), ("east", "south"), ("north", "east")]
 
