@@ -101,12 +101,6 @@ def test_designs_that_are_not_there_are_usage_errors(tmp_path, words, told):
     assert (result.exit_code, told in result.output) == (2, True), result.output
 
 
-def test_designs_are_listed_without_a_folder():
-    result = CliRunner().invoke(synth, ["--show-design", "all"])
-    assert result.exit_code == 0
-    assert "3  unprotected left turn" in result.output
-
-
 MINE = """\
 road: {signalized: false}
 actors:

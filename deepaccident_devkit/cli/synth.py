@@ -9,7 +9,7 @@ from deepaccident_devkit.cli.options import PATH, engine_of, engine_parameters, 
 from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
-from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, designs_text, read_spec
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, read_spec
 
 _EXAMPLES = """\b
 Examples:
@@ -21,9 +21,7 @@ Examples:
 
 def _show_design(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
     if value is not None:
-        whole = value.strip().lower() == "all"
-        text = f"{designs_text()}\n" if whole else design_text(_number(context, parameter, value))
-        click.echo(text, nl=False)
+        click.echo(design_text(_number(context, parameter, value)), nl=False)
         context.exit()
 
 
@@ -79,11 +77,11 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
 @engine_parameters
 @click.option(
     "--show-design",
-    metavar="N|all",
+    metavar="N",
     is_eager=True,
     expose_value=False,
     callback=_show_design,
-    help="Print the scenario file of a design, as a start for your own, or with all a list of them, and stop.",
+    help="Print the scenario file of a design, as a start for your own, and stop; docs/scenarios.md lists them.",
 )
 def synth(out: Path, *, designs: dict[str, Any], **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.

@@ -2,7 +2,7 @@
 
 A file is read into a `SpecTemplate`, whose ranges and choices are still open; `draw` makes a `ScenarioSpec` from it.
 The parts, lowest layer first: `model` (the fields and their open choices), `reading` (YAML and types), `checks` (the
-rest), `catalogue` (templates, the designs, and the fields as text).
+rest), `catalogue` (templates and the designs).
 """
 
 from deepaccident_devkit.synth.spec.catalogue import (
@@ -10,9 +10,7 @@ from deepaccident_devkit.synth.spec.catalogue import (
     DESIGNS,
     SpecTemplate,
     design_text,
-    designs_text,
     draw,
-    field_tables,
     parse_spec,
     read_spec,
 )
@@ -34,9 +32,7 @@ __all__ = [
     "SpecTemplate",
     "View",
     "design_text",
-    "designs_text",
     "draw",
-    "field_tables",
     "parse_spec",
     "read_spec",
 ]

@@ -1,13 +1,11 @@
-"""Scenario files from text to template, how to draw from it, the paper's twelve designs, and the table of fields."""
+"""Scenario files from text to template, how to draw from it, and the paper's twelve designs."""
 
-import dataclasses
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from inspect import cleandoc
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import numpy as np
 
@@ -22,11 +20,8 @@ from deepaccident_devkit.synth.spec.model import (
     Part,
     Role,
     ScenarioSpec,
-    default_of,
-    key_of,
 )
-from deepaccident_devkit.synth.spec.reading import FieldType, field_types, parse_yaml, read_part, required_fields
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.synth.spec.reading import parse_yaml, read_part
 
 _EXCHANGED: dict[Role, Role] = {
     "ego": "other", "other": "ego", "ego_behind": "other_behind", "other_behind": "ego_behind",
@@ -207,94 +202,3 @@ def design_text(number: int) -> str:
 @cache
 def _design(number: int) -> SpecTemplate:
     return parse_spec(design_text(number), f"design {number}")
-
-
-@dataclass(frozen=True, slots=True)
-class FieldEntry:
-    """A row of the table of fields.
-
-    Attributes:
-        key: the field's key in the file.
-        values: the possible values.
-        default: the value if the file does not have the key.
-        meaning: one or more sentences.
-    """
-
-    key: str
-    values: str
-    default: str
-    meaning: str
-
-
-def field_tables() -> dict[str, tuple[FieldEntry, ...]]:
-    """Path of a part of a scenario file, such as `road.hump`, → its fields; the path of the whole file is empty."""
-    return dict(_tables(ScenarioSpec, ""))
-
-
-def designs_text() -> str:
-    """The twelve designs: number, name, junction."""
-    rows = [("design  name", "junction")]
-    for number, template in DESIGNS.items():
-        (road,) = template.root.values("road")
-        lights = "signalised" if road.values("signalized")[0] else "unsignalised"
-        rows.append((f"{number:>6}  {template.name}", f"{road.values('kind')[0]}, {lights}"))
-    return columns_text(rows)
-
-
-def _tables(kind: type[Any], path: str) -> Iterator[tuple[str, tuple[FieldEntry, ...]]]:
-    types_of, meanings = field_types(kind), _meanings(kind)
-    required = required_fields(kind)
-    yield (
-        path,
-        tuple(
-            FieldEntry(
-                key_of(name),
-                _values(wanted),
-                "required" if name in required else _default(default_of(kind, name)),
-                meanings[name],
-            )
-            for name, wanted in types_of.items()
-        ),
-    )
-    for name, wanted in types_of.items():
-        inner, ending = (wanted.items, "[]") if wanted.items else (wanted, "")
-        if dataclasses.is_dataclass(inner.base):
-            yield from _tables(inner.base, f"{path}.{key_of(name)}{ending}".lstrip("."))
-
-
-def _values(wanted: FieldType) -> str:
-    if wanted.items is not None:
-        many = f"list of {wanted.length}" if wanted.length else "list"
-        return f"{many}: {_values(wanted.items)}"
-    if dataclasses.is_dataclass(wanted.base):
-        text = "keys and values"
-    elif wanted.words:
-        text = ", ".join(wanted.words)
-    else:
-        names = {str: "text", bool: "true, false", int: "whole number", float: "number"}
-        text = names[wanted.base] + (f", {wanted.bounds}" if wanted.bounds else "")
-    return f"{text}; or null" if wanted.optional else text
-
-
-def _default(value: Any) -> str:
-    if dataclasses.is_dataclass(value):
-        return "its defaults"
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(str, value))}]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "null" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _meanings(kind: type[Any]) -> dict[str, str]:
-    """Field name → its text in the docstring's section Attributes."""
-    lines = cleandoc(kind.__doc__ or "").partition("Attributes:\n")[2].splitlines()
-    meanings: dict[str, str] = {}
-    name = ""
-    for line in lines:
-        if line.startswith(" " * 8):
-            meanings[name] += f" {line.strip()}"
-        elif line.strip():
-            name, _, text = line.strip().partition(": ")
-            meanings[name] = text
-    return meanings

@@ -1,12 +1,10 @@
 """The twelve designs are the paper's: the accident that each means is of its type (docs/format.md, Accident types)."""
 
-import dataclasses
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scripts import loaded_script
 
 from deepaccident_devkit.synth.roads import Hump, RoadSpec
 from deepaccident_devkit.synth.spec import (
@@ -16,11 +14,13 @@ from deepaccident_devkit.synth.spec import (
     BackgroundSpec,
     MeetSpec,
     ScenarioSpec,
+    design_text,
     draw,
-    field_tables,
     parse_spec,
     read_spec,
 )
+from deepaccident_devkit.synth.spec.model import key_of
+from deepaccident_devkit.synth.spec.reading import field_types
 
 
 @pytest.mark.parametrize("number", DESIGN_NUMBERS)
@@ -51,18 +51,26 @@ PARTS = {
 }
 
 
-def test_every_field_has_a_line_with_values_and_meaning():
-    tables = field_tables()
-    assert list(tables) == list(PARTS)
-    for path, kind in PARTS.items():
-        keys = [entry.key.replace("from", "from_arm") for entry in tables[path]]
-        assert keys == [field.name for field in dataclasses.fields(kind)]
-        assert all(len(entry.meaning) > 8 and entry.values for entry in tables[path])
+def test_the_page_has_every_field_with_its_values():
+    page = (DOCS / "scenarios.md").read_text(encoding="utf-8")
+    _, *sections = page.partition("## All fields")[2].split("\n### ")
+    for section, (path, kind) in zip(sections, PARTS.items(), strict=True):
+        assert section.startswith(f"`{path}`\n" if path else "The file\n")
+        rows = dict(re.findall(r"^\| `(\w+)` \| (.*)", section, re.MULTILINE))
+        types = field_types(kind)
+        assert list(rows) == [key_of(name) for name in types]
+        for row, wanted in zip(rows.values(), types.values(), strict=True):
+            words = wanted.words or (wanted.items.words if wanted.items else ())
+            assert row.partition(" | ")[0].endswith((", ".join(words), "; or null"))
+            assert str(wanted.bounds or "") in row
 
 
-def test_the_page_is_what_the_fields_make():
-    module = loaded_script("docs/make_scenarios_page.py")
-    assert module.PAGE.read_text(encoding="utf-8") == module.page(), "run: python docs/make_scenarios_page.py"
+def test_the_page_has_every_design():
+    page = (DOCS / "scenarios.md").read_text(encoding="utf-8")
+    assert re.findall(r"^ +(\d+)  (.*?)  +\w+-way, ", page, re.MULTILINE) == [
+        (str(number), template.name) for number, template in DESIGNS.items()
+    ]
+    assert f"```yaml\n{design_text(3)}```" in page
 
 
 def test_the_page_s_examples_can_be_read_and_its_code_runs(tmp_path, monkeypatch, capsys):
