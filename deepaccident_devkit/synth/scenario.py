@@ -8,7 +8,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import Collision, Meta
-from deepaccident_devkit.synth.actors import Actor, Actors, Body, Sampled, Uniform
+from deepaccident_devkit.synth.actors import Actor, Actors, Body, Motion
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan
 from deepaccident_devkit.synth.roads import Junction
@@ -185,7 +185,7 @@ def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
     start = float(simulation.time[0]) - recorded.start
     actors = []
     for column, row in enumerate(recorded.performance.present):
-        motion = Sampled(
+        motion = Motion(
             start=start,
             period=PERIOD,
             samples=simulation.poses[:, column],
@@ -193,11 +193,12 @@ def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
         )
         actors.append(_actor(ids, row, stage.users[row].body, motion))
     for row, vehicle in enumerate(stage.parked, start=len(stage.users)):
-        actors.append(_actor(ids, row, vehicle.body, Uniform(*vehicle.pose)))
+        motion = Motion(start=0.0, period=PERIOD, samples=np.array([vehicle.pose]), sample_velocities=np.zeros((1, 2)))
+        actors.append(_actor(ids, row, vehicle.body, motion))
     return actors
 
 
-def _actor(ids: _Ids, row: int, body: Body, motion: Sampled | Uniform) -> Actor:
+def _actor(ids: _Ids, row: int, body: Body, motion: Motion) -> Actor:
     return Actor(
         actor_id=ids.actor[row],
         object_id=ids.camera[row],

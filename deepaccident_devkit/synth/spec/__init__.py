@@ -7,11 +7,11 @@ rest), `catalogue` (templates and the designs).
 
 from deepaccident_devkit.synth.spec.catalogue import (
     DESIGN_NUMBERS,
-    DESIGNS,
     SpecTemplate,
     design_text,
     draw,
     parse_spec,
+    read_design,
     read_spec,
 )
 from deepaccident_devkit.synth.spec.model import (
@@ -23,7 +23,6 @@ from deepaccident_devkit.synth.spec.model import (
 )
 
 __all__ = [
-    "DESIGNS",
     "DESIGN_NUMBERS",
     "ActorSpec",
     "BackgroundSpec",
@@ -34,5 +33,6 @@ __all__ = [
     "design_text",
     "draw",
     "parse_spec",
+    "read_design",
     "read_spec",
 ]

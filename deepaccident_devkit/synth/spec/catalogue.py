@@ -1,7 +1,6 @@
 """Scenario files from text to template, how to draw from it, and the paper's twelve designs."""
 
 import os
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -72,7 +71,7 @@ def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
     from the same arm as before.
 
     Args:
-        template: from `read_spec`, or one of `DESIGNS`.
+        template: from `read_spec` or `read_design`.
         rng: random numbers; the same numbers give the same scenario.
     """
     spec = cast("ScenarioSpec", template.root.draw(rng))
@@ -168,25 +167,6 @@ DESIGN_NUMBERS: Final = tuple(range(1, 13))
 """1 to 6 at signalised junctions, 7 to 12 at unsignalised ones."""
 
 
-class _Designs(Mapping[int, SpecTemplate]):
-    """Reads a design's file when it is first asked for."""
-
-    def __getitem__(self, number: int) -> SpecTemplate:
-        if number not in DESIGN_NUMBERS:
-            raise KeyError(number)
-        return _design(number)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(DESIGN_NUMBERS)
-
-    def __len__(self) -> int:
-        return len(DESIGN_NUMBERS)
-
-
-DESIGNS: Final[Mapping[int, SpecTemplate]] = _Designs()
-"""Number → design."""
-
-
 def design_text(number: int) -> str:
     """The text of a design's scenario file.
 
@@ -200,5 +180,6 @@ def design_text(number: int) -> str:
 
 
 @cache
-def _design(number: int) -> SpecTemplate:
+def read_design(number: int) -> SpecTemplate:
+    """The scenario of a design; raises ConfigError if there is no such design."""
     return parse_spec(design_text(number), f"design {number}")

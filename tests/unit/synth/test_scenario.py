@@ -8,7 +8,7 @@ from deepaccident_devkit.synth.collision import separation
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.scenario import build_scenario
-from deepaccident_devkit.synth.spec import DESIGNS
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS
 from deepaccident_devkit.tables.build import accident_type
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 
@@ -38,7 +38,7 @@ def test_each_design_is_told_by_its_meta(built):
         for scenario in built
         if scenario.plan.accident
     ]
-    assert sorted(types) == list(DESIGNS)
+    assert sorted(types) == list(DESIGN_NUMBERS)
     assert types == [scenario.plan.design for scenario in built if scenario.plan.accident]
 
 

@@ -9,7 +9,6 @@ import pytest
 from deepaccident_devkit.synth.roads import Hump, RoadSpec
 from deepaccident_devkit.synth.spec import (
     DESIGN_NUMBERS,
-    DESIGNS,
     ActorSpec,
     BackgroundSpec,
     MeetSpec,
@@ -17,6 +16,7 @@ from deepaccident_devkit.synth.spec import (
     design_text,
     draw,
     parse_spec,
+    read_design,
     read_spec,
 )
 from deepaccident_devkit.synth.spec.model import key_of
@@ -25,7 +25,7 @@ from deepaccident_devkit.synth.spec.reading import field_types
 
 @pytest.mark.parametrize("number", DESIGN_NUMBERS)
 def test_one_of_the_two_who_meet_breaks_a_rule(number):
-    spec = draw(DESIGNS[number], np.random.default_rng(0))
+    spec = draw(read_design(number), np.random.default_rng(0))
     rules = [set(spec.actor(role).ignores) for role in spec.meet.actors]
     assert set(spec.meet.actors) == {"ego", "other"}
     assert sorted(map(bool, rules)) == [False, True]
@@ -33,7 +33,7 @@ def test_one_of_the_two_who_meet_breaks_a_rule(number):
 
 
 def test_both_parts_fall_to_ego_and_all_weathers_come():
-    made = [draw(DESIGNS[3], np.random.default_rng(seed)) for seed in range(100)]
+    made = [draw(read_design(3), np.random.default_rng(seed)) for seed in range(100)]
     assert {spec.actor("ego").turn for spec in made} == {"left", "straight"}
     assert len({spec.weather for spec in made}) == 7
     assert len({spec.time_of_day for spec in made}) == 3
@@ -68,7 +68,7 @@ def test_the_page_has_every_field_with_its_values():
 def test_the_page_has_every_design():
     page = (DOCS / "scenarios.md").read_text(encoding="utf-8")
     assert re.findall(r"^ +(\d+)  (.*?)  +\w+-way, ", page, re.MULTILINE) == [
-        (str(number), template.name) for number, template in DESIGNS.items()
+        (str(number), read_design(number).name) for number in DESIGN_NUMBERS
     ]
     assert f"```yaml\n{design_text(3)}```" in page
 

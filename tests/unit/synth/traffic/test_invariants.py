@@ -8,7 +8,7 @@ import pytest
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction
-from deepaccident_devkit.synth.spec import DESIGNS
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS
 from deepaccident_devkit.synth.stage import random_world
 from deepaccident_devkit.synth.traffic.casting import WARM_UP, unplanned
 from deepaccident_devkit.synth.traffic.drama import Performance, perform_twin, set_stage, try_accident
@@ -22,7 +22,7 @@ CORNERS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
 MAPPED = 143.0
 """Metres from the middle within which the ground is known under a whole truck."""
 SCENES = [
-    *((design, "designed") for design in DESIGNS),
+    *((design, "designed") for design in DESIGN_NUMBERS),
     (1, "hidden"),
     (7, "hidden"),
     (3, "unplanned"),

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.synth.roads import Junction
-from deepaccident_devkit.synth.spec import DESIGNS, draw
+from deepaccident_devkit.synth.spec import draw, read_design
 from deepaccident_devkit.synth.traffic.casting import unplanned
 from deepaccident_devkit.synth.traffic.drama import Performance, perform_twin, set_stage, try_accident
 
 
 def played(seed, design=1):
     rng = np.random.default_rng([seed, 77])
-    spec = draw(DESIGNS[design], rng)
+    spec = draw(read_design(design), rng)
     junction = Junction(spec.road)
     spec = unplanned(rng, spec, junction)
     stage = set_stage(rng, spec, junction, 6.0)
@@ -44,7 +44,7 @@ def test_a_pedestrian_steps_out_behind_the_crest_of_a_hump():
     found = 0
     for seed in range(40):
         rng = np.random.default_rng([seed, 78])
-        spec = draw(DESIGNS[1], rng)
+        spec = draw(read_design(1), rng)
         hump = spec.road.hump
         changed = unplanned(rng, spec, Junction(spec.road))
         stranger = changed.actors[-1]
@@ -59,7 +59,7 @@ def test_where_there_are_two_lanes_some_change_into_the_victim_s(monkeypatch):
     met = found = 0
     for seed in range(60):
         rng = np.random.default_rng([seed, 79])
-        spec = draw(DESIGNS[7], rng)
+        spec = draw(read_design(7), rng)
         junction = Junction(spec.road)
         changed = unplanned(rng, spec, junction)
         stranger = changed.actors[-1]
