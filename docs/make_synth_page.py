@@ -89,7 +89,7 @@ def measure(number: int, *, views: bool = True) -> Pair:
     twin_gap, twin_touches = _nearest(twin)
     return Pair(
         design=accident.plan.design or 0,
-        type=accident_type(accident.meta, signalized=accident.plan.subtype == 1),
+        type=accident_type(accident.meta, signalized=accident.plan.traits.subtype == 1),
         draws=accident.draws,
         angle=round(abs(np.degrees(np.angle(np.exp(1j * turn)))), 1),
         speeds=sorted(np.hypot(*end.velocities[rows].T).round(1).tolist()),
@@ -115,7 +115,7 @@ def _nearest(scenario: Scenario) -> tuple[float, bool]:
 
 def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
     """Every agent's labels at the observed moments, the last one `STEP` frames before the impact."""
-    sky = (scenario.weather, scenario.time_of_day)
+    sky = (scenario.spec.weather, scenario.spec.time_of_day)
     noise = (seed, scenario.plan.pair, int(scenario.plan.accident))
     rig = make_rig(
         scenario.world, scenario.actors, scenario.agents, sky=sky, image_size=(480, 270), seed=noise, images=False

@@ -113,7 +113,7 @@ def _looked_at(job: RecordingJob, scenario: Scenario, rows: list[int]) -> tuple[
         scenario.world,
         scenario.actors,
         scenario.agents,
-        sky=(scenario.weather, scenario.time_of_day),
+        sky=(scenario.spec.weather, scenario.spec.time_of_day),
         image_size=config.pixels,
         seed=(config.seed, plan.pair, int(plan.accident)),
         sensors="none",

@@ -56,14 +56,9 @@ class ScenarioPlan:
         return self.template.design
 
     @property
-    def subtype(self) -> int:
-        """1, signalised, or 2."""
-        return self.traits.subtype
-
-    @property
     def scenario_type(self) -> str:
         """Such as `type1_subtype1_accident`."""
-        return f"type1_subtype{self.subtype}_{'accident' if self.accident else 'normal'}"
+        return f"type1_subtype{self.traits.subtype}_{'accident' if self.accident else 'normal'}"
 
     @property
     def token(self) -> str:

@@ -106,7 +106,7 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
         scenario.world,
         scenario.actors,
         scenario.agents,
-        sky=(scenario.weather, scenario.time_of_day),
+        sky=(scenario.spec.weather, scenario.spec.time_of_day),
         image_size=config.pixels,
         seed=(config.seed, plan.pair, int(plan.accident)),
         sensors=cast(Sensors, config.sensors),  # never True or False once the configuration is made

@@ -52,8 +52,6 @@ class Scenario:
         world: what stands still.
         actors: what moves, and parked vehicles.
         agents: actor ids of the four vehicle agents.
-        weather: one of `WEATHERS`.
-        time_of_day: one of `taxonomy.TIMES_OF_DAY`.
         meta: the contents of its meta file.
         frames: how many are recorded.
         signals: the phases of the traffic lights; None if there are no lights.
@@ -65,26 +63,10 @@ class Scenario:
     world: World
     actors: Actors
     agents: dict[AgentName, int]
-    weather: str
-    time_of_day: str
     meta: Meta
     frames: int
     signals: SignalPlan | None
     draws: int
-
-
-class RandomStreams(NamedTuple):
-    """Independent random numbers for each part of a pair's scene, so that a change to one part leaves the others."""
-
-    world: np.random.Generator
-    traffic: np.random.Generator
-    ids: np.random.Generator
-
-    @classmethod
-    def of(cls, seed: int, pair: int) -> "RandomStreams":
-        """The streams of a pair, from their start."""
-        spawned = np.random.SeedSequence([seed, pair]).spawn(len(cls._fields))
-        return cls(*map(np.random.default_rng, spawned))
 
 
 def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
@@ -99,23 +81,23 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     Raises:
         ConfigError: they do not touch in `MAX_DRAWS` draws; the message says how near they came, and what to change.
     """
-    random = RandomStreams.of(config.seed, plan.pair)
-    stage, accident, draws = _first_good_draw(random.traffic, config, plan)
+    # a stream for each part of the scene, so that a change to one part leaves the others
+    streams = np.random.SeedSequence([config.seed, plan.pair]).spawn(3)
+    of_world, of_traffic, of_ids = map(np.random.default_rng, streams)
+    stage, accident, draws = _first_good_draw(of_traffic, config, plan)
     if plan.accident and accident is not None:
         recorded = recorded_accident(stage, accident, config.frames)
     else:
         recorded = _twin(stage, config, plan)
     spec = stage.spec
     ego, other = (spec.actor(role).from_arm or "west" for role in ("ego", "other"))
-    ids = _Ids.of(random.ids, stage)
+    ids = _Ids.of(of_ids, stage)
     return Scenario(
         plan=plan,
         spec=spec,
-        world=random_world(random.world, stage.junction, spec.view, between=(ego, other)),
+        world=random_world(of_world, stage.junction, spec.view, between=(ego, other)),
         actors=Actors.of(_actors(stage, recorded, ids)),
         agents=ids.agents,
-        weather=spec.weather,
-        time_of_day=spec.time_of_day,
         meta=_meta(plan, stage, recorded, ids),
         frames=recorded.frames,
         signals=None if stage.signals is None else stage.signals.shifted(-recorded.start),

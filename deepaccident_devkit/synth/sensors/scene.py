@@ -260,11 +260,6 @@ class Scene:
         """The same as `Setting.face_owner`."""
         return self.setting.face_owner
 
-    @cached_property
-    def normals(self) -> FloatArray:
-        """Outward unit normals of all faces, (F, 3)."""
-        return np.concatenate([self.setting.still.planes[0], self.movers.planes[0]])
-
     def cast(
         self, origin: FloatArray, directions: AnyArray, *, near: IntArray | None = None
     ) -> tuple[AnyArray, AnyArray]:

@@ -18,9 +18,6 @@ _AGENTS: Final = (*_LEADING, *LEADERS)
 _AGENT_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
 _WALKING: Final = "pedestrian"
 _MOST_ACTORS: Final = 100
-_PARKED_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
-_ROLE_OF_CATEGORY: Final[Mapping[str, Role]] = {"cyclist": "background", _WALKING: _WALKING}
-"""Category that no agent can have → the role for it."""
 _FASTEST_WALK: Final = 3.0
 """m/s: from kerb to kerb no pedestrian becomes faster."""
 _FORBIDDEN: Final[Mapping[str, tuple[str, ...]]] = {
@@ -100,24 +97,16 @@ def _check_category(actor: Part) -> None:
     possible = _possible_categories(role)
     for category in actor.values("category") if "category" in actor.fields else ():
         if category not in possible:
-            instead = (
-                f"; give the {category} the role {_ROLE_OF_CATEGORY[category]}" if _moves_to(role, category) else ""
+            remedy = (
+                f"choose {', '.join(possible)}; a cyclist has the role background, a pedestrian the role pedestrian"
             )
-            remedy = f"choose {', '.join(possible)}{instead}"
             raise _fault(actor, "category", f"the role {role} cannot be a {category}", remedy)
-
-
-def _moves_to(role: Role, category: str) -> bool:
-    """Whether another role is the remedy for a category that a role cannot have."""
-    return category in _ROLE_OF_CATEGORY and role in (*_AGENTS, "background")
 
 
 def _possible_categories(role: Role) -> tuple[str, ...]:
     if role == _WALKING:
         return (_WALKING,)
-    if role in _AGENTS:
-        return _AGENT_CATEGORIES
-    return _PARKED_CATEGORIES if role == "parked" else (*_AGENT_CATEGORIES, "cyclist")
+    return (*_AGENT_CATEGORIES, "cyclist") if role == "background" else _AGENT_CATEGORIES
 
 
 def _check_way(actor: Part, junctions: Sequence[Junction]) -> None:

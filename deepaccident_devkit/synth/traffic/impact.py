@@ -65,13 +65,11 @@ class Impact:
         time: seconds, when the boxes first touch.
         side: the side of the first one's box that is hit.
         strength: the impact in the meta file.
-        angle: angle between their headings, from 0 to π.
     """
 
     time: float
     side: ContactSide
     strength: float
-    angle: float
 
 
 def impact_of(simulation: Simulation, pair: tuple[int, int], size: FloatArray) -> Impact:
@@ -89,12 +87,10 @@ def impact_of(simulation: Simulation, pair: tuple[int, int], size: FloatArray) -
     poses = before + share * (last - before)
     period = float(simulation.time[-1] - simulation.time[-2]) if len(simulation.time) > 1 else 0.0
     velocity = simulation.velocities[-1][rows]
-    turn = poses[1, 2] - poses[0, 2]
     return Impact(
         time=float(simulation.time[-1]) - (1.0 - share) * period,
         side=contact_side(poses, size),
         strength=float(_AREA_MASS * size[0].prod() * np.hypot(*(velocity[0] - velocity[1]))),
-        angle=float(abs(np.arctan2(np.sin(turn), np.cos(turn)))),
     )
 
 

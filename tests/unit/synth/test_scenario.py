@@ -34,7 +34,7 @@ def gaps(scenario, first, second, times):
 
 def test_each_design_is_told_by_its_meta(built):
     types = [
-        accident_type(scenario.meta, signalized=scenario.plan.subtype == 1)
+        accident_type(scenario.meta, signalized=scenario.plan.traits.subtype == 1)
         for scenario in built
         if scenario.plan.accident
     ]
@@ -81,7 +81,7 @@ def test_unplanned_accidents_are_with_someone_who_records_nothing():
     config = replace(CONFIG, scenarios=8, unplanned=1.0)
     for plan in plan_scenarios(config)[::2]:
         meta = build_scenario(config, plan).meta
-        assert accident_type(meta, signalized=plan.subtype == 1) is None
+        assert accident_type(meta, signalized=plan.traits.subtype == 1) is None
         assert None in meta.collision.agents
         assert not set(meta.collision.ids) <= set(meta.agent_ids)
 

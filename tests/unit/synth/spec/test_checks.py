@@ -10,11 +10,11 @@ from deepaccident_devkit.synth.spec import parse_spec
         ("gap: 3", r"f.yaml:4: actors\[1\].gap: is not possible for the role other; leave it out"),
         (
             "category: cyclist",
-            "category: the role other cannot be a cyclist; choose car, .*cle; give the cyclist the role background$",
+            "category: the role other cannot be a cyclist; choose car, .*cle; cyclists have the role background",
         ),
         (
             "category: [car, pedestrian]",
-            "the role other cannot be a pedestrian; .*; give the pedestrian the role pedes",
+            "the role other cannot be a pedestrian; .*, pedestrians the role pedestrian$",
         ),
         (
             "start_distance: 30",
@@ -73,7 +73,10 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
         (scenario("role: ego", OTHER), r"actors\[0\].from: is missing; the role ego needs it; add one of west, "),
         (scenario(EGO, OTHER, "role: ego_behind, from: west"), "from: is not possible for the role ego_behind"),
         (scenario(EGO, OTHER, "role: pedestrian, category: car, from: east"), "the role pedestrian cannot be a car"),
-        (scenario(EGO, OTHER, "role: parked, category: cyclist, from: east"), "choose car, truck, van, motorcycle$"),
+        (
+            scenario(EGO, OTHER, "role: parked, category: cyclist, from: east"),
+            "choose car, truck, van, motorcycle; ",
+        ),
         (
             scenario(EGO, OTHER, "role: pedestrian, from: east, max_speed: [2, 3.5]"),
             r"actors\[2\].max_speed: expected 0.5 to 3 m/s for a pedestrian, found 3.5; walking is 1 to 2 m/s",
