@@ -10,11 +10,11 @@ from deepaccident_devkit.synth.spec import parse_spec
         ("gap: 3", r"f.yaml:4: actors\[1\].gap: is not possible for the role other; leave it out"),
         (
             "category: cyclist",
-            "category: the role other cannot be a cyclist; choose car, .*cle; cyclists have the role background",
+            "category: the role other cannot be a cyclist; choose car, .*cle; a cyclist has the role background",
         ),
         (
             "category: [car, pedestrian]",
-            "the role other cannot be a pedestrian; .*, pedestrians the role pedestrian$",
+            "the role other cannot be a pedestrian; .*, a pedestrian the role pedestrian$",
         ),
         (
             "start_distance: 30",
