@@ -166,7 +166,7 @@ class DeepAccident(Dataset):
 
     def list_scenarios(self) -> None:
         """Print a line for each scenario."""
-        _print(overview.scenario_lines(self))
+        _print(overview.scenario_lines(self.scenario))
 
     def list_agents(self) -> None:
         """Print the number of scenarios of each agent."""

@@ -37,14 +37,15 @@ class _Fault(str):
     __slots__ = ()
 
 
-def parsed_json(content: bytes, *, constants: bool = False) -> Any:
-    """The value of JSON text, nested at most `MOST_LEVELS` levels deep.
+def parsed_json(content: bytes, *, constants: bool = False, levels: int = MOST_LEVELS) -> Any:
+    """The value of JSON text.
 
     A number too large for a float is infinite; callers check the numbers that they use.
 
     Args:
         content: of a file.
         constants: whether NaN and Infinity may stand there, which are no JSON, and which Python writes.
+        levels: how deeply it may be nested.
 
     Raises:
         ValueError: it is no JSON, or against these rules; half a sentence, which names the place of the fault.
@@ -70,7 +71,7 @@ def parsed_json(content: bytes, *, constants: bool = False) -> Any:
         raise ValueError("is compressed with gzip; unpack it")
     if content.startswith(_PICKLE):
         raise ValueError("is a pickle; write JSON")
-    _check_levels(content)
+    _check_levels(content, levels)
     try:
         text = content.decode("utf-8")
         value = json.loads(text, object_pairs_hook=made, parse_constant=None if constants else refused)
@@ -108,7 +109,7 @@ def as_record(value: object, kind: type[Record]) -> Record:
         raise ValueError(shortened(said[:1].lower() + said[1:])) from error
 
 
-def _check_levels(content: bytes) -> None:
+def _check_levels(content: bytes, most: int) -> None:
     """Raise ValueError if brackets outside texts are nested too deeply."""
     if b"\\" in content:  # of an escaped quote nothing must be left
         content = content.replace(b"\\\\", b"").replace(b'\\"', b"")
@@ -117,8 +118,8 @@ def _check_levels(content: bytes) -> None:
         marks = np.frombuffer(content[first : first + _BLOCK].translate(None, _OTHERS), dtype=np.uint8)
         in_text = np.logical_xor.accumulate(np.concatenate([[inside], marks == _QUOTE]))
         levels = level + np.cumsum(_STEPS[marks] * ~in_text[1:])
-        if levels.max(initial=0) > MOST_LEVELS:
-            raise ValueError(f"is nested more than {MOST_LEVELS} levels deep")
+        if levels.max(initial=0) > most:
+            raise ValueError(f"is nested more than {most} levels deep")
         level, inside = levels[-1] if len(levels) else level, in_text[-1]
 
 

@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
@@ -33,18 +31,16 @@ _UNKNOWN = "unknown"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overview(Report):
-    """Counts over one release, or over some of its scenarios.
+    """Counts over one release.
 
     Attributes:
         dataroot: its folder.
         version: `v1` or `v1-mini`.
         layout: `A`, `B` or `A+B`.
         index: folder of the index's tables.
-        scenarios: how many the release has; the counts below are of all of them or of a selection.
-        selected: whether they are of a selection.
-        tables: table → rows; of a selection those that belong to its scenarios (`sensor` and `category` to all).
+        tables: table → rows.
         splits: split → scenarios here; `unknown` for those of no known split.
-        expected: split (or the version, for mini) → scenarios of the whole release; empty for a selection.
+        expected: split (or the version, for mini) → scenarios of the whole release.
         agents: agent → scenarios that have it.
         labelled: agent → scenarios in which it has labels.
         channels: channel → recordings (scenario and agent) that have files of it.
@@ -59,8 +55,6 @@ class Overview(Report):
     version: str
     layout: str
     index: str
-    scenarios: int
-    selected: bool
     tables: Mapping[str, int]
     splits: Mapping[str, int]
     expected: Mapping[str, int]
@@ -81,8 +75,6 @@ class Overview(Report):
             (name, f"{count} of {self.expected[name]}" if name in self.expected else str(count))
             for name, count in self.splits.items()
         ]
-        if self.selected:
-            head += f"\nselected: {scenarios} of {self.scenarios} scenarios; all counts are of these"
         if set(self.expected) != set(SPLITS):
             splits = [(name, str(count)) for name, count in self.splits.items()]
             splits += [(name, f"{scenarios} of {count}") for name, count in self.expected.items()]
@@ -114,32 +106,21 @@ class Overview(Report):
         return "\n\n".join(blocks)
 
 
-def overview(dataset: Dataset, scenarios: Sequence[ScenarioRecord] | None = None) -> Overview:
-    """Count what a release holds.
-
-    Args:
-        dataset: the release.
-        scenarios: records of its scenarios to count alone, such as `find` gives; None for all.
-    """
-    selected = scenarios is not None
-    scenarios = dataset.scenario[:] if scenarios is None else scenarios
-    tokens = {scenario["token"] for scenario in scenarios}
-    agents = [agent for agent in dataset.agent if agent["scenario_token"] in tokens]
+def overview(dataset: Dataset) -> Overview:
+    """Count what a release holds."""
+    scenarios, agents = dataset.scenario[:], dataset.agent[:]
     samples = {agent["token"]: dataset.get("sample", agent["first_sample_token"]) for agent in agents}
     split_counts = Counter(scenario["split"] or _UNKNOWN for scenario in scenarios)
     mini = dataset.version == "v1-mini"
-    tables = _table_rows(dataset, tokens)
     files = _channel_files(dataset, scenarios, agents)
     return Overview(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
         layout=dataset.layout,
         index=str(dataset.tables_folder),
-        scenarios=len(dataset.scenario),
-        selected=selected,
-        tables=tables,
+        tables={name: len(dataset.arrow(name)) for name in dataset.table_names},
         splits={name: split_counts[name] for name in (*SPLITS, _UNKNOWN) if split_counts[name] or name in SPLITS},
-        expected={} if selected else {dataset.version: EXPECTED_MINI_SCENARIOS} if mini else EXPECTED_SCENARIOS,
+        expected={dataset.version: EXPECTED_MINI_SCENARIOS} if mini else EXPECTED_SCENARIOS,
         agents={name: sum(agent["name"] == name for agent in agents) for name in AGENTS},
         labelled={
             name: sum(agent["name"] == name and samples[agent["token"]]["labelled"] for agent in agents)
@@ -148,16 +129,16 @@ def overview(dataset: Dataset, scenarios: Sequence[ScenarioRecord] | None = None
         channels={channel: sum(count > 0 for count in counts) for channel, counts in files.items()},
         files={channel: sum(counts) for channel, counts in files.items()},
         recordings=len(agents),
-        samples=tables["sample"],
+        samples=len(dataset.sample),
         attributes={field: _counts(scenario[field] for scenario in scenarios) for field in SCENARIO_ATTRIBUTES},
         left_out=[problem.scenario for problem in dataset.problems],
     )
 
 
-def scenario_lines(dataset: Dataset) -> list[str]:
+def scenario_lines(scenarios: Iterable[ScenarioRecord]) -> list[str]:
     """A line a scenario: token, frames, split, weather and how it ended."""
     lines = []
-    for scenario in dataset.scenario:
+    for scenario in scenarios:
         end = "collision" if scenario["collision"] else "no collision"
         end = "collision unknown" if scenario["weather"] is None else end  # there is no meta
         weather = f"{scenario['weather'] or _UNKNOWN} {scenario['time_of_day'] or ''}".strip()
@@ -204,29 +185,6 @@ def table_text(left: str, right: str, rows: Sequence[tuple[str, str]]) -> str:
 def _counts(values: Iterable[object]) -> dict[str, int]:
     counts = Counter("none" if value is None else str(value) for value in values)
     return dict(sorted(counts.items(), key=lambda item: natural_order(item[0])))
-
-
-def _table_rows(dataset: Dataset, scenarios: set[str]) -> dict[str, int]:
-    """Rows of every table that belong to some scenarios, counted in the columns, without records."""
-    rows = {name: len(dataset.arrow(name)) for name in dataset.table_names}
-    chosen = [dataset.getind("scenario", token) for token in scenarios]
-    if len(chosen) == rows["scenario"]:
-        return rows
-    kept = {
-        name: np.isin(dataset.arrow(name)["scenario_row"].to_numpy(), chosen)
-        for name in ("agent", "frame", "sample", "instance", "track")
-    }
-    agents_of_sensors = dataset.arrow("calibrated_sensor")["agent_row"].to_numpy()
-    samples = int(kept["sample"].sum())
-    return {
-        **rows,
-        "scenario": len(chosen),
-        **{name: int(mask.sum()) for name, mask in kept.items()},
-        "sample_data": samples * len(CHANNELS),
-        "ego_pose": samples,
-        "calibrated_sensor": int(kept["agent"][agents_of_sensors].sum()),
-        "annotation": int(dataset.arrow("sample")["num_annotations"].to_numpy()[kept["sample"]].sum()),
-    }
 
 
 def _channel_files(

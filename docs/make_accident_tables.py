@@ -3,7 +3,6 @@
 import re
 import sys
 import tempfile
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -26,25 +25,10 @@ PAGE, TESTS = HERE / "protocols.md", HERE.parent / "tests"
 RELEASE = SynthConfig(scenarios=24, frames=40, seed=12, sensors=False)
 HORIZON = 2.0
 PAPER_CHOICES: tuple[tuple[str, object], ...] = (
-    ("reading.foreground", "sigmoid"),
-    ("reading.link_distance", 3.0),
-    ("reading.link_distance", 8.0),
-    ("reading.redraw", True),
-    ("reading.outline", "cells"),
     ("reading.danger_distance", 0.5),
     ("reading.danger_distance", 1.5),
     ("reading.danger_distance", 2.5),
-    ("reading.present", False),
-    ("reading.moment", "first"),
-    ("reading.moment", "last"),
-    ("predicted_by", "mean"),
     ("sample_choice", "mean_first"),
-    ("position_time", "truth"),
-    ("match_distance", 2.0),
-    ("match_distance", 8.0),
-    ("scoring.errors_at", 5.0),
-    ("scoring.errors_at", 15.0),
-    ("scoring.far_is_missed", False),
 )
 
 
@@ -62,7 +46,8 @@ def golden_table() -> str:
 
     folder = TESTS / "data" / "golden"
     evaluators = {"`released`": AccidentEvaluator("released"), "**`paper`**": AccidentEvaluator("paper")}
-    evaluators |= changed("paper", PAPER_CHOICES)
+    paper = PROTOCOLS["paper"]
+    evaluators |= {f"`{name}={to}`": AccidentEvaluator(switched(paper, {name: to})) for name, to in PAPER_CHOICES}
     for index in range(len(GoldenCase(folder, "d_accident", "samples", None).whole["samples"])):
         case = GoldenCase(folder, "d_accident", "samples", index)
         label = label_of(case, "devkit")
@@ -71,12 +56,6 @@ def golden_table() -> str:
             evaluator.update(f"sample {index}", output, label)
     rows = {name: evaluator.compute() for name, evaluator in evaluators.items()}
     return table(rows, "protocol, or the choice of `paper` that is changed")
-
-
-def changed(protocol: str, choices: Iterable[tuple[str, object]]) -> dict[str, AccidentEvaluator]:
-    """An evaluator for each choice of a protocol that is changed."""
-    rules = PROTOCOLS[protocol]
-    return {f"`{name}={value}`": AccidentEvaluator(switched(rules, {name: value})) for name, value in choices}
 
 
 def perfect_table() -> str:

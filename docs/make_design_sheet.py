@@ -12,7 +12,7 @@ from deepaccident_devkit.render.best_view import best_view
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.spec import DESIGNS
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, read_design
 from deepaccident_devkit.v2x import Contact
 
 PICTURE = Path(__file__).parent / "images" / "designs.jpg"
@@ -28,10 +28,10 @@ AROUND = 26.0
 
 def main() -> None:
     PICTURE.parent.mkdir(exist_ok=True)
-    rows = len(DESIGNS) // COLUMNS
+    rows = len(DESIGN_NUMBERS) // COLUMNS
     fig = detached_figure((16, 6.9 * rows))
     axes = fig.subplots(2 * rows, COLUMNS, height_ratios=[1, 9 / 16] * rows)
-    for place, number in enumerate(DESIGNS):
+    for place, number in enumerate(DESIGN_NUMBERS):
         row, column = divmod(place, COLUMNS)
         with tempfile.TemporaryDirectory() as folder:
             release = DeepAccident(dataroot=make_design(number, Path(folder) / "release"))
@@ -49,9 +49,9 @@ def make_design(number: int, folder: Path) -> Path:
 
 
 def title_of(number: int) -> str:
-    name = DESIGNS[number].name.partition(",")[0]
-    junction = "three-way" if "three-way" in DESIGNS[number].name else "four-way"
-    lights = "signalised" if number <= len(DESIGNS) // 2 else "unsignalised"
+    name = read_design(number).name.partition(",")[0]
+    junction = "three-way" if "three-way" in read_design(number).name else "four-way"
+    lights = "signalised" if number <= len(DESIGN_NUMBERS) // 2 else "unsignalised"
     return f"{number}  {name},\n{junction}, {lights}"
 
 

@@ -1,4 +1,4 @@
-"""Measure the tables of motion, detection and `released` accidents of docs/protocols.md; run it from a checkout."""
+"""Measure the tables of motion and detection of docs/protocols.md; run it from a checkout."""
 
 import sys
 import tempfile
@@ -7,10 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from make_accident_tables import RELEASE, TESTS, changed, put, table
+from make_accident_tables import RELEASE, TESTS, put
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.metrics.accident import AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
@@ -21,12 +20,7 @@ from deepaccident_devkit.evaluation.metrics.detection import (
 )
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import detection_result
 from deepaccident_devkit.evaluation.metrics.detection.frame_counts import frame_counts
-from deepaccident_devkit.evaluation.metrics.motion import (
-    MOTION_PROTOCOLS,
-    MotionEvaluator,
-    MotionProtocol,
-    MotionResult,
-)
+from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionHeads, MotionLabels
@@ -34,88 +28,19 @@ from deepaccident_devkit.synth import make_release
 
 GOLDEN = TESTS / "data" / "golden"
 SPLITS = ("train", "val", "test")
-RELEASED_CHOICES: tuple[tuple[str, object], ...] = (
-    ("level", 0.5),
-    ("truth_gap", 2.0),
-    ("prediction_gap", 2.0),
-    ("errors_at", 10.0),
-    ("truth_through_heads", False),
-    ("redraw", False),
-    ("last_frame_only", False),
-    ("far_is_missed", True),
-    ("empty_first_ends", False),
-    ("mean_alone_alarms", False),
-)
+METRICS = ("IoU 30x30", "VPQ 30x30", "VPQ 100x100", "minADE (m)", "minFDE (m)", "miss rate", "paths", "accuracy")
 Given = tuple[str, MotionOutput, MotionLabels]
 
 
 def main() -> None:
     """Write all tables into the page."""
     sys.path.insert(0, str(TESTS))
-    put("released-accidents-golden", golden_accidents())
     put("detection-golden", golden_detection())
-    put("motion-golden", golden_motion())
     put("motion-attribute", golden_attribute())
     with tempfile.TemporaryDirectory() as folder:
         dataset = DeepAccident("v1", make_release(Path(folder) / "release", RELEASE), verbose=False)
         put("detection-release", release_detection(dataset))
-        samples = simple_predictions(dataset)
-        put("motion-release", motion_table(samples, motion_variants(), once=("labels as maps",)))
-        put("released-accidents-release", released_accidents(samples["nobody moves"]))
-
-
-def golden_accidents() -> str:
-    """The golden run (d_accident) through the released protocol, and with each choice changed."""
-    return released_accidents(golden_samples())
-
-
-def released_accidents(samples: Iterable[Given]) -> str:
-    """The released protocol, and with one choice changed at a time."""
-    evaluators = {"**`released`**": AccidentEvaluator("released"), **changed("released", RELEASED_CHOICES)}
-    for each in samples:
-        for evaluator in evaluators.values():
-            evaluator.update(*each)
-    results = {name: evaluator.compute() for name, evaluator in evaluators.items()}
-    head, _, *lines = table(results, "protocol, or the choice that is changed").splitlines()
-    rows = {name: cells for name, *cells in (line.strip("| ").split(" | ") for line in lines)}
-    return "\n".join(["| " + head.strip("| ") + " |", "|---" * head.count(" | ") + "|---|", *folded(rows)])
-
-
-def motion_variants() -> dict[str, MotionProtocol]:
-    """The released protocol, and with one choice changed at a time."""
-    released = MOTION_PROTOCOLS["released"]
-    reading = {"center_threshold": (0.3,), "max_centers": (20,), "scan": ("fiery",)}
-    instances = {"link_distance": (3.0, 8.0), "foreground": ("sigmoid",), **reading}
-    paths = {"link_distance": (3.0, 10.0), "foreground": ("argmax",), "labels_bypass_sigmoid": (False,), **reading}
-    rules = {
-        "miss_distance": (2.0,),
-        "first_prediction_empty_ends": (False,),
-    }
-    own = {"accelerating_paths": (False,), "gate": (2.0, np.inf), "nothing_is_zero": (False,)}
-    result = {"**`released`**": released}
-    for part, choices in (("vpq", {"ids_must_stay": (False,)}), ("instances", instances), ("paths", paths)):
-        result |= _variants(released, part, choices)
-    result |= _variants(released, None, own)
-    return result | _variants(released, "trajectories", rules)
-
-
-def _variants(
-    released: MotionProtocol, part: str | None, choices: Mapping[str, Sequence[object]]
-) -> dict[str, MotionProtocol]:
-    result = {}
-    for name, values in choices.items():
-        for value in values:
-            if part is None:
-                result[f"`{name}={_text(value)}`"] = replace(released, **{name: value})  # type: ignore[arg-type]
-            else:
-                changed = replace(getattr(released, part), **{name: value})
-                result[f"`{part}.{name}={_text(value)}`"] = replace(released, **{part: changed})
-    return result
-
-
-def golden_motion() -> str:
-    """The golden run (d_accident) through the released protocol, and with each choice changed."""
-    return motion_table({"": list(golden_samples())}, motion_variants())
+        put("motion-release", motion_table(simple_predictions(dataset)))
 
 
 def golden_attribute() -> str:
@@ -168,44 +93,31 @@ def simple_predictions(dataset: DeepAccident) -> dict[str, list[Given]]:
     return samples
 
 
-def motion_table(
-    samples: Mapping[str, Iterable[Given]], protocols: Mapping[str, MotionProtocol], once: Sequence[str] = ()
-) -> str:
-    """A line a protocol, of each set of samples; of those in `once` the first protocol alone."""
-    kinds = ["prediction"] if len(samples) > 1 else []
-    metrics = ["IoU 30x30", "VPQ 30x30", "VPQ 100x100", "minADE (m)", "minFDE (m)", "miss rate", "paths", "accuracy"]
-    head = [*kinds, "protocol, or the choice that is changed", *metrics]
+def motion_table(samples: Mapping[str, Iterable[Given]]) -> str:
+    """A line a set of samples, by the released protocol."""
+    head = ["prediction", *METRICS]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for kind, given in samples.items():
-        every = list(given)
-        used = list(protocols)[:1] if kind in once else list(protocols)
-        rows = {name: _motion_cells(_evaluated(every, protocols[name])) for name in used}
-        lines += folded(rows, f"| {kind} " if kinds else "")
+        evaluator = MotionEvaluator()
+        for each in given:
+            evaluator.update(*each)
+        result = evaluator.compute()
+        near, far = result.ranges["30x30"], result.ranges["100x100"]
+        percent = [f"{value:.2f}" for value in (near.iou, near.pq, far.pq)]
+        errors = [f"{value:.3f}" for value in (result.min_ade, result.min_fde, result.miss_rate)]
+        cells = [kind, *percent, *errors, str(result.paths), f"{result.path_accuracy:.3f}"]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def folded(rows: Mapping[str, Sequence[str]], before: str = "") -> list[str]:
+def folded(rows: Mapping[str, Sequence[str]]) -> list[str]:
     """Lines of a table; names of rows that are as the first one stand together in the last line."""
     first = list(next(iter(rows.values())))
     same = [name for name, cells in rows.items() if list(cells) == first][1:]
-    lines = [f"{before}| {' | '.join([name, *cells])} |" for name, cells in rows.items() if name not in same]
+    lines = [f"| {' | '.join([name, *cells])} |" for name, cells in rows.items() if name not in same]
     if same:
-        lines.append(f"{before}| no difference: {', '.join(same)} |" + " |" * len(first))
+        lines.append(f"| no difference: {', '.join(same)} |" + " |" * len(first))
     return lines
-
-
-def _evaluated(given: Sequence[Given], protocol: MotionProtocol) -> MotionResult:
-    evaluator = MotionEvaluator(protocol)
-    for each in given:
-        evaluator.update(*each)
-    return evaluator.compute()
-
-
-def _motion_cells(result: MotionResult) -> list[str]:
-    near, far = result.ranges["30x30"], result.ranges["100x100"]
-    percent = [f"{value:.2f}" for value in (near.iou, near.pq, far.pq)]
-    errors = [f"{value:.3f}" for value in (result.min_ade, result.min_fde, result.miss_rate)]
-    return [*percent, *errors, str(result.paths), f"{result.path_accuracy:.3f}"]
 
 
 def detection_variants() -> dict[str, dict[str, object]]:

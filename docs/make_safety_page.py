@@ -117,7 +117,7 @@ CUTS: dict[str, Callable[[str], str]] = {
     "twins": fewer_rows,
     "describe": one_story,
     "--statistics": paragraph("least TTC"),
-    "info": paragraph("selected"),
+    "info": lambda text: text.splitlines()[0],
     "warning": paragraph("prevented accidents"),
 }
 """Verb or option → what the page shows of its output; of others all."""

@@ -22,7 +22,7 @@ from deepaccident_devkit.synth.collision import gap, separation
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.scenario import Scenario, build_scenario
 from deepaccident_devkit.synth.sensors.rig import make_rig
-from deepaccident_devkit.synth.spec import DESIGNS
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, read_design
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.build import accident_type
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS, frame_timestamp
@@ -89,7 +89,7 @@ def measure(number: int, *, views: bool = True) -> Pair:
     twin_gap, twin_touches = _nearest(twin)
     return Pair(
         design=accident.plan.design or 0,
-        type=accident_type(accident.meta, signalized=accident.plan.subtype == 1),
+        type=accident_type(accident.meta, signalized=accident.plan.traits.subtype == 1),
         draws=accident.draws,
         angle=round(abs(np.degrees(np.angle(np.exp(1j * turn)))), 1),
         speeds=sorted(np.hypot(*end.velocities[rows].T).round(1).tolist()),
@@ -115,7 +115,7 @@ def _nearest(scenario: Scenario) -> tuple[float, bool]:
 
 def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
     """Every agent's labels at the observed moments, the last one `STEP` frames before the impact."""
-    sky = (scenario.weather, scenario.time_of_day)
+    sky = (scenario.spec.weather, scenario.spec.time_of_day)
     noise = (seed, scenario.plan.pair, int(scenario.plan.accident))
     rig = make_rig(
         scenario.world, scenario.actors, scenario.agents, sky=sky, image_size=(480, 270), seed=noise, images=False
@@ -165,11 +165,11 @@ def designs_table(pairs: Sequence[Pair]) -> str:
     head += "| slower, faster (m/s) | frames | follower of ego, of other, infrastructure: each sees both "
     head += "| twins without contact | least gap of agents in twins (m) |"
     lines = [head, "|---" * (head.count("|") - 1) + "|"]
-    for design, template in DESIGNS.items():
+    for design in DESIGN_NUMBERS:
         of_design = [pair for pair in pairs if pair["design"] == design]
         speeds = np.median([pair["speeds"] for pair in of_design], axis=0)
         cells = (
-            f"{design} {template.name}",
+            f"{design} {read_design(design).name}",
             _share(pair["draws"] == 1 for pair in of_design),
             sum(pair["draws"] for pair in of_design),
             _share(pair["type"] == pair["design"] for pair in of_design),
@@ -270,7 +270,7 @@ def main() -> None:
         content["generated"] = synth_beside.measure_generated()
     if not options.tables and not options.beside:
         with ProcessPoolExecutor(WORKERS) as executor:
-            content["pairs"] = list(executor.map(measure, range(SEEDS * len(DESIGNS)), chunksize=4))
+            content["pairs"] = list(executor.map(measure, range(SEEDS * len(DESIGN_NUMBERS)), chunksize=4))
     save(content)
     PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8"), content), encoding="utf-8")
 

@@ -7,7 +7,6 @@ import numpy as np
 
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Meta, write_calib, write_label, write_meta
-from deepaccident_devkit.synth.actors import Sampled
 from deepaccident_devkit.synth.collision import separation
 from deepaccident_devkit.synth.recording import RecordingJob
 from deepaccident_devkit.synth.scenario import Scenario, build_scenario
@@ -86,7 +85,7 @@ class Truth:
 def recorded(job: RecordingJob) -> Truth:
     """Write a scenario's labels, calib and meta, and tell what the generator knows of it."""
     scenario = build_scenario(job.config, job.plan)
-    actors, moving = scenario.actors, [each for each in scenario.actors.all if isinstance(each.motion, Sampled)]
+    actors, moving = scenario.actors, [each for each in scenario.actors.all if not each.parked]
     rows = [actors.row_of(actor) for actor in scenario.meta.collision.ids] if job.plan.accident else []
     world_paths, sights = _looked_at(job, scenario, rows)
     times = np.arange((scenario.frames - 1) * STEPS_A_FRAME + 1) * STEP
@@ -113,7 +112,7 @@ def _looked_at(job: RecordingJob, scenario: Scenario, rows: list[int]) -> tuple[
         scenario.world,
         scenario.actors,
         scenario.agents,
-        sky=(scenario.weather, scenario.time_of_day),
+        sky=(scenario.spec.weather, scenario.spec.time_of_day),
         image_size=config.pixels,
         seed=(config.seed, plan.pair, int(plan.accident)),
         sensors="none",

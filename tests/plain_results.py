@@ -52,16 +52,12 @@ def detections() -> dict[str, Any]:
 
 
 def instance_arrays(number: int = 0) -> dict[str, np.ndarray]:
-    """Two predictions in which two instances go ahead, and their paths."""
+    """Two predictions in which two instances go ahead."""
     maps = np.zeros((PREDICTIONS, FRAMES, *SHAPE), dtype=np.uint8)
     for t in range(FRAMES):
         maps[:, t, 1:3, t : t + 2] = 1
         maps[:, t, 4:5, 3 + t + number % 2] = 7
-    return {
-        "instance": maps,
-        "trajectory_id": np.array([1, 7], dtype=np.int32),
-        "trajectory": np.arange(2 * FRAMES * 2, dtype=np.float32).reshape(2, FRAMES, 2),
-    }
+    return {"instance": maps}
 
 
 def head_arrays() -> dict[str, np.ndarray]:

@@ -1,6 +1,5 @@
 """`deepaccident synth`: from the words of the command line to a release."""
 
-import re
 import sys
 from pathlib import Path
 
@@ -35,7 +34,6 @@ def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
     assert result.exit_code == 0, result.output
     assert f"deepaccident info {out}" in result.output
     assert f"{out}: 1 scenario of 1 frame with five agents, layout B" in result.output
-    assert "slow" not in result.stderr
     assert find_release(out).layout == "B"
 
 
@@ -90,13 +88,6 @@ def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
     assert f"{tmp_path}: 4 scenarios with five agents, layout A" in result.output
 
 
-def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
-    monkeypatch.setattr(sys.modules[synth.callback.__module__], "has_embree", lambda: False)
-    result = CliRunner().invoke(synth, [str(tmp_path), "--sensors", "none"])
-    assert "slow without the package embreex; in a checkout: pip install '.[synth]'" in result.stderr
-    assert made == [SynthConfig(frames=None, sensors=False)]
-
-
 @pytest.mark.parametrize(
     ("words", "told"),
     [
@@ -108,12 +99,6 @@ def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch
 def test_designs_that_are_not_there_are_usage_errors(tmp_path, words, told):
     result = CliRunner().invoke(synth, [str(tmp_path), *words.split()])
     assert (result.exit_code, told in result.output) == (2, True), result.output
-
-
-def test_designs_are_listed_without_a_folder():
-    result = CliRunner().invoke(synth, ["--show-design", "all"])
-    assert result.exit_code == 0
-    assert "3  unprotected left turn" in result.output
 
 
 MINE = """\
@@ -135,44 +120,18 @@ def mine(tmp_path, monkeypatch) -> Path:
     return path
 
 
-@pytest.mark.slow
-def test_a_file_is_checked_and_nothing_is_written(mine):
-    result = CliRunner().invoke(synth, ["--design", "mine.yaml", "--check"])
-    assert result.exit_code == 0, result.output
-    assert re.search(
-        r"mine.yaml: can be simulated; one draw of it, with seed 0:\n"
-        r"  accident: ego \(car, \d+\.\d m/s, \w+( side)?\) and other \(van, \d+\.\d m/s, \w+( side)?\) collide at "
-        r"(\d+\.\d) s; found in draw \d+\n"
-        r"    \d+ frames \(\3 s\), 5 road users that move, 2 parked; Clear, Noon\n"
-        r"  normal: nobody collides\n"
-        r"    \d+ frames \(\d+\.\d s\), 5 road users that move, 2 parked; Clear, Noon\n"
-        r"checked in \d+\.\d s; nothing is written\n",
-        result.stdout,
-    ), result.stdout
-    assert [path.name for path in Path.cwd().iterdir()] == ["mine.yaml"]
-
-
-def test_a_file_that_is_no_scenario_has_exit_status_1(mine):
+def test_a_file_that_is_no_scenario_is_refused(mine):
     mine.write_text(MINE.replace("van", "cyclist"), encoding="utf-8")
-    result = CliRunner().invoke(synth, ["--design", "mine.yaml", "--check"])
-    assert result.exit_code == 1
-    assert "error: mine.yaml:4: actors[1].category: the role other cannot be a cyclist" in result.stderr
-    result = CliRunner().invoke(synth, ["--design", "your.yaml", "--check"])
-    assert (result.exit_code, "your.yaml: no such file" in result.stderr) == (1, True)
+    result = CliRunner().invoke(synth, ["out", "--design", "mine.yaml"])
+    assert "mine.yaml:4: actors[1].category: the role other cannot be a cyclist" in str(result.exception)
+    assert not Path("out").exists()
+    result = CliRunner().invoke(synth, ["out", "--design", "your.yaml"])
+    assert "your.yaml: no such file" in str(result.exception)
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ([], "Missing argument 'OUT'"),
-        (["--check"], "--check needs a scenario file: --design FILE"),
-        (["out", "--design", "mine.yaml", "--check"], "--check writes nothing; leave out out"),
-    ],
-)
-def test_words_that_are_missing_or_too_many_are_usage_errors(mine, words, sentence):
-    result = CliRunner().invoke(synth, words)
-    assert result.exit_code == 2
-    assert sentence in result.output
+def test_without_a_folder_is_a_usage_error():
+    result = CliRunner().invoke(synth, [])
+    assert (result.exit_code, "Missing argument 'OUT'" in result.output) == (2, True)
 
 
 def test_how_to_see_an_accident_is_the_last_line(mine, made):

@@ -20,13 +20,9 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
-from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, DetectionProtocol
 from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, MotionProtocol
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import VpqRules
-from deepaccident_devkit.evaluation.metrics.trajectories import TrajectoryRules
 from deepaccident_devkit.evaluation.metrics.warning import (
     WARNING_PROTOCOLS,
     CleanWarnings,
@@ -154,13 +150,13 @@ def test_every_switch_of_the_label_protocols_is_explained() -> None:
     assert missing == []
 
 
-@pytest.mark.parametrize("choices", [LabelProtocol, MotionProtocol, VpqRules, TrajectoryRules, ReleasedAccidents])
+@pytest.mark.parametrize("choices", [LabelProtocol, MotionProtocol])
 def test_every_switch_is_on_the_page_of_the_released_code(choices: type[Any]) -> None:
     page = (DOCS / "released_code.md").read_text(encoding="utf-8")
     assert [field.name for field in fields(choices) if not re.search(rf"[`.]{field.name}\b", page)] == []
 
 
-@pytest.mark.parametrize("choices", [LabelProtocol, MotionLabelConfig, MotionProtocol, ReleasedAccidents, Scoring])
+@pytest.mark.parametrize("choices", [LabelProtocol, MotionLabelConfig, MotionProtocol])
 def test_the_page_of_the_released_code_names_no_other_switch(choices: type[Any]) -> None:
     page = (DOCS / "released_code.md").read_text(encoding="utf-8")
     named = set(re.findall(rf"`{choices.__name__}\.(\w+)", page))
@@ -201,14 +197,10 @@ def test_the_commands_of_the_gallery_run(da_motion: DeepAccident, in_demo: Path)
     "choices",
     [
         MotionProtocol,
-        VpqRules,
-        TrajectoryRules,
         PostProcessing,
         DetectionProtocol,
-        ReleasedAccidents,
         PaperAccidents,
         AccidentReading,
-        Scoring,
         BoxAccidents,
         CleanWarnings,
     ],

@@ -20,7 +20,6 @@ NOT_FOR_USERS = {
         "deepaccident",
         "files",
         "json_text",
-        "nuscenes_names",
         "overview",
         "pages",
         "parallel",

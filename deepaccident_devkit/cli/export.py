@@ -26,9 +26,8 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field_option, together, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ExportError, NotAvailableError
-from deepaccident_devkit.motion import PRESETS
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
-from deepaccident_devkit.text import choice, size_text, spelled
+from deepaccident_devkit.text import choice, size_text
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 if TYPE_CHECKING:
@@ -341,14 +340,6 @@ def _town_line(told: dict[str, Any]) -> str:
     )
 
 
-def _points(context: click.Context, parameter: click.Parameter, value: str) -> str | int:
-    """Parse `all`, or n."""
-    value = spelled(value, ("all",))
-    if value != "all" and not value.isdecimal():
-        raise click.BadParameter(f"expected all, or a number for every n-th point, found {value!r}", context, parameter)
-    return value if value == "all" else int(value)
-
-
 @verb("mcap", short_help=_LINES["mcap"])
 @release_parameters
 @click.argument("scenario", required=False)
@@ -358,20 +349,17 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
 @frame_range_parameter
 @click.option(
     "--points",
-    callback=_points,
-    metavar="all|N",
-    default="all",
+    type=click.IntRange(min=1),
+    metavar="N",
+    default=1,
     show_default=True,
-    help="all, or N for every N-th point of a cloud.",
+    help="Only every N-th point of a cloud.",
 )
-@click.option("--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels by this preset.")
-@click.option("--results", type=PATH, metavar="FILE", help="Also write the predictions of this results file.")
 def _mcap(
     scenario: str | None,
     out: Path,
     agents: tuple[str, ...],
     channels: tuple[str, ...],
-    results: Path | None,
     **options: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as an MCAP file for Foxglove or rerun.
@@ -379,20 +367,18 @@ def _mcap(
     SCENARIO is a token, such as type1_subtype1_accident/Town03_type001_subtype0001_scenario00024. Without SCENARIO the
     command takes the first scenario with a collision, or if there is none, the first scenario.
     """
-    from deepaccident_devkit.evaluation.results import read_results
     from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 
     names = agent_names(agents)
-    choices = {name: options.pop(name) for name in ("frames", "points", "motion_labels")}
+    choices = {name: options.pop(name) for name in ("frames", "points")}
     choices["agents"] = None if names == AGENTS else names
     choices["channels"] = words_of(channels) if channels else None
     config = McapConfig.of(**choices)  # before the release is indexed
     if LIDAR not in (config.channels or ()):
         refuse_unused(f"without the channel {LIDAR}", "points")
-    prediction = None if results is None else read_results(results)
     dataset = DeepAccident(**options)
     token = scenario or default_scenario(dataset)
-    made = export_mcap(dataset, token, out, prediction=prediction, progress=True, **choices)
+    made = export_mcap(dataset, token, out, progress=True, **choices)
     click.echo(f"{made}: {token}, {made.stat().st_size / 1e6:.1f} MB; open it in Foxglove, or with: rerun {made}")
 
 

@@ -1,5 +1,6 @@
-"""`deepaccident info`: what a release holds, its statistics, its index, and what scenarios can be found by."""
+"""`deepaccident info`: what a release holds, its statistics, and what scenarios can be found by."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,12 @@ from deepaccident_devkit.cli.options import (
     refuse_unused,
     release_parameters,
     say_report,
-    was_given,
     where_parameter,
     write_report,
 )
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.overview import overview
+from deepaccident_devkit.overview import overview, scenario_lines
 from deepaccident_devkit.selection.fields import fields_text
 
 _OF_STATISTICS = ("interactions", "out")
@@ -48,33 +48,21 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     help="With --statistics: folder to write statistics.json, one CSV file per table, and figures into; earlier ones "
     "there are replaced.",
 )
-@click.option(
-    "--index",
-    "of_index",
-    is_flag=True,
-    help="Print instead where the indexes of all versions are, what they hold, and whether they are up to date. "
-    "Nothing is changed.",
-)
 @json_parameter
 def info(
     where: tuple[str, ...],
     statistics: bool,
     interactions: bool,
     out: str | None,
-    of_index: bool,
     as_json: bool,
     **release: Any,
 ) -> None:
     """Print what the release in DATAROOT holds: tables, splits, agents, sensors, attributes.
 
-    With --where, it is about the scenarios that match all filters, and lists them.
+    With --where, list the scenarios that match all filters instead; with --json, their records.
     """
     if not statistics:
         refuse_unused("without --statistics", *_OF_STATISTICS)
-    if of_index:
-        refuse_unused("with --index, which makes none", "where", "statistics", "workers", "on_error")
-        _print_index(release, as_json=as_json)
-        return
     dataset = DeepAccident(**release)
     chosen = dataset.find(*where) if where else None
     if chosen == [] and out is not None:
@@ -82,13 +70,15 @@ def info(
     if statistics:
         _statistics(dataset, chosen, out, interactions=interactions, as_json=as_json, **engine_of(release))
         return
-    if chosen == [] and not as_json:
-        click.echo(f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for")
-        return
-    summary = overview(dataset, chosen)
-    click.echo(summary.to_json() if as_json else summary.to_text())
-    if chosen is not None and not as_json:
-        click.echo("\n".join(["", *(scenario["token"] for scenario in chosen)]))
+    if chosen is None:
+        summary = overview(dataset)
+        click.echo(summary.to_json() if as_json else summary.to_text())
+    elif as_json:
+        click.echo(json.dumps(chosen, indent=2, ensure_ascii=False))
+    else:
+        found = [f"{len(chosen)} of {len(dataset.scenario)} scenarios match", *scenario_lines(chosen)]
+        none = f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for"
+        click.echo("\n".join(found) if chosen else none)
 
 
 def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:
@@ -102,11 +92,3 @@ def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None
     if folder:
         written += save_statistics(found, folder)
     say_report(found, written, folder, as_json=as_json)
-
-
-def _print_index(release: dict[str, Any], *, as_json: bool) -> None:
-    from deepaccident_devkit.tables import index_report
-
-    version = release["version"] if was_given("version") else None
-    report = index_report(release["dataroot"], version=version, index_dir=release["index_dir"])
-    click.echo(report.to_json() if as_json else report.to_text())

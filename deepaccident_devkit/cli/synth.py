@@ -1,6 +1,5 @@
 """`deepaccident synth`: make a synthetic release."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,34 +7,21 @@ import click
 
 from deepaccident_devkit.cli.options import PATH, engine_of, engine_parameters, pixel_size, refuse_unused
 from deepaccident_devkit.cli.verbs import advanced, field_option, verb
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
-from deepaccident_devkit.synth.scenario import checked_text
-from deepaccident_devkit.synth.sensors.caster import has_embree
-from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, designs_text, read_spec
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, read_spec
 
-_OF_FILES = (
-    *("scenarios", "image_size", "layout", "sensors", "unlabelled_test", "for_released_code"),
-    *("unplanned", "workers", "scheduler"),
-)
-"""Options of what is written."""
-_FAULTY = 1
-"""Exit status if a checked file gives no scenario."""
 _EXAMPLES = """\b
 Examples:
   deepaccident synth OUT --scenarios 24 --sensors none     only labels, all twelve designs
   deepaccident synth --show-design 3 > mine.yaml           print a scenario file to edit
-  deepaccident synth --design mine.yaml --check            say what happens in your file, and write nothing
   deepaccident synth OUT --design mine.yaml                make accidents from your file
   deepaccident synth OUT --for-released-code               for the released DeepAccident code"""
 
 
 def _show_design(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
     if value is not None:
-        whole = value.strip().lower() == "all"
-        text = f"{designs_text()}\n" if whole else design_text(_number(context, parameter, value))
-        click.echo(text, nl=False)
+        click.echo(design_text(_number(context, parameter, value)), nl=False)
         context.exit()
 
 
@@ -54,7 +40,7 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
 
 
 @verb(epilog=_EXAMPLES)
-@click.argument("out", required=False, type=PATH)
+@click.argument("out", type=PATH)
 @field_option(SynthConfig, "scenarios")
 @field_option(
     SynthConfig,
@@ -87,40 +73,26 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
     help="Only accidents of this design; you can repeat this option. Or a scenario file of your own; docs/scenarios.md "
     "describes its fields.  [default: all twelve in turn]",
 )
-@click.option(
-    "--check",
-    is_flag=True,
-    help="Draw one accident and its normal twin from the file of --design, print who hits whom, and write nothing; "
-    "without OUT. Exit status 1 if the file gives no scenario.",
-)
 @field_option(SynthConfig, "unplanned", option=advanced)
 @engine_parameters
 @click.option(
     "--show-design",
-    metavar="N|all",
+    metavar="N",
     is_eager=True,
     expose_value=False,
     callback=_show_design,
-    help="Print the scenario file of a design, as a start for your own, or with all a list of them, and stop.",
+    help="Print the scenario file of a design, as a start for your own, and stop; docs/scenarios.md lists them.",
 )
-@click.pass_context
-def synth(context: click.Context, /, out: Path | None, *, check: bool, designs: dict[str, Any], **options: Any) -> None:
+def synth(out: Path, *, designs: dict[str, Any], **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
     If a run is interrupted, the same command continues it.
     """
     how = engine_of(options)
     options = {name: each for name, each in options.items() if name not in how} | designs
-    if check:
-        _check(context, out, options)
-        return
-    if out is None:
-        raise click.UsageError("Missing argument 'OUT': the folder to make.", context)
     if options["spec"] is not None or options["view"] == "hidden":
         refuse_unused("with a scenario file or --view hidden, which ask for one certain accident", "unplanned")
     config = SynthConfig(**options)
-    if config.sensors == "none" and not has_embree():
-        click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
     made = make_release(out, config, progress=True, **how)
     scenarios = f"{config.scenarios} scenario{'s' if config.scenarios > 1 else ''}"
     frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"
@@ -129,17 +101,3 @@ def synth(context: click.Context, /, out: Path | None, *, check: bool, designs: 
     if config.spec is None or read_spec(config.spec).meets:
         layers = " --layers boxes" if config.sensors == "none" else ""
         click.echo(f"or:   deepaccident render accident {made}{layers} --out countdown.png")
-
-
-def _check(context: click.Context, out: Path | None, options: Mapping[str, Any]) -> None:
-    """Print what a scenario file gives; exit status 1 with the error if it gives nothing."""
-    if options["spec"] is None:
-        raise click.UsageError("--check needs a scenario file: --design FILE.", context)
-    if out is not None:
-        raise click.UsageError(f"--check writes nothing; leave {out} out.", context)
-    refuse_unused("with --check, which draws one pair and writes nothing", *_OF_FILES)
-    try:
-        click.echo(checked_text(SynthConfig(**options), progress=True))
-    except ConfigError as error:
-        click.echo(f"error: {error}", err=True)
-        context.exit(_FAULTY)

@@ -33,8 +33,8 @@ _FINDINGS_STATUS = 1
 @click.option(
     "--files",
     is_flag=True,
-    help="Only list folders: which scenarios are whole, and how many files and bytes of each split, agent and sensor "
-    "are here and missing.",
+    help="Only list folders: how many scenarios are whole, and how many files of each split, agent and sensor are "
+    "missing.",
 )
 @click.option("--deep", is_flag=True, help="Also decode each image and array, and compare them with the labels.")
 @click.option(

@@ -1,4 +1,4 @@
-"""The official metrics, and those that the paper describes: motion, accidents, detection, segmentation from above.
+"""The official metrics, and those that the paper describes: motion, accidents, detection, warnings.
 
 Three rooms: `metrics` counts arrays and sums the counts, a package a task; `results` are predictions in files; `runs`
 evaluates them into bundles that others can check, and looks for mistakes in predictions (`runs.sanity`). `breakdown`
@@ -15,7 +15,6 @@ from deepaccident_devkit.evaluation.metrics.accident import (
     BoxTruth,
     PaperAccidents,
     accident_context,
-    accidents_of,
     box_truth,
     foreseen_accident,
 )
@@ -25,20 +24,12 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     DetectionEvaluator,
     DetectionResult,
     detection_truth,
-    nuscenes_summary,
 )
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult, motion_counts
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
-    LostInstance,
-    lost_instances,
-    segmentation_counts,
-    vpq,
-    vpq_counts,
-)
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
-from deepaccident_devkit.evaluation.metrics.segmentation import BevSegmentationEvaluator, BevSegmentationResult
 from deepaccident_devkit.evaluation.metrics.trajectories import match_trajectories
 from deepaccident_devkit.evaluation.metrics.warning import (
     AnticipationResult,
@@ -58,8 +49,6 @@ __all__ = [
     "AccidentEvaluator",
     "AccidentResult",
     "AnticipationResult",
-    "BevSegmentationEvaluator",
-    "BevSegmentationResult",
     "BoxAccidents",
     "BoxTruth",
     "Breakdown",
@@ -70,7 +59,6 @@ __all__ = [
     "Evaluator",
     "FieldResult",
     "FieldWarnings",
-    "LostInstance",
     "MotionEvaluator",
     "MotionOutput",
     "MotionResult",
@@ -81,21 +69,16 @@ __all__ = [
     "SampleAttributes",
     "WarningEvaluator",
     "accident_context",
-    "accidents_of",
     "box_truth",
     "breakdown",
     "detection_truth",
     "evaluate_samples",
     "foreseen_accident",
     "instances_of",
-    "lost_instances",
     "match_trajectories",
     "motion_counts",
-    "nuscenes_summary",
     "read_results",
     "sample_attributes",
-    "segmentation_counts",
-    "vpq",
     "vpq_counts",
 ]
 

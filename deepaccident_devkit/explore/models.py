@@ -172,7 +172,6 @@ def open_models(bundles: Iterable[Path], results: Iterable[Path], jobs: Jobs) ->
     paired: set[str] = set()
     for folder in bundles:
         bundle = read_bundle(folder)
-        _ = bundle.setup  # refuses a protocol that cannot be
         copy = bundle.results_copy()
         found = read_results(copy) if copy is not None else None
         for path, each in given.items():

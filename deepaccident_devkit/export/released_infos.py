@@ -26,7 +26,7 @@ from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import read_bytes
-from deepaccident_devkit.release import Labels, ScenarioFolder, read_calibs, read_label
+from deepaccident_devkit.release import Labels, ScenarioFolder, read_calib, read_label
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, CHANNEL_FORMAT, CHANNELS, LIDAR
@@ -168,7 +168,7 @@ def _fault(dataset: Dataset, scenario: str) -> str | None:
 
 def _infos(folder: ScenarioFolder, agent: str, numbers: range, root_prefix: str) -> Iterator[dict[str, Any]]:
     """The infos of an agent's keyframes, with the converter's own keys."""
-    calibs = read_calibs([folder.calib_path(agent, number) for number in numbers], raw=True)
+    calibs = [read_calib(folder.calib_path(agent, number), raw=True) for number in numbers]
     name, place = folder.name.split("_"), "/".join(filter(None, (root_prefix, folder.folder, folder.scenario_type)))
     for number, calib in zip(numbers, calibs, strict=True):
         stem = f"{folder.name}_{number:03d}"

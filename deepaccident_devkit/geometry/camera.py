@@ -100,22 +100,6 @@ class PinholeCamera(FrozenArrays):
             pixels: FloatArray = (given / safe[:, None]) @ self.intrinsic[:2].T
         return pixels, depth
 
-    def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> FloatArray:
-        """Pixels (N, 2) as (u, v) and their depths (N,) along the optical axis, metres → points (N, 3), optical frame.
-
-        NaN stays NaN. Raises GeometryError if the intrinsic has no inverse.
-        """
-        uv = checked("pixels", pixels, (None, 2))
-        distance = checked("depth", depth, (len(uv),))
-        try:
-            inverse = np.linalg.inv(self.intrinsic)
-        except np.linalg.LinAlgError:
-            raise GeometryError(
-                f"the intrinsic {self.intrinsic.tolist()} has no inverse; is a focal length 0?"
-            ) from None
-        points: FloatArray = (uv @ inverse[:, :2].T + inverse[:, 2]) * distance[:, None]
-        return points
-
     def in_image(
         self, pixels: ArrayLike, depth: ArrayLike | None = None, *, min_depth: float = 0.0, margin: float = 0.0
     ) -> BoolArray:

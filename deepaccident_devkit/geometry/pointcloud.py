@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.arrays import (
     AnyArray,
     BoolArray,
@@ -20,24 +18,17 @@ from deepaccident_devkit.arrays import (
     checked_number,
     readonly,
 )
-from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
-from deepaccident_devkit.files import path_of, replacing
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
-from deepaccident_devkit.nuscenes_names import CLOUD, without_names
-from deepaccident_devkit.reading import fault_text
 from deepaccident_devkit.text import Pictured
 
 Range = tuple[float, float]
-_FIELDS = ("xyz", "intensity", "frame")
 _SOURCES: Final = {"agent": np.int8, "time_lag": np.float32}
 """Columns that only some clouds have, and the types of their numbers."""
-_FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare array, which is no archive
-"""The errors of reading a damaged file or one of another kind."""
 
 
-@without_names(CLOUD)
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarPointCloud(FrozenArrays, Pictured):
     """N points in one right-handed coordinate frame; arrays are read-only views.
@@ -144,37 +135,6 @@ class LidarPointCloud(FrozenArrays, Pictured):
             )
         place = checked("sensor", (0.0, 0.0, 0.0) if sensor is None else sensor, (3,))
         return self.select(np.hypot(*(self.xyz[:, :2] - place[:2]).T) >= distance)
-
-    def save(self, path: str | Path) -> None:
-        """Write the cloud to an `.npz` file (its attributes that are not None), completely or not at all.
-
-        `load` returns the same cloud, equal to the bit. This is not the release's format, which is single precision,
-        left-handed and in the LiDAR frame: `release.write_lidar` writes that.
-        """
-        with replacing(path_of(path)) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **self._columns(), frame=np.array(self.frame))
-
-    @classmethod
-    def load(cls, path: str | Path) -> LidarPointCloud:
-        """Read a file that `save` wrote.
-
-        Raises:
-            MissingFileError: there is no such file.
-            SensorFileError: it cannot be read, or is another kind of file.
-        """
-        try:
-            with open_zip(path_of(path)) as archive:
-                there = {*_FIELDS, *archive.namelist()}
-                names = [name for name in (*_FIELDS, *_SOURCES) if name in there or f"{name}.npy" in there]
-                arrays: dict[str, Any] = {name: read_array(archive, name, "cloud") for name in names}
-            return cls(**arrays | {"frame": str(arrays["frame"])})
-        except FileNotFoundError:
-            raise MissingFileError(f"{path}: no such file; LidarPointCloud.save writes one") from None
-        except _FAULTS as error:
-            raise SensorFileError(
-                f"{path}: not a cloud that LidarPointCloud.save wrote ({fault_text(error)}); "
-                "files of the release are read by load_point_cloud"
-            ) from error
 
     def _columns(self) -> dict[str, Any]:
         """The arrays of N rows that the cloud has, by attribute."""

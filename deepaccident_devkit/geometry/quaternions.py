@@ -94,16 +94,3 @@ def yaw_of(quaternion: ArrayLike) -> FloatArray:
     q = as_floats(quaternion)
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-
-
-def slerp(first: ArrayLike, second: ArrayLike, share: ArrayLike) -> FloatArray:
-    """Rotations on the shorter arc between unit quaternions (…, 4): share (…) 0 is the first, 1 the second."""
-    a, b = as_floats(first), as_floats(second)
-    cosine = np.sum(a * b, axis=-1, keepdims=True)
-    a, cosine = np.where(cosine < 0, -a, a), np.abs(cosine)
-    square = b - cosine * a  # the part of b at right angles to a: its length is the angle's sine
-    sine = np.linalg.norm(square, axis=-1, keepdims=True)
-    angle = as_floats(share)[..., None] * np.arctan2(sine, cosine)
-    direction = np.divide(square, sine, out=np.zeros_like(square), where=sine > 0)
-    result = np.cos(angle) * a + np.sin(angle) * direction
-    return as_floats(result / np.linalg.norm(result, axis=-1, keepdims=True))

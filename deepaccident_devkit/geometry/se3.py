@@ -132,26 +132,6 @@ class SE3(FrozenArrays):
         """
         return six_vectors.from_matrices(self.matrix)
 
-    def interpolate(self, other: SE3, share: float) -> SE3:
-        """The pose at `share` of the way from this one (0) to `other` (1), both between the same two frames.
-
-        The rotation turns evenly about one axis by the smaller angle (slerp), the translation moves in a straight line.
-
-        Raises:
-            GeometryError: `share` is not between 0 and 1, or `other` is no SE3.
-        """
-        checked_transform("other", other)
-        share = checked_number("share", share, "a number from 0 to 1")
-        if not 0 <= share <= 1:
-            raise GeometryError(f"share: expected a number from 0 to 1, found {share}")
-        if share in (0, 1):
-            return other if share else self
-        mine, theirs = quaternions.from_matrix(self.rotation), quaternions.from_matrix(other.rotation)
-        matrix = np.eye(4)
-        matrix[:3, :3] = quaternions.to_matrix(quaternions.slerp(mine, theirs, share))
-        matrix[:3, 3] = (1 - share) * self.translation + share * other.translation
-        return trusted_se3(matrix)
-
     def inverse(self) -> SE3:
         """The inverse transform, `source_from_target`."""
         return trusted_se3(inverses(self.matrix))

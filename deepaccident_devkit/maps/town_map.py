@@ -73,16 +73,10 @@ class TownMap(FrozenArrays):
         """(H, W), whether any picture saw the ground of a cell."""
         return np.asarray(self.agents > 0)
 
-    def drivable(self, *, least_looks: int = 0, least_agents: int = 0) -> BoolArray:
-        """(H, W), cells that more than half of the pictures saw as road or road line, and hidden ones amid these.
-
-        Args:
-            least_looks: cells that fewer pictures saw are left out; 1 leaves out the hidden ones.
-            least_agents: cells that fewer recordings saw are left out.
-        """
+    def drivable(self) -> BoolArray:
+        """(H, W), cells that more than half of the pictures saw as road or road line, and hidden ones amid these."""
         surface, every = _surface_and_all(self.counts)
-        road = (2 * surface > every) | (self.hidden == _ROAD)
-        return np.asarray(road & (every >= least_looks) & (self.agents >= least_agents))
+        return np.asarray((2 * surface > every) | (self.hidden == _ROAD))
 
     def classes(self) -> ByteArray:
         """(H, W) uint8, 0 where nothing is known, else 1 + the position in `GROUND_CLASSES`.

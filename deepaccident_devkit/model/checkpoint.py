@@ -1,4 +1,4 @@
-"""Weights in files: our own as safetensors, foreign ones of the release, BEVerse, Swin or torchvision.
+"""Weights in files: our own as safetensors, foreign ones of the release, BEVerse or Swin.
 
 Names are the release's (tests/data/golden/model/released_keys_*.txt), so that the key table is the identity.
 A foreign file is read by `release.checkpoints`, which runs no code of it and makes nothing large.

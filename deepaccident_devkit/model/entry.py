@@ -144,7 +144,7 @@ def _taken(values: Tensor, source: Tensor) -> Tensor:
 def _moved(value: Any, device: torch.device | str) -> Any:
     if isinstance(value, CameraGeometry):
         return CameraGeometry(**{name: _moved(each, device) for name, each in _parts(value).items()})
-    return value if value is None else value.to(device, non_blocking=True)
+    return value.to(device, non_blocking=True)
 
 
 def _parts(cameras: CameraGeometry) -> dict[str, Any]:

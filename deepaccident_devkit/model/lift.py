@@ -7,7 +7,7 @@ probability of the depth, and each cell of the map is the sum or the mean of the
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -103,27 +103,16 @@ class CameraGeometry:
     Attributes:
         rotation: (B, P, N, 3, 3) of `ego_from_camera`; camera axes are x right, y down, z forward.
         translation: (B, P, N, 3) of `ego_from_camera`, metres.
-        intrinsics: (B, P, N, 3, 3) K, pixels of the image before the affine map below.
-        image_rotation: (B, P, N, 3, 3) the linear part of the augmentation of images, which acts on (u, v, depth); None
-            for the identity.
-        image_translation: (B, P, N, 3) its shift, pixels; None for 0.
-        bev_transform: (B, 4, 4) applied to points of the ego frame, `augmented_from_ego`; None if the poses hold it.
-        valid: (B, P, N) bool, False for cameras whose images are missing and must not count; None for all.
+        intrinsics: (B, P, N, 3, 3) K, pixels.
     """
 
     rotation: Tensor
     translation: Tensor
     intrinsics: Tensor
-    image_rotation: Tensor | None = None
-    image_translation: Tensor | None = None
-    bev_transform: Tensor | None = None
-    valid: Tensor | None = None
 
     def flattened(self) -> CameraGeometry:
         """The cameras of (B, A, P, N, …) tensors, with A agents, as those of B · A samples."""
-        given = {each.name: getattr(self, each.name) for each in fields(self)}
-        merged: dict[str, Any] = {name: None if each is None else each.flatten(0, 1) for name, each in given.items()}
-        return CameraGeometry(**merged)
+        return CameraGeometry(**{each.name: getattr(self, each.name).flatten(0, 1) for each in fields(self)})
 
 
 class LiftSplat(nn.Module):
@@ -140,12 +129,12 @@ class LiftSplat(nn.Module):
         self.depthnet = nn.Conv2d(config.in_channels, config.frustum_shape[0] + config.channels, 1)
         self.register_buffer("frustum", _frustum(config))
 
-    def forward(self, features: Tensor, cameras: CameraGeometry | Tensor) -> Tensor:
+    def forward(self, features: Tensor, cameras: CameraGeometry) -> Tensor:
         """One map of each frame.
 
         Args:
             features: (B, P, N, C, h', w').
-            cameras: their cameras, or what `cells` gave for them.
+            cameras: their cameras.
 
         Returns:
             (B, P, `channels`, Y, X), row = y ascending, column = x ascending; float32 under autocast too.
@@ -159,7 +148,7 @@ class LiftSplat(nn.Module):
                 f"features: expected (…, {rows}, {columns}) of images of {self.config.image_size} pixels, found "
                 f"{tuple(features.shape)}"
             )
-        cells = cameras if isinstance(cameras, Tensor) else self.cells(cameras)
+        cells = self.cells(cameras)
         expected = (*features.shape[:3], depths, rows, columns)
         if cells.shape != expected:
             raise GeometryError(f"cameras: expected cells {expected} for these features, found {tuple(cells.shape)}")
@@ -171,8 +160,6 @@ class LiftSplat(nn.Module):
     @torch.no_grad()
     def cells(self, cameras: CameraGeometry) -> Tensor:
         """The cell of the map in which each point of the frustum lies.
-
-        It depends on the cameras alone: for cameras that stay, compute it once and give it to `forward`.
 
         Returns:
             (B, P, N, D, h', w') int64, row · X + column, −1 for points that do not count.
@@ -191,35 +178,20 @@ class LiftSplat(nn.Module):
             road = torch.where(cameras.translation[..., 2] > _LEAST_CAMERA, 0.0, -POLE_HEIGHT)[..., None, None, None]
             above = points[..., 2] - road
             inside &= (above >= config.band[0]) & (above < config.band[1])
-        if cameras.valid is not None:
-            inside &= cameras.valid[..., None, None, None]
         column, row, _ = torch.where(inside[..., None], steps, 0).long().unbind(-1)
         return torch.where(inside, row * columns + column, -1)
 
     @torch.no_grad()
     def points(self, cameras: CameraGeometry) -> Tensor:
-        """The frustum's points (B, P, N, D, h', w', 3) in the ego frame, metres: with `bev_transform`, augmented."""
+        """The frustum's points (B, P, N, D, h', w', 3) in the ego frame, metres."""
         dtype = torch.promote_types(cameras.rotation.dtype, torch.float32)
         with torch.autocast(self.frustum.device.type, enabled=False):
             rotation, shift = cameras.rotation.to(dtype), cameras.translation.to(dtype)
-            if cameras.bev_transform is not None:
-                transform = cameras.bev_transform.to(dtype)[:, None, None]
-                rotation = transform[..., :3, :3] @ rotation
-                shift = (transform[..., :3, :3] @ shift[..., None]).squeeze(-1) + transform[..., :3, 3]
-            pixels = self._pixels(cameras, dtype)
+            pixels = self.frustum.to(dtype).flatten(0, 2)
             rays = torch.cat([pixels[..., :2] * pixels[..., 2:], pixels[..., 2:]], -1)
-            ego_from_ray = rotation @ _inverse(cameras.intrinsics.to(dtype), cameras.valid)
+            ego_from_ray = rotation @ torch.linalg.inv(cameras.intrinsics.to(dtype))
             points = rays @ ego_from_ray.transpose(-1, -2) + shift[..., None, :]
         return points.unflatten(-2, self.config.frustum_shape)
-
-    def _pixels(self, cameras: CameraGeometry, dtype: torch.dtype) -> Tensor:
-        """The frustum (…, D · h' · w', 3) as u, v, depth in images before their augmentation."""
-        pixels = self.frustum.to(dtype).flatten(0, 2)
-        if cameras.image_translation is not None:
-            pixels = pixels - cameras.image_translation.to(dtype)[..., None, :]
-        if cameras.image_rotation is not None:
-            pixels = pixels @ _inverse(cameras.image_rotation.to(dtype), cameras.valid).transpose(-1, -2)
-        return pixels
 
     def _splat(self, depth: Tensor, context: Tensor, cells: Tensor) -> Tensor:
         """Sum (M, D, h', w') · (M, C, h', w') of M = B · P · N cameras over the cells."""
@@ -255,14 +227,6 @@ def _frustum(config: LiftConfig) -> Tensor:
     depth = start + step * torch.arange(depths, dtype=u.dtype)
     frustum = torch.meshgrid(depth, v, u, indexing="ij")
     return torch.stack(frustum[::-1], -1)
-
-
-def _inverse(matrices: Tensor, valid: Tensor | None) -> Tensor:
-    """Inverses of (…, 3, 3); what a missing camera's matrix is does not matter."""
-    if valid is not None:
-        identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
-        matrices = torch.where(valid[..., None, None], matrices, identity)
-    return torch.linalg.inv(matrices)
 
 
 def _steps(name: str, axis: Axis) -> int:

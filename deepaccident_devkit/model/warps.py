@@ -81,23 +81,6 @@ def present_from_past(egomotion: Tensor, *, chain: Chain = "exact", bev_transfor
     return _augmented(stacked, bev_transform)
 
 
-def present_from_frames(egomotion: Tensor, *, bev_transform: Tensor | None = None) -> Tensor:
-    """Transforms of the present and each future frame to the present: C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹.
-
-    Args:
-        egomotion: (N, T, 6) rows `next_from_this` from the present on; the last one is not used.
-        bev_transform: (N, 4, 4) the BEV augmentation A of all frames; C becomes A · C · A⁻¹.
-
-    Returns:
-        (N, T, 4, 4); without augmentation the first is the identity.
-    """
-    this_from_next = torch.linalg.inv(matrices_from_six(egomotion)).unbind(1)
-    products = [torch.eye(4, dtype=egomotion.dtype, device=egomotion.device).expand(len(egomotion), 4, 4)]
-    for step in this_from_next[:-1]:
-        products.append(_product(products[-1], step))
-    return _augmented(torch.stack(products, 1), bev_transform)
-
-
 def _product(first: Tensor, second: Tensor) -> Tensor:
     return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
 

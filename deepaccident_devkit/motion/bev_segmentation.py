@@ -12,7 +12,6 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, IntArray, ShortRepr, readonly
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.release import BevImage
@@ -64,7 +63,6 @@ def bev_segmentation(
     sample: RowArgument,
     grid: BevGrid | None = None,
     *,
-    coverage: Mapping[str, float] | None = None,
     augmentation: Augmentation | None = None,
 ) -> BevSegmentation:
     """The segmentation targets of a sample on a grid of its ego frame.
@@ -73,34 +71,26 @@ def bev_segmentation(
         dataset: the release.
         sample: token or record.
         grid: cells, right-handed metres; None for ±50 m in cells of 0.5 m.
-        coverage: class → share of a cell in [0, 1) that it must cover; other classes are as in `COVERAGE`.
         augmentation: turns, scales or mirrors the ground as it does labels; None for no change.
 
     Raises:
         TokenError: no such sample.
-        ConfigError: a class in `coverage` does not exist, or its share is not in [0, 1).
         MissingFileError: the BEV camera's file was not downloaded (the test split has none).
         SensorFileError: the file cannot be read.
     """
-    return segmentation_of(dataset.load_bev(sample), grid or BevGrid(), coverage=coverage, augmentation=augmentation)
+    return segmentation_of(dataset.load_bev(sample), grid or BevGrid(), augmentation=augmentation)
 
 
 def segmentation_of(
     image: BevImage,
     grid: BevGrid,
     *,
-    coverage: Mapping[str, float] | None = None,
     augmentation: Augmentation | None = None,
 ) -> BevSegmentation:
     """The targets on a grid, from a BEV camera's array; arguments and errors as in `bev_segmentation`."""
-    given = coverage or {}
-    shares = {**COVERAGE, **{choice("coverage", name, BEV_CLASSES, error=ConfigError): given[name] for name in given}}
-    for name, share in shares.items():
-        if not 0 <= share < 1:
-            raise ConfigError(f"coverage: {name} is {share}; choose a share of a cell, at least 0 and below 1")
     index = _pixels_of_cells(grid, augmentation)
     tags = np.append(image.semantic.reshape(-1), np.uint8(0))[index]
-    needed = [max(1, math.ceil(shares[name] * index.shape[-1])) for name in BEV_CLASSES]
+    needed = [max(1, math.ceil(COVERAGE[name] * index.shape[-1])) for name in BEV_CLASSES]
     layers = [np.count_nonzero(tags == tag, axis=-1) >= pixels for tag, pixels in zip(_TAGS, needed, strict=True)]
     known: BoolArray = np.all(index < image.semantic.size, axis=-1)
     return BevSegmentation(grid=grid, masks=np.stack(layers), known=known)

@@ -64,8 +64,7 @@ def cluster_executor(address: str | None = None, scheduler_file: Path | None = N
 
     Raises:
         MissingExtraError: `distributed` or mpi4py is not installed.
-        WorkerError: no scheduler answers, or a worker lacks the devkit or has another version of it; or this is no MPI
-            program of several ranks.
+        WorkerError: no scheduler answers, or this is no MPI program of several ranks.
     """
     if address is None and scheduler_file is None:
         yield None
@@ -114,7 +113,8 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
             f"{place}: no dask scheduler answers ({said}); start one with `dask scheduler`, and give its address"
         ) from error
     with client:
-        _check_workers(client, place)
+        if not client.ncores():
+            logger.warning("%s: has no workers yet; waiting for them", place)
         yield client
 
 
@@ -128,20 +128,3 @@ def _made(kind: Any, **options: Any) -> Client:
             client.close(timeout=1)
         raise
     return client
-
-
-def _check_workers(client: Client, place: str) -> None:
-    """Raise WorkerError if one of those that are there lacks the devkit; one that comes later says so with its task."""
-
-    def version() -> str:  # sent as it is, and not by the name of its module, which may be missing there
-        from deepaccident_devkit import _version
-
-        return _version.__version__
-
-    found: dict[str, Any] = client.run(version, on_error="return")
-    if not found:
-        logger.warning("%s: has no workers yet; waiting for them", place)
-    for worker, answer in sorted(found.items()):
-        if answer != __version__:
-            told = f"has {_PACKAGE} {answer}" if isinstance(answer, str) else f"cannot import {_PACKAGE} ({answer})"
-            raise WorkerError(f"{place}: the worker {worker} {told}; install version {__version__} there")

@@ -89,9 +89,10 @@ def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, Any
         CalibError: it is damaged, lacks a key, holds an array of a wrong shape, NaN, a number beyond 1e9 or a transform
             that is not rigid, or asks for anything but numpy arrays to be made (nothing of such a file is run).
     """
+    file = read_unchecked_calib(path)
+    calibs = _converted([path], [file])
     if raw:
-        return read_calibs([path], raw=True)[0]
-    calibs = read_calibs([path])
+        return file
     return Calib(
         ego_from_lidar=SE3(calibs.ego_from_lidar[0]),
         world_from_ego=SE3(calibs.world_from_ego[0]),
@@ -100,18 +101,9 @@ def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, Any
     )
 
 
-@overload
-def read_calibs(paths: Sequence[ReleasePath], *, raw: Literal[False] = False) -> Calibs: ...
-@overload
-def read_calibs(paths: Sequence[ReleasePath], *, raw: Literal[True]) -> list[dict[str, AnyArray]]: ...
-def read_calibs(paths: Sequence[ReleasePath], *, raw: bool = False) -> Calibs | list[dict[str, AnyArray]]:
-    """The calibrations of several files as stacked arrays, or with `raw` as the files' own dicts.
-
-    Raises as `read_calib` does.
-    """
-    files = [read_unchecked_calib(path) for path in paths]
-    calibs = _converted(paths, files)
-    return files if raw else calibs
+def read_calibs(paths: Sequence[ReleasePath]) -> Calibs:
+    """The calibrations of several files as stacked arrays; raises as `read_calib` does."""
+    return _converted(paths, [read_unchecked_calib(path) for path in paths])
 
 
 def write_calib(path: Path, calib: Calib) -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, overload
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import MetaError
@@ -73,16 +72,8 @@ class Meta(ShortRepr):
         return self.simulated_frames - WARM_UP_FRAMES
 
 
-@overload
-def read_meta(path: ReleasePath, *, raw: Literal[False] = False) -> Meta: ...
-@overload
-def read_meta(path: ReleasePath, *, raw: Literal[True]) -> tuple[str, ...]: ...
-def read_meta(path: ReleasePath, *, raw: bool = False) -> Meta | tuple[str, ...]:
+def read_meta(path: ReleasePath) -> Meta:
     """What a meta file says.
-
-    Args:
-        path: the file.
-        raw: return its lines as they are, without line ends.
 
     Raises:
         MissingFileError: there is no such file.
@@ -90,8 +81,6 @@ def read_meta(path: ReleasePath, *, raw: bool = False) -> Meta | tuple[str, ...]
             no numbers.
     """
     lines = read_lines(path, "meta", MetaError)
-    if raw:
-        return tuple(lines)
     filled = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
     if not filled:
         raise MetaError(f"{path}:1: expected '{_FIRST_LINE}', found an empty file; {REMEDY}")

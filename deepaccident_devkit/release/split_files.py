@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, overload
 
 from deepaccident_devkit.errors import SplitFileError
 from deepaccident_devkit.files import write_bytes
@@ -11,18 +10,14 @@ from deepaccident_devkit.release._content import read_lines
 from deepaccident_devkit.release.store import ReleasePath
 
 
-@overload
-def read_split_file(path: ReleasePath, *, raw: Literal[False] = False, unique: bool = False) -> list[str]: ...
-@overload
-def read_split_file(path: ReleasePath, *, raw: Literal[True], unique: bool = False) -> list[tuple[str, ...]]: ...
-def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = False) -> list[str] | list[tuple[str, ...]]:
+def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = False) -> list[str]:
     """The scenarios of a split file, in its order, each once, as tokens `<scenario_type>/<scenario>`.
 
     Blank lines, blanks at line ends and CRLF are read.
 
     Args:
         path: the file.
-        raw: return the words of every non-blank line instead, repeated lines included.
+        raw: keep scenarios that stand in several lines as often.
         unique: a scenario in two lines is an error; if not set, it counts once.
 
     Raises:
@@ -39,9 +34,8 @@ def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = Fals
             )
     if unique:
         _check_unique(path, words)
-    if raw:
-        return [line_words for _, line_words in words]
-    return list(dict.fromkeys("/".join(line_words) for _, line_words in words))
+    tokens = ["/".join(line_words) for _, line_words in words]
+    return tokens if raw else list(dict.fromkeys(tokens))
 
 
 def write_split_file(path: Path, scenario_tokens: Sequence[str]) -> None:

@@ -12,8 +12,8 @@ What is not kept yet is computed in parallel.
 **Values.** One value, or a list, tuple or set of values, one of which must match; numpy's scalars count as Python's, an
 array is given as a list (`array.tolist()`). In words, case, `_`, `-` and blanks do not count. Numbers also as texts:
 `"40..60"` (both ends count; one may be left out), `">=50"`, `">50"`, `"<=50"`, `"<50"`. None, or the text `unknown` or
-`none`, stands for a value that is not known; no other value or range matches those. A function of the value stands for
-any test: `closing_speed=lambda speed: speed and speed > 10`. All filters of a call must hold.
+`none`, stands for a value that is not known; no other value or range matches those. All filters of a call must hold.
+For any other test, choose among the records: `[each for each in da.find(town="Town03") if each["num_frames"] % 2]`.
 
 **Texts.** A filter may also be written as one text, which is what `--where` takes: `town=Town03,Town05` (any of),
 `weather!=Clear` (all that `weather=Clear` leaves out, unknown ones too), `length=40..60,80`, `length>=50`. Blanks

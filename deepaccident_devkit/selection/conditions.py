@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,18 +15,17 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.selection.fields import Field, Value
 from deepaccident_devkit.text import possible_text
 
-FilterValue = Value | Collection[Value] | Callable[[Any], object]
-"""What a keyword of `find` takes: a value; several values, one of which must match; or a test of the value."""
+FilterValue = Value | Collection[Value]
+"""What a keyword of `find` takes: a value, or several values, one of which must match."""
 
 _TEXT = re.compile(r"\s*(\w+)\s*(!=|>=|<=|=|>|<)(.*)", re.DOTALL)
-_NUMBER = r"-?\d+(?:\.\d+)?"
+_NUMBER = r"-?\d{1,18}(?:\.\d{1,18})?"
 _RANGE = re.compile(rf"({_NUMBER})?\s*\.\.\s*({_NUMBER})?")
 _BOUND = re.compile(rf"(>=|<=|>|<)\s*({_NUMBER})")
 _UNKNOWN = ("unknown", "none")
 _FLAGS = {"true": True, "yes": True, "false": False, "no": False}
 _SINGLE = (str, bytes, bytearray, Mapping, np.ndarray)
 """Types that Python takes for collections and a filter does not; of these only a str can be a value."""
-_MOST_DIGITS = 18
 _LONGEST = 60
 """Characters of a wrong value that a message shows."""
 
@@ -99,7 +98,7 @@ def parse_where(text: str) -> Filter:
     return Filter(name, (f"{sign}{values[0]}",))
 
 
-def keyword_filter(name: str, value: Value | Collection[Value]) -> Filter:
+def keyword_filter(name: str, value: FilterValue) -> Filter:
     """The filter that a keyword of `find` stands for."""
     several = isinstance(value, Collection) and not isinstance(value, _SINGLE)
     return Filter(name, tuple(value) if several else (value,))  # type: ignore[arg-type]
@@ -183,12 +182,7 @@ def _number(field: Field, value: object) -> float:
 
 
 def _read_number(field: Field, digits: str) -> float:
-    """The number that a sign and digits stand for; Python itself reads no more than 4300 digits."""
-    if len(digits) > _MOST_DIGITS:
-        raise ChoiceError(
-            f"{field.name}: found a number of {len(digits)} characters, {_shown(digits)}; expected one of at most "
-            f"{_MOST_DIGITS}"
-        )
+    """The number that a sign and digits stand for."""
     if field.kind == "measure":
         return float(digits)
     if "." in digits:

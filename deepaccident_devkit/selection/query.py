@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.selection.conditions import Filter, FilterValue, condition_of, keyword_filter, parse_where
-from deepaccident_devkit.selection.fields import Field, field_of
+from deepaccident_devkit.selection.conditions import (
+    Condition,
+    Filter,
+    FilterValue,
+    condition_of,
+    keyword_filter,
+    parse_where,
+)
+from deepaccident_devkit.selection.fields import field_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-_Test = Callable[["ScenarioRecord"], object]
-_Choose = Callable[["list[ScenarioRecord]"], "list[ScenarioRecord]"]
 
-
-def find(dataset: Dataset, *where: str | _Test, **filters: FilterValue) -> list[ScenarioRecord]:
+def find(dataset: Dataset, *where: str, **filters: FilterValue) -> list[ScenarioRecord]:
     """The scenarios that meet all filters, in the order of the table; without filters all of them.
 
     Fields: every column of the scenario table (`town`, `weather`, `num_frames`, …); `collision` and what meta says of
@@ -27,10 +29,9 @@ def find(dataset: Dataset, *where: str | _Test, **filters: FilterValue) -> list[
 
     Args:
         dataset: the release.
-        where: filters as texts, as `--where` takes them: `town=Town03,Town05`, `weather!=Clear`, `length>=50`; or as
-            functions of a scenario's record.
+        where: filters as texts, as `--where` takes them: `town=Town03,Town05`, `weather!=Clear`, `length>=50`.
         filters: filters as keywords: field=value; a list, tuple or set for any of several; for numbers also `"40..60"`
-            and `">=50"`; None for unknown; or a function of the field's value, which is None where unknown.
+            and `">=50"`; None for unknown.
 
     Returns:
         Fresh records, the caller's own.
@@ -43,42 +44,22 @@ def find(dataset: Dataset, *where: str | _Test, **filters: FilterValue) -> list[
         >>> da.find(town=["Town03", "Town05"], collision=True, length="50..")  # doctest: +SKIP
         >>> da.find("closing_speed>=10", time_of_day="Night", accident_visibility="invisible")  # doctest: +SKIP
         >>> da.find(min_ttc="..1.5", collision=False)  # doctest: +SKIP
-        >>> da.find(lambda scenario: scenario["ego_direction"] == scenario["other_direction"])  # doctest: +SKIP
     """
     scenarios = dataset.scenario[:]
-    tests = [
-        (False, _those_for_which(each)) if callable(each) else _test(dataset, scenarios, parse_where(each))
-        for each in where
-    ]
-    tests += [
-        _reading(dataset, field_of(name), value)
-        if callable(value)
-        else _test(dataset, scenarios, keyword_filter(name, value))
-        for name, value in filters.items()
-    ]
-    for _, choose in sorted(tests, key=itemgetter(0)):  # costly ones last, on the few that are left
-        scenarios = choose(scenarios)
+    wanted = [*map(parse_where, where), *(keyword_filter(name, value) for name, value in filters.items())]
+    conditions = [_condition(dataset, scenarios, each) for each in wanted]
+    for condition in sorted(conditions, key=lambda each: each.field.costly):  # those last, on the few that are left
+        values = condition.field.values(dataset, scenarios)
+        scenarios = [scenario for scenario, value in zip(scenarios, values, strict=True) if condition.holds(value)]
     return scenarios
 
 
-def _those_for_which(test: _Test) -> _Choose:
-    return lambda scenarios: [scenario for scenario in scenarios if test(scenario)]
-
-
-def _test(dataset: Dataset, scenarios: list[ScenarioRecord], wanted: Filter) -> tuple[bool, _Choose]:
-    """Whether a filter is costly, and the choice of records that it comes to."""
+def _condition(dataset: Dataset, scenarios: list[ScenarioRecord], wanted: Filter) -> Condition:
+    """A filter, checked against its field and the words that this release has of it."""
     field = field_of(wanted.name)
     here: set[Any] = set()
     if field.kind == "word" and not field.costly:
         for scenario in scenarios:
             value = field.read(dataset, scenario)
             here.update(value if isinstance(value, tuple) else (value,))
-    return _reading(dataset, field, condition_of(wanted, field, here).holds)
-
-
-def _reading(dataset: Dataset, field: Field, holds: Callable[[Any], object]) -> tuple[bool, _Choose]:
-    def choose(scenarios: list[ScenarioRecord]) -> list[ScenarioRecord]:
-        values = field.values(dataset, scenarios)
-        return [scenario for scenario, value in zip(scenarios, values, strict=True) if holds(value)]
-
-    return field.costly, choose
+    return condition_of(wanted, field, here)

@@ -1,8 +1,7 @@
 """Road users: what they are made of, who they are and where they are at any time, in the ground frame."""
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,46 +16,11 @@ _SLACK = 1e-9
 """Seconds: a time may be this far before the first sample or after the last one and still counts as inside."""
 
 
-class Motion(Protocol):
-    """Where something is at any time; times are seconds since the first recorded frame."""
-
-    def poses(self, times: ArrayLike) -> FloatArray:
-        """(T, 3) x, y (metres), yaw (radians) of the box's centre in the ground frame at times (T,)."""
-        ...
-
-    def velocities(self, times: ArrayLike) -> FloatArray:
-        """(T, 2) m/s in the ground frame at times (T,)."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Uniform:
-    """A motion straight on at a constant speed (speed 0: standing still).
-
-    Attributes:
-        x: position at time 0, metres.
-        y: position at time 0, metres.
-        yaw: radians.
-        speed: m/s.
-    """
-
-    x: float
-    y: float
-    yaw: float
-    speed: float = 0.0
-
-    def poses(self, times: ArrayLike) -> FloatArray:
-        """See `Motion`."""
-        return _along(self.x, self.y, self.yaw, self.speed * np.asarray(times, dtype=np.float64))
-
-    def velocities(self, times: ArrayLike) -> FloatArray:
-        """See `Motion`."""
-        return _directed(self.yaw, np.full(np.shape(times), self.speed))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sampled(FrozenArrays):
-    """A simulated motion: straight lines between samples; it stands still before the first and after the last one.
+class Motion(FrozenArrays):
+    """Where something is at any time: straight lines between samples; before the first and after the last it stands.
+
+    Times are seconds since the first recorded frame. Several with the same times can be in one, M of them.
 
     Attributes:
         start: time of the first sample, seconds.
@@ -71,11 +35,11 @@ class Sampled(FrozenArrays):
     sample_velocities: FloatArray
 
     def poses(self, times: ArrayLike) -> FloatArray:
-        """See `Motion`."""
+        """(T, 3) x, y (metres), yaw (radians) of the box's centre at times (T,); (T, M, 3) for M."""
         return self._between(self.samples, np.asarray(times, dtype=np.float64))
 
     def velocities(self, times: ArrayLike) -> FloatArray:
-        """See `Motion`."""
+        """(T, 2) m/s in the ground frame at times (T,); (T, M, 2) for M actors."""
         wanted = np.asarray(times, dtype=np.float64)
         end = self.start + self.period * (len(self.samples) - 1)
         inside = (wanted >= self.start - _SLACK) & (wanted <= end + _SLACK)
@@ -194,35 +158,22 @@ def _together(motions: Sequence[Motion]) -> tuple[tuple[list[int], Motion], ...]
     """The motions, grouped as in `Actors.motions`."""
     rows_of: dict[Hashable, list[int]] = {}
     for row, motion in enumerate(motions):
-        times = (motion.start, motion.period, len(motion.samples)) if isinstance(motion, Sampled) else row
-        rows_of.setdefault(times, []).append(row)
+        rows_of.setdefault((motion.start, motion.period, len(motion.samples)), []).append(row)
     return tuple((rows, _joined([motions[row] for row in rows])) for rows in rows_of.values())
 
 
 def _joined(motions: Sequence[Motion]) -> Motion:
-    """One motion made of several with the same times; a single motion stays as it is."""
-    sampled = [motion for motion in motions if isinstance(motion, Sampled)]
-    if not sampled:
-        return motions[0]
-    return Sampled(
-        start=sampled[0].start,
-        period=sampled[0].period,
-        samples=np.stack([motion.samples for motion in sampled], axis=1),
-        sample_velocities=np.stack([motion.sample_velocities for motion in sampled], axis=1),
+    """One motion made of several with the same times."""
+    return replace(
+        motions[0],
+        samples=np.stack([motion.samples for motion in motions], axis=1),
+        sample_velocities=np.stack([motion.sample_velocities for motion in motions], axis=1),
     )
 
 
 def _over(weights: AnyArray, values: FloatArray) -> AnyArray:
     """Weights (T,) of the first axis of values (T, …), shaped to be multiplied with them."""
     return weights.reshape(weights.shape + (1,) * (values.ndim - weights.ndim))
-
-
-def _along(x: float, y: float, yaw: float, distance: FloatArray) -> FloatArray:
-    return np.stack([x + np.cos(yaw) * distance, y + np.sin(yaw) * distance, np.full(distance.shape, yaw)], axis=-1)
-
-
-def _directed(yaw: float, speed: FloatArray) -> FloatArray:
-    return np.stack([np.cos(yaw) * speed, np.sin(yaw) * speed], axis=-1)
 
 
 Size = tuple[float, float, float]

@@ -30,8 +30,7 @@ class SynthConfig:
     Attributes:
         scenarios: how many; they alternate between an accident and its normal twin.
         frames: recorded frames of each scenario, at 10 Hz: the last ones before its end. None records from the moment
-            when the cars set off to the end, 40 to 100 frames; a normal one up to 200, if `end.time` of its file says
-            so.
+            when the cars set off to the end, 40 to 100 frames.
         image_size: width and height of the camera images, pixels; None for 480×270, or 1600×900 with
             `for_released_code`. The real images have 1600×900. The released code assumes this size: with another
             one it computes wrong camera geometry.
@@ -109,22 +108,17 @@ class SynthConfig:
 
     def _check_for_released_code(self) -> None:
         """Refuse what the released code cannot read, or reads wrongly."""
-        remedy = "leave one of the two out"
-        if self.pixels != RELEASED_IMAGE_SIZE:
-            real, found = ("{}x{}".format(*size) for size in (RELEASED_IMAGE_SIZE, self.pixels))
-            raise ConfigError(
-                f"image_size, for_released_code: the released code expects images of {real}, found {found}; {remedy}"
-            )
-        if self.layout != "A":
-            raise ConfigError(
-                "layout, for_released_code: the released code looks for all splits in one folder, layout A, found "
-                f"{self.layout}; {remedy}"
-            )
-        if self.unlabelled_test:
-            raise ConfigError(
-                "unlabelled_test, for_released_code: the released converter finds the frames of each split by their "
-                f"labels, those of test too; {remedy}"
-            )
+        needed = {
+            "image_size": (RELEASED_IMAGE_SIZE, self.pixels),
+            "layout": ("A", self.layout),
+            "unlabelled_test": (False, self.unlabelled_test),
+        }
+        for name, (wanted, found) in needed.items():
+            if found != wanted:
+                raise ConfigError(
+                    f"{name}, for_released_code: the released code needs {wanted}, found {found} (docs/synth.md says "
+                    "why); leave one of the two out"
+                )
 
 
 def _check_range(name: str, value: int, least: int, most: int | None) -> None:

@@ -214,25 +214,21 @@ def make_release(
             configuration is there; the scenario file cannot be read or simulated; or something cannot be written.
         OutputFolderError: a link in the hidden folder leads out of it; nothing is written there.
         ChoiceError: `workers` is less than 1.
-        MissingExtraError: files of sensors are wanted and the package embreex is not installed.
+        MissingExtraError: the package embreex is not installed.
         SomeFailedError: some parts cannot be recorded; the others are, and the same call continues.
         WorkerError: a worker was killed, or cannot do the work.
     """
     wanted = config or SynthConfig()
     out = path_of(out)
     check_free(out)
-    if wanted.sensors != "none":
-        require_embree()
+    require_embree()
     plans = plan_scenarios(wanted)
     if not is_writable_folder(out.parent):
         raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
     unfinished = Unfinished(out.absolute())
     with unfinished_release(unfinished, wanted) as alone:
         count = workers or _worker_count(wanted, len(plans))
-        draws = progress is True and count == 1 and executor is None
-        parts = {
-            name: part for plan in plans for name, part in _parts(unfinished, wanted, plan, progress=draws).items()
-        }
+        parts = {name: part for plan in plans for name, part in _parts(unfinished, wanted, plan).items()}
         places = Places(writes=(unfinished.folder,))
         how: dict[str, Any] = {"workers": count, "executor": executor, "progress": progress}
         try:
@@ -259,14 +255,12 @@ class _Part:
     job: RecordingJob
 
 
-def _parts(
-    unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan, *, progress: bool = False
-) -> dict[str, _Part]:
-    """The parts of a scenario by their names; `progress` shows the draws, where no other process writes too."""
+def _parts(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, _Part]:
+    """The parts of a scenario by their names."""
     parts = parts_of(config)
     names = {first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)}
     return {
-        name: _Part(unfinished, name, RecordingJob(unfinished.part(name), config, plan, first, parts, progress))
+        name: _Part(unfinished, name, RecordingJob(unfinished.part(name), config, plan, first, parts))
         for first, name in names.items()
     }
 

@@ -10,7 +10,7 @@ import numpy as np
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.splits import Splits, split_records
 from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.spec import DESIGNS, ScenarioSpec, SpecTemplate, View, draw, read_spec
+from deepaccident_devkit.synth.spec import ScenarioSpec, SpecTemplate, View, draw, read_design, read_spec
 from deepaccident_devkit.tables.records import ScenarioRecord
 from deepaccident_devkit.taxonomy import ROAD_TYPES, SPLITS, TOWNS
 
@@ -56,14 +56,9 @@ class ScenarioPlan:
         return self.template.design
 
     @property
-    def subtype(self) -> int:
-        """1, signalised, or 2."""
-        return self.traits.subtype
-
-    @property
     def scenario_type(self) -> str:
         """Such as `type1_subtype1_accident`."""
-        return f"type1_subtype{self.subtype}_{'accident' if self.accident else 'normal'}"
+        return f"type1_subtype{self.traits.subtype}_{'accident' if self.accident else 'normal'}"
 
     @property
     def token(self) -> str:
@@ -122,7 +117,7 @@ def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
     for number in range(config.scenarios):
         pair, second = divmod(number, 2) if twins else (number, 1)
         designs = config.design_round
-        template = own or DESIGNS[designs[pair % len(designs)]]
+        template = own or read_design(designs[pair % len(designs)])
         plans.append(_plan(config, pair, template, accident=second == 0))
     split_of = {
         token: name for name, tokens in plan_splits(plans).by_name().items() if name in SPLITS for token in tokens

@@ -45,7 +45,6 @@ class RecordingJob:
         plan: which scenario it is.
         first: the first frame, counted from 1.
         step: from each frame to the next one.
-        progress: whether to show the number of draws.
     """
 
     root: Path
@@ -53,7 +52,6 @@ class RecordingJob:
     plan: ScenarioPlan
     first: int = 1
     step: int = 1
-    progress: bool = False
 
     @property
     def folder(self) -> ScenarioFolder:
@@ -70,7 +68,7 @@ def parts_of(config: SynthConfig) -> int:
 def record_scenario(job: RecordingJob) -> None:
     """Make a scenario and write all its files, or those of a part of it."""
     _share_cores()
-    scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan, job.progress))
+    scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled)
     if labelled and job.first == 1:
@@ -98,18 +96,17 @@ class _Task:
 
     config: SynthConfig
     plan: ScenarioPlan = field(hash=False)
-    progress: bool = field(compare=False)
 
 
 def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
     """A scenario and its sensors."""
     config, plan = task.config, task.plan
-    scenario = build_scenario(config, plan, progress=task.progress)
+    scenario = build_scenario(config, plan)
     rig = make_rig(
         scenario.world,
         scenario.actors,
         scenario.agents,
-        sky=(scenario.weather, scenario.time_of_day),
+        sky=(scenario.spec.weather, scenario.spec.time_of_day),
         image_size=config.pixels,
         seed=(config.seed, plan.pair, int(plan.accident)),
         sensors=cast(Sensors, config.sensors),  # never True or False once the configuration is made

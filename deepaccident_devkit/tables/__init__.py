@@ -4,11 +4,8 @@ from deepaccident_devkit.tables.boxes import visible_ids, visible_mask
 from deepaccident_devkit.tables.findings import SEVERITIES, Finding, Severity
 from deepaccident_devkit.tables.index import (
     Index,
-    IndexInfo,
-    IndexReport,
     Problem,
     clear_index,
-    index_report,
     open_index,
     place_outside,
 )
@@ -20,8 +17,6 @@ __all__ = [
     "SEVERITIES",
     "Finding",
     "Index",
-    "IndexInfo",
-    "IndexReport",
     "OpenTables",
     "Problem",
     "RowArgument",
@@ -30,7 +25,6 @@ __all__ = [
     "Tables",
     "clear_index",
     "displacement_velocities",
-    "index_report",
     "open_index",
     "place_outside",
     "table_names",

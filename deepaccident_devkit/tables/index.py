@@ -22,7 +22,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError, VersionError
@@ -36,14 +36,13 @@ from deepaccident_devkit.files import (
 )
 from deepaccident_devkit.parallel import Engine, Places, Store
 from deepaccident_devkit.reading import RefusedFileError, fault_text, file_checksum, limit_of, read_bytes
-from deepaccident_devkit.release import ReleaseLayout, find_release
-from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in, open_dataroot, places_of
-from deepaccident_devkit.reports import Report
+from deepaccident_devkit.release import ReleaseLayout
+from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in, places_of
 from deepaccident_devkit.tables.indexing import SCHEMA_VERSION, Outcome, index_scenario, join_tables
 from deepaccident_devkit.tables.records import table_specs
 from deepaccident_devkit.tables.scan import contents_digest, folder_digest
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
-from deepaccident_devkit.tables.store import StoredTable, table_path
+from deepaccident_devkit.tables.store import table_path
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
 from deepaccident_devkit.text import choice
 
@@ -440,113 +439,3 @@ def _remove(store: Store) -> None:
         store.remove()
     except OSError as error:
         raise IndexStoreError(f"{store.folder}: cannot be removed ({error})") from error
-
-
-IndexState = Literal["up to date", "out of date", "unfinished", "another devkit's", "no release"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IndexInfo(ShortRepr):
-    """An index on disk.
-
-    Attributes:
-        folder: where it lies.
-        version: of the release.
-        state: `up to date`; `out of date` and `unfinished` are remade when the release is opened, `another devkit's`
-            too if that is older; `no release`: the dataroot has none of this version.
-        total_bytes: size of the whole folder.
-        tables: table → rows; empty where they cannot be read.
-        left_out: broken scenario → what is wrong with it.
-        notices: what else was left aside.
-    """
-
-    folder: str
-    version: str
-    state: IndexState
-    total_bytes: int
-    tables: Mapping[str, int]
-    left_out: Mapping[str, Sequence[str]]
-    notices: Sequence[str]
-
-    def to_text(self) -> str:
-        """Some lines for a terminal."""
-        lines = [
-            f"{self.folder}: {self.state}",
-            f"  release {self.version}, {self.total_bytes / 1e6:,.1f} MB, {len(self.left_out)} scenarios left out",
-            *(f"  {name:<20}{rows:>14,} rows" for name, rows in self.tables.items()),
-        ]
-        for token, messages in self.left_out.items():
-            lines += [f"  left out: {token}", *_first_lines(messages)]
-        return "\n".join([*lines, *(f"  {notice}" for notice in self.notices)])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IndexReport(Report):
-    """The indexes of one dataroot.
-
-    Attributes:
-        dataroot: the release's folder.
-        indexes: the first choice first.
-        looked_in: the folders where one could be.
-    """
-
-    dataroot: str
-    indexes: Sequence[IndexInfo]
-    looked_in: Sequence[str]
-
-    def to_text(self) -> str:
-        """Some lines an index for a terminal."""
-        none = "\n".join([f"{self.dataroot}: no index; looked in", *(f"  {folder}" for folder in self.looked_in)])
-        return "\n\n".join(info.to_text() for info in self.indexes) or none
-
-
-def index_report(dataroot: Dataroot, *, version: str | None = None, index_dir: Path | None = None) -> IndexReport:
-    """Look at the indexes of a dataroot, in its own folder and in the user's cache; changes none.
-
-    Args:
-        dataroot: the release, as of `DeepAccident`.
-        version: whose indexes; None looks for every version's.
-        index_dir: the only place to look in, where given.
-
-    Raises:
-        DatarootError: the folder is missing, or holds neither a release nor an index.
-        VersionError: the version is unknown.
-    """
-    infos: list[IndexInfo] = []
-    looked_in: list[str] = []
-    faults: list[DatarootError | VersionError] = []
-    versions = VERSIONS if version is None else (version,)
-    for each in versions:
-        layout = None
-        try:
-            layout = find_release(open_dataroot(dataroot, index_dir), each)
-        except (DatarootError, VersionError) as error:
-            faults.append(error)
-        folders = list(index_folders(dataroot, each, index_dir))
-        looked_in += map(str, folders)
-        infos += [_info(folder, each, layout) for folder in folders if _holds_index(folder)]
-    if not infos and len(faults) == len(versions):
-        raise faults[0]
-    return IndexReport(dataroot=str(dataroot), indexes=infos, looked_in=looked_in)
-
-
-def _info(folder: Path, version: str, layout: ReleaseLayout | None) -> IndexInfo:
-    index = Index.read(folder)
-    state: IndexState = "no release"
-    if index is None:
-        state = "unfinished" if _schema_version(folder) in (None, SCHEMA_VERSION) else "another devkit's"
-    elif layout is not None:
-        state = "up to date" if index.is_current(layout, _fingerprint(layout)) else "out of date"
-    rows = {}
-    if index and index.tables:
-        with suppress(IndexStoreError):
-            rows = {name: StoredTable(index.tables_folder, spec).num_rows for name, spec in table_specs().items()}
-    return IndexInfo(
-        folder=str(folder),
-        version=version,
-        state=state,
-        total_bytes=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
-        tables=rows,
-        left_out={problem.scenario: problem.messages for problem in index.problems} if index else {},
-        notices=index.notices if index else (),
-    )

@@ -45,10 +45,9 @@ class Contact(FrozenArrays):
             touch or overlap, along the normal of the sides that meet); negative if they part; NaN if unknown.
         impact_angle: angle between their headings, in [0, π]: 0 the same direction, π head-on.
         sides: the side of each that faces the other across the widest gap along any side's normal (the least overlap).
-        agrees: whether the meta file agrees with the recording: `disagreements` is empty.
-        disagreements: each contradiction in words: a gap of more than 1.5 m, other classes or other agents than in the
-            meta file, an end before the last frame, or a contact side in the meta file that is neither of the two
-            sides.
+        disagreements: each contradiction of the meta file and the recording in words: a gap of more than 1.5 m, other
+            classes or other agents than in the meta file, an end before the last frame, or a contact side in the meta
+            file that is neither of the two sides.
     """
 
     instances: tuple[str, str]
@@ -61,11 +60,6 @@ class Contact(FrozenArrays):
     impact_angle: float
     sides: tuple[ContactSide, ContactSide]
     disagreements: tuple[str, ...]
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the meta file agrees with the recording."""
-        return not self.disagreements
 
     def __repr__(self) -> str:
         """Who, where, how fast: in one line."""

@@ -6,7 +6,7 @@ import hashlib
 import math
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Final, Literal, get_args
+from typing import Final
 
 import numpy as np
 
@@ -14,9 +14,7 @@ from deepaccident_devkit.arrays import FloatArray, checked_number, checked_whole
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import choice
 
-NoiseLaw = Literal["paper", "zero-mean"]
 _NORMAL: Final = NormalDist()
 _LONGEST: Final = 20.0
 """Seconds: no scenario is longer, so a longer latency is in milliseconds."""
@@ -28,22 +26,18 @@ _FRAME_TOLERANCE: Final = 1e-6
 class PoseNoise:
     """The error of a partner's own pose: one draw for each partner and frame.
 
-    The law `paper`: the error of the position is a distance from a normal distribution of `mean` and `std`. The paper
-    studies means of 0.1 to 0.5 m with σ = 0.02 m and does not name the direction; ours is horizontal and uniform over
-    all directions. The law `zero-mean`: x and y of the world each have a normal error of mean 0 and deviation `std`,
-    as in other V2X studies; its `mean` must be 0.
+    The error of the position is a distance from a normal distribution of `mean` and `std`. The paper studies means of
+    0.1 to 0.5 m with σ = 0.02 m and does not name the direction; ours is horizontal and uniform over all directions.
 
     Attributes:
         mean: metres.
         std: standard deviation, metres.
         heading_std: standard deviation of the heading about the vertical, radians; its mean is 0.
-        law: `paper` or `zero-mean`.
     """
 
     mean: float = 0.0
     std: float = 0.02
     heading_std: float = 0.0
-    law: NoiseLaw = "paper"
 
     def __post_init__(self) -> None:
         """Check the numbers; raises ConfigError."""
@@ -58,18 +52,12 @@ class PoseNoise:
                 f"pose noise: heading_std is {self.heading_std:g} radians, over half a turn; if these are degrees, "
                 f"give {radians:.4g}"
             )
-        object.__setattr__(self, "law", choice("pose noise: law", self.law, get_args(NoiseLaw), error=ConfigError))
-        if self.law == "zero-mean" and self.mean:
-            raise ConfigError(f"pose noise: the law zero-mean takes no mean, found {self.mean}; give std alone")
 
     def draw(self, key: str) -> tuple[float, float, float]:
         """The error of one partner at one frame: x and y in world, metres, and heading, radians; `key` decides it."""
-        turn, distance, sideways, heading = uniforms(f"{key}/pose")
-        about = self.heading_std * _NORMAL.inv_cdf(heading)
-        if self.law == "zero-mean":
-            return self.std * _NORMAL.inv_cdf(distance), self.std * _NORMAL.inv_cdf(sideways), about
+        turn, distance, _, heading = uniforms(f"{key}/pose")
         off, direction = self.mean + self.std * _NORMAL.inv_cdf(distance), 2 * math.pi * turn
-        return off * math.cos(direction), off * math.sin(direction), about
+        return off * math.cos(direction), off * math.sin(direction), self.heading_std * _NORMAL.inv_cdf(heading)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

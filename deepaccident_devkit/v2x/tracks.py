@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_floats
+from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
@@ -27,7 +27,7 @@ class Trajectory(FrozenArrays):
         size: (T, 3) float64, length, width, height, metres.
         velocity: (T, 3) float64, m/s over the ground, NaN if unknown.
         agents: (T,) uint8, bit masks over `taxonomy.AGENTS`: who annotated it.
-        present: frame number of the given sample; None without one.
+        present: frame number of the given sample, before which is the past; None without one.
     """
 
     instance: str
@@ -54,25 +54,6 @@ class Trajectory(FrozenArrays):
         """(T,) heading about z of `frame`, radians in (−π, π]."""
         return quaternions.yaw_of(self.rotation)
 
-    @property
-    def past(self) -> Trajectory:
-        """The moments before the present; raises ChoiceError if there is no present."""
-        return self._part(self.index < self._present())
-
-    @property
-    def future(self) -> Trajectory:
-        """The moments after the present; raises ChoiceError if there is no present."""
-        return self._part(self.index > self._present())
-
-    def _present(self) -> int:
-        if self.present is None:
-            raise ChoiceError("past and future: this trajectory has no present; ask for it with sample=")
-        return self.present
-
-    def _part(self, which: BoolArray) -> Trajectory:
-        columns = {name: getattr(self, name)[which] for name in (*_MOVED, "size", "index", "agents")}
-        return Trajectory(instance=self.instance, frame=self.frame, present=self.present, **columns)
-
 
 def trajectory(
     dataset: Dataset, instance: RowArgument, sample: RowArgument | None = None, frame: str = "world"
@@ -82,8 +63,7 @@ def trajectory(
     Args:
         dataset: the release.
         instance: token or record.
-        sample: token or record of the present: it divides past from future, and `frame` is one of its coordinate
-            frames.
+        sample: token or record of the present; `frame` is one of its coordinate frames.
         frame: `world`, or `ego`, `lidar` or a channel of `sample`, always as it is at that sample.
 
     Raises:

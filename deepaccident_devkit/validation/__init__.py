@@ -4,8 +4,7 @@ from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.velocities import VelocityFit
 from deepaccident_devkit.validation.checks import ScenarioCheck
 from deepaccident_devkit.validation.codes import CODES
-from deepaccident_devkit.validation.completeness import release_completeness
-from deepaccident_devkit.validation.completeness_report import Completeness, FileCount, LackingScenario, SplitFiles
+from deepaccident_devkit.validation.completeness import Completeness, FileCount, SplitFiles, release_completeness
 from deepaccident_devkit.validation.validate import ValidationReport, findings, validate_release
 
 __all__ = [
@@ -13,7 +12,6 @@ __all__ = [
     "Completeness",
     "FileCount",
     "Finding",
-    "LackingScenario",
     "ScenarioCheck",
     "SplitFiles",
     "ValidationReport",

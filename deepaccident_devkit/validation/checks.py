@@ -15,6 +15,7 @@ from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.scan import times_digest
 from deepaccident_devkit.tables.velocities import VelocityFit, total_fit
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
+from deepaccident_devkit.validation.completeness import FileCount
 
 NO_FIT = total_fit([])
 
@@ -27,12 +28,14 @@ class ScenarioCheck:
         token: the scenario's.
         findings: in the order of the checks.
         samples: agents times frames.
+        files: how many are here and missing.
         velocity: what the labels' velocities fit.
     """
 
     token: str
     findings: tuple[Finding, ...]
     samples: int
+    files: tuple[FileCount, ...]
     velocity: VelocityFit = NO_FIT
 
     def to_json(self) -> str:
@@ -47,6 +50,7 @@ class ScenarioCheck:
             token=stored["token"],
             findings=tuple(Finding(**each) for each in stored["findings"]),
             samples=stored["samples"],
+            files=tuple(FileCount(**each) for each in stored["files"]),
             velocity=VelocityFit(**stored["velocity"]),
         )
 

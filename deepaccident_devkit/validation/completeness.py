@@ -3,70 +3,129 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.errors import ReleaseError, TokenError
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release, read_split_file
-from deepaccident_devkit.release.layout import frame_sizes, names_without_calib
-from deepaccident_devkit.release.store import Dataroot, ReleasePath, open_dataroot, places_of
+from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
+from deepaccident_devkit.release.layout import frame_sizes
+from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of
+from deepaccident_devkit.reports import Report
 from deepaccident_devkit.tables.scan import ENDINGS
 from deepaccident_devkit.tables.split_assignment import assign_splits
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
+    CAMERAS,
     CHANNEL_FORMAT,
-    CHANNELS,
     EXPECTED_MINI_SCENARIOS,
     EXPECTED_SCENARIOS,
+    LIDAR,
     SPLITS,
 )
-from deepaccident_devkit.validation.completeness_report import (
-    Completeness,
-    FileCount,
-    LackingScenario,
-    SplitFiles,
-    summed,
-)
+from deepaccident_devkit.text import columns_text, counted, size_text
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from deepaccident_devkit.parallel import Engine
 
-_META = "meta"
-_KINDS = ("calib", "label", *CHANNELS)
-"""The kinds of files that an agent has."""
-_NOT_IN_TEST = ("label", BEV_CAMERA, _META)
+_META: Final = "meta"
+_NOT_IN_TEST: Final = ("label", BEV_CAMERA, _META)
 """Kinds that the test split ships without."""
-_UNKNOWN_SPLIT = "unknown"
-_Part = tuple[str | None, str]
-"""Agent and kind of file; no agent and `meta`."""
+_UNKNOWN_SPLIT: Final = "unknown"
+_LISTED: Final = 10
+"""Scenarios that the text lists at most."""
+_COLUMNS: Final = {
+    "calib": ("calib",),
+    "label": ("label",),
+    f"{len(CAMERAS)} cameras": CAMERAS,
+    LIDAR: (LIDAR,),
+    BEV_CAMERA: (BEV_CAMERA,),
+}
+"""Of the text's tables: heading → kinds of files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _FilesHere:
-    """What is here of one scenario.
+class FileCount:
+    """Files of one kind of one agent, or `meta` files, in one or several scenarios.
 
     Attributes:
-        frames: the highest number of any agent's calib and label files.
-        sizes: agent and kind → number and bytes of the files of these frames that have any bytes; of `meta` as well.
+        agent: the agent's name; None for `meta`, of which a scenario has one.
+        channel: `calib`, `label`, a sensor's channel, or `meta`.
+        expected: one a frame of every scenario.
+        missing: those of them that are not here, or have no bytes.
+        bytes: of the files that are here.
     """
 
-    frames: int
-    sizes: Mapping[_Part, tuple[int, int]]
+    agent: str | None
+    channel: str
+    expected: int
+    missing: int
+    bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class _Counted:
-    """A scenario and its split with the counts of all its files, agent by agent, then `meta`."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitFiles:
+    """What is here of the scenarios of a split.
 
-    folder: ScenarioFolder
-    split: str
-    counts: Sequence[FileCount]
+    Attributes:
+        scenarios: how many are here, in part or whole.
+        whole: those of them that lack nothing.
+        expected: scenarios of the split in the whole release; None for a selection, and for unknown splits.
+        files: for every agent and kind of file, then for `meta`.
+    """
+
+    scenarios: int
+    whole: int
+    expected: int | None
+    files: Sequence[FileCount]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Completeness(Report):
+    """Which files of a release are here, and which are missing.
+
+    Attributes:
+        dataroot: its folder.
+        version: `v1` or `v1-mini`.
+        scenarios: how many are here, in part or whole, and have a calib or label file, by which frames are counted.
+        whole: those of them that lack nothing.
+        total: the files of all of them; its agent is None, its channel `all`.
+        splits: split → what is here of it; `unknown` for scenarios of no known split. The mini release is one split.
+        lacking: scenario that is not whole → kind of file → how many are missing, of all agents.
+    """
+
+    dataroot: str
+    version: str
+    scenarios: int
+    whole: int
+    total: FileCount
+    splits: Mapping[str, SplitFiles]
+    lacking: Mapping[str, Mapping[str, int]]
+
+    def to_text(self) -> str:
+        """Blocks for a terminal: each split, then the first scenarios that lack something."""
+        return f"DeepAccident {self.version} at {self.dataroot}\n{self.section()}"
+
+    def section(self) -> str:
+        """The same without the release's name, as a part of another report."""
+        total, here = self.total, self.total.expected - self.total.missing
+        head = (
+            f"{counted(self.scenarios, 'scenario')} here, {self.whole:,} of them whole\n"
+            f"{here:,} of their {total.expected:,} files are here ({size_text(total.bytes)}), "
+            f"{total.missing:,} are missing"
+        )
+        blocks = [head, *(_split_text(name, split) for name, split in self.splits.items())]
+        if self.lacking:
+            lines = [f"  {token}: {sum(kinds.values()):,}" for token, kinds in self.lacking.items()]
+            more = [f"  … and {len(lines) - _LISTED:,} more (--json lists all)"] if len(lines) > _LISTED else []
+            heading = f"scenarios that lack files, and how many ({len(lines):,}):"
+            blocks.append("\n".join([heading, *lines[:_LISTED], *more]))
+        return "\n\n".join(blocks)
 
 
 def release_completeness(
@@ -79,7 +138,8 @@ def release_completeness(
     """Count which files are here and which are missing, by split, agent and channel.
 
     Every agent is expected to have a file of every kind for each frame of a scenario, which its calib and label files
-    number; the test split has no label, BEV camera and meta files. Broken scenarios count, too.
+    number; the test split has no label, BEV camera and meta files. Broken scenarios count, too. A folder that cannot be
+    listed counts as empty; `validate_release` names it.
 
     Args:
         root: the release, as of `DeepAccident`: a folder, archives, or a URL.
@@ -94,44 +154,10 @@ def release_completeness(
         TokenError: one of `scenarios` is not there.
     """
     layout = find_release(open_dataroot(root), version)
-    return completeness(layout, scenarios, str(root), **how)
-
-
-def completeness(
-    layout: ReleaseLayout,
-    scenarios: Collection[str] | None,
-    dataroot: str,
-    *,
-    lenient: bool = False,
-    **how: Unpack[Engine],
-) -> Completeness:
-    """What `release_completeness` gives of a release that was found; what cannot be listed may count as missing.
-
-    Args:
-        layout: the release, with the split files to read.
-        scenarios: tokens of the scenarios to look at; None for all.
-        dataroot: its name.
-        lenient: whether a folder that cannot be listed counts as empty.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
-    """
     folders = chosen_scenarios(layout, scenarios)
-    listing = partial(_files_here, lenient=lenient)
-    files = run_batch(listing, folders, label="listing files", places=Places(reads=places_of(layout.root)), **how)
-    counted = _count_all(layout, {folder: here for folder, here in zip(folders, files, strict=True) if here.frames})
-    lacking = [_lacking(each) for each in counted if any(count.missing for count in each.counts)]
-    strays = [] if scenarios is not None else _without_calib(layout, counted)
-    return Completeness(
-        dataroot=dataroot,
-        version=layout.version,
-        selected=scenarios is not None,
-        scenarios=len(counted),
-        whole=len(counted) - len(lacking),
-        total=summed((count for each in counted for count in each.counts), "all"),
-        splits=_splits(layout.version, counted, lacking, selected=scenarios is not None),
-        lacking=lacking,
-        not_here={} if scenarios is not None else _not_here(layout, strays),
-        without_calib=strays,
-    )
+    files = run_batch(files_of, folders, label="listing files", places=Places(reads=places_of(layout.root)), **how)
+    tokens = [folder.token for folder in folders]
+    return completeness(layout, zip(tokens, files, strict=True), str(root), selected=scenarios is not None)
 
 
 def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
@@ -145,123 +171,111 @@ def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -
     return chosen
 
 
-def _files_here(scenario: ScenarioFolder, *, lenient: bool) -> _FilesHere:
-    endings = {**ENDINGS, **CHANNEL_FORMAT}
-    found = {
-        (agent, kind): _sizes(scenario.kind_folder(agent, kind), endings[kind], lenient=lenient)
-        for agent in AGENTS
-        for kind in _KINDS
-    }
+def files_of(scenario: ScenarioFolder) -> tuple[FileCount, ...]:
+    """The files of a scenario, agent by agent, then `meta`; none if neither calib nor labels number a frame."""
+    found: dict[tuple[str, str], Mapping[int, int]] = {}
+    for agent in AGENTS:
+        for kind, ending in {**ENDINGS, **CHANNEL_FORMAT}.items():
+            found[agent, kind] = {}
+            with suppress(ReleaseError):  # a finding of its own
+                found[agent, kind] = frame_sizes(scenario.kind_folder(agent, kind), ending)
     frames = max((frame for (_, kind), sizes in found.items() if kind in ENDINGS for frame in sizes), default=0)
-    sizes: dict[_Part, tuple[int, int]] = {}
-    for part, of_frames in found.items():
-        filled = [size for frame, size in of_frames.items() if size and frame <= frames]
-        sizes[part] = len(filled), sum(filled)
-    try:
+    if not frames:
+        return ()
+    counts = []
+    for (name, kind), of_frames in found.items():
+        sizes = [size for frame, size in of_frames.items() if size and frame <= frames]
+        missing = frames - len(sizes)
+        counts.append(FileCount(agent=name, channel=kind, expected=frames, missing=missing, bytes=sum(sizes)))
+    meta = 0
+    with suppress(OSError):
         meta = scenario.meta_path.stat().st_size
-    except OSError:
-        meta = 0
-    sizes[None, _META] = int(meta > 0), meta
-    return _FilesHere(frames=frames, sizes=sizes)
+    return *counts, FileCount(agent=None, channel=_META, expected=1, missing=int(not meta), bytes=meta)
 
 
-def _sizes(folder: ReleasePath, ending: str, *, lenient: bool) -> Mapping[int, int]:
-    """Frame → bytes of its file in a folder."""
-    try:
-        return frame_sizes(folder, ending)
-    except ReleaseError:
-        if not lenient:
-            raise
-        return {}
+def completeness(
+    layout: ReleaseLayout, found: Iterable[tuple[str, Sequence[FileCount]]], dataroot: str, *, selected: bool
+) -> Completeness:
+    """Sum the files of scenarios.
 
-
-def _count_all(layout: ReleaseLayout, found: Mapping[ScenarioFolder, _FilesHere]) -> list[_Counted]:
-    """The counts of every scenario, with estimates by what is here of all of them."""
+    Args:
+        layout: the release, with the split files to read.
+        found: token of each scenario, and what `files_of` gives of it.
+        dataroot: its name.
+        selected: whether these are not all scenarios.
+    """
     split_of = assign_splits(layout).split_of
-    files: Counter[str] = Counter()
-    size: Counter[str] = Counter()
-    for here in found.values():
-        for (_, kind), (number, in_bytes) in here.sizes.items():
-            files[kind] += number
-            size[kind] += in_bytes
-    means = {kind: size[kind] / number for kind, number in files.items() if number}
-    counted = []
-    for folder, here in found.items():
-        split = layout.version if layout.version == "v1-mini" else split_of.get(folder.token, _UNKNOWN_SPLIT)
-        counts = [_count(part, here, means, in_test=split == "test") for part in here.sizes]
-        counted.append(_Counted(folder, split, counts))
-    return counted
+    by_split: dict[str, dict[str, list[FileCount]]] = {}
+    for token, counts in found:
+        split = layout.version if layout.version == "v1-mini" else split_of.get(token, _UNKNOWN_SPLIT)
+        if counts:
+            by_split.setdefault(split, {})[token] = [_expected_in(split, count) for count in counts]
+    every = {token: counts for scenarios in by_split.values() for token, counts in scenarios.items()}
+    lacking = {token: kinds for token, counts in every.items() if (kinds := _missing_kinds(counts))}
+    of_release = {layout.version: EXPECTED_MINI_SCENARIOS} if layout.version == "v1-mini" else EXPECTED_SCENARIOS
+    expected = {} if selected else of_release
+    splits = (split for split in (*SPLITS, layout.version, _UNKNOWN_SPLIT) if split in by_split or split in expected)
+    return Completeness(
+        dataroot=dataroot,
+        version=layout.version,
+        scenarios=len(every),
+        whole=len(every) - len(lacking),
+        total=summed((count for counts in every.values() for count in counts), "all"),
+        splits={split: _split_files(by_split.get(split, {}), lacking, expected.get(split)) for split in splits},
+        lacking=dict(sorted(lacking.items())),
+    )
 
 
-def _count(part: _Part, files: _FilesHere, means: Mapping[str, float], *, in_test: bool) -> FileCount:
-    agent, kind = part
-    here, in_bytes = files.sizes[part]
-    expected = 1 if kind == _META else files.frames
-    if in_test and not here and kind in _NOT_IN_TEST:
-        expected = 0
-    missing = expected - here
-    estimate = None if missing and kind not in means else round(missing * means.get(kind, 0))
+def summed(counts: Iterable[FileCount], channel: str, agent: str | None = None) -> FileCount:
+    """The sum of some counts, under a name."""
+    counts = list(counts)
     return FileCount(
         agent=agent,
-        channel=kind,
+        channel=channel,
+        expected=sum(count.expected for count in counts),
+        missing=sum(count.missing for count in counts),
+        bytes=sum(count.bytes for count in counts),
+    )
+
+
+def _expected_in(split: str, count: FileCount) -> FileCount:
+    """A scenario's count of a kind; the test split is not expected to have any file of some kinds."""
+    if split == "test" and count.missing == count.expected and count.channel in _NOT_IN_TEST:
+        return replace(count, expected=0, missing=0)
+    return count
+
+
+def _missing_kinds(counts: Iterable[FileCount]) -> dict[str, int]:
+    kinds: Counter[str] = Counter()
+    for count in counts:
+        kinds[count.channel] += count.missing
+    return dict(+kinds)
+
+
+def _split_files(
+    scenarios: Mapping[str, Sequence[FileCount]], lacking: Collection[str], expected: int | None
+) -> SplitFiles:
+    of_parts = zip(*scenarios.values(), strict=True)
+    return SplitFiles(
+        scenarios=len(scenarios),
+        whole=len(scenarios.keys() - set(lacking)),
         expected=expected,
-        here=here,
-        missing=missing,
-        bytes_here=in_bytes,
-        bytes_missing=estimate,
+        files=[summed(of_part, of_part[0].channel, of_part[0].agent) for of_part in of_parts],
     )
 
 
-def _lacking(counted: _Counted) -> LackingScenario:
-    with_files = {count.agent for count in counted.counts if count.here}
-    absent = [agent for agent in AGENTS if agent not in with_files]
-    return LackingScenario(
-        scenario=counted.folder.token,
-        folder=counted.folder.folder,
-        split=counted.split,
-        absent_agents=absent,
-        files=[count for count in counted.counts if count.missing and count.agent not in absent],
-    )
+def _split_text(name: str, split: SplitFiles) -> str:
+    of_release = "" if split.expected is None else f" of the release's {split.expected}"
+    head = f"split {name}: {counted(split.scenarios, 'scenario')}{of_release} here, {split.whole:,} of them whole"
+    if split.whole == split.scenarios:
+        return head
+    rows = [("missing files", *_COLUMNS), *((agent, *_missing_texts(split.files, agent)) for agent in AGENTS)]
+    without_meta = next(count.missing for count in split.files if count.channel == _META)
+    return "\n".join([head, columns_text(rows), *([f"meta is missing of {without_meta:,}"] if without_meta else [])])
 
 
-def _splits(
-    version: str, counted: Sequence[_Counted], lacking: Sequence[LackingScenario], *, selected: bool
-) -> dict[str, SplitFiles]:
-    """Split → its counts, in the usual order; those that a whole release has, and those of which a scenario is here."""
-    of_release = {version: EXPECTED_MINI_SCENARIOS} if version == "v1-mini" else EXPECTED_SCENARIOS
-    expected = {} if selected else of_release
-    splits = {}
-    for split in (*SPLITS, version, _UNKNOWN_SPLIT):
-        here = [each for each in counted if each.split == split]
-        if not here and split not in expected:
-            continue
-        broken = [each for each in lacking if each.split == split]
-        absent = Counter(agent for each in broken for agent in each.absent_agents)
-        splits[split] = SplitFiles(
-            scenarios=len(here),
-            whole=len(here) - len(broken),
-            expected=expected.get(split),
-            absent_agents={agent: absent[agent] for agent in AGENTS if agent in absent},
-            files=[
-                summed(of_part, of_part[0].channel, of_part[0].agent)
-                for of_part in zip(*(each.counts for each in here), strict=True)
-            ],
-        )
-    return splits
-
-
-def _without_calib(layout: ReleaseLayout, counted: Sequence[_Counted]) -> list[str]:
-    """Scenarios that have files or folders here, but no frames."""
-    numbered = {each.folder.token for each in counted}
-    strays = {f"{folder.name}/{name}" for folder, name in names_without_calib(layout)}
-    strays |= {folder.token for folder in layout.scenarios}
-    return sorted(strays - numbered)
-
-
-def _not_here(layout: ReleaseLayout, strays: Collection[str]) -> dict[str, list[str]]:
-    """Split → scenarios of its file that are not here; the split files are not the mini release's."""
-    if layout.version == "v1-mini":
-        return {}
-    here = {folder.token for folder in layout.scenarios}.union(strays)
-    listed = {split: set(read_split_file(path)) - here for split, path in layout.split_files.items()}
-    return {split: sorted(tokens) for split, tokens in listed.items() if tokens}
+def _missing_texts(files: Sequence[FileCount], agent: str) -> Iterator[str]:
+    """How many files of the kinds of each of `_COLUMNS` an agent lacks; - for none, `all` for as many as expected."""
+    for kinds in _COLUMNS.values():
+        count = summed((each for each in files if each.agent == agent and each.channel in kinds), "")
+        yield "-" if not count.missing else "all" if count.missing == count.expected else f"{count.missing:,}"

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import permutations
 
 from deepaccident_devkit.errors import ReleaseError
@@ -24,15 +24,8 @@ Recording = tuple[str, str]
 """Agent and kind of file: `label`, `calib` or a channel."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Inventory:
-    """The sensor files of one scenario.
-
-    Attributes:
-        frames: agent and channel → frame numbers, for folders that have any.
-    """
-
-    frames: Mapping[Recording, list[int]]
+Inventory = Mapping[Recording, list[int]]
+"""Frame numbers of the sensor folders of a scenario that have any."""
 
 
 def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Inventory, list[Finding]]:
@@ -53,7 +46,7 @@ def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Invent
             if found:
                 frames[agent, channel] = found
                 findings += _frame_findings(scenario, scan, agent, channel, found)
-    return Inventory(frames=frames), findings
+    return frames, findings
 
 
 def absences(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[Finding]:
@@ -116,20 +109,20 @@ def check_splits(layout: ReleaseLayout) -> tuple[ReleaseLayout, list[Finding]]:
     readable: dict[str, ReleasePath] = {}
     for split, path in layout.split_files.items():
         try:
-            lines = read_split_file(path, raw=True)
+            tokens = read_split_file(path, raw=True)
         except ReleaseError as error:
             found.append(finding_of(error, "split-file-unreadable", None))
             continue
         readable[split] = path
-        found += _repeated(path, lines)
+        found += _repeated(path, tokens)
     layout = replace(layout, split_files=readable)
     splits = assign_splits(layout)
     return layout, [*found, *_assignment_findings(splits), *_twins(splits)]
 
 
-def _repeated(path: ReleasePath, lines: list[tuple[str, ...]]) -> Iterator[Finding]:
+def _repeated(path: ReleasePath, tokens: list[str]) -> Iterator[Finding]:
     """Scenarios that a file lists more than once; reading takes them once."""
-    repeated = [shortened(" ".join(words)) for words, count in Counter(lines).items() if count > 1]
+    repeated = [shortened(token.replace("/", " ", 1)) for token, count in Counter(tokens).items() if count > 1]
     if repeated:
         more = f" and {len(repeated) - _NAMED} more" if len(repeated) > _NAMED else ""
         what = f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"

@@ -148,7 +148,7 @@ class _BevHits:
 def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
     """Decode all sensor files of a scenario and compare them with its labels and calib files."""
     checksums: dict[str, list[tuple[str, str, int]]] = defaultdict(list)
-    for (agent, channel), frames in inventory.frames.items():
+    for (agent, channel), frames in inventory.items():
         usable = [frame for frame in frames if frame <= subject.num_frames]
         paths = {frame: subject.files.scenario.channel_path(agent, channel, frame) for frame in usable}
         row = subject.agents.index(agent)

@@ -27,8 +27,7 @@ from deepaccident_devkit.taxonomy import VELOCITY_FRAMES
 from deepaccident_devkit.text import counted
 from deepaccident_devkit.validation.agreement import check_agreement, check_story
 from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, check_key
-from deepaccident_devkit.validation.completeness import chosen_scenarios, completeness
-from deepaccident_devkit.validation.completeness_report import Completeness
+from deepaccident_devkit.validation.completeness import Completeness, chosen_scenarios, completeness, files_of
 from deepaccident_devkit.validation.inventory import absences, check_splits, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses, check_untracked, check_velocities
@@ -197,7 +196,7 @@ def validate_release(
     folder = None if parts is None else writable_folder(parts)
     store = None if folder is None else Store(folder, folder, "validates scenarios", ConfigError)
     checks = _Work(deep=deep, store=store).run(chosen_scenarios(layout, scenarios), **how)
-    return _report(layout, checks, scenarios, root=root, deep=deep, **how)
+    return _report(layout, checks, scenarios, root=root, deep=deep)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,13 +245,13 @@ def _report(
     *,
     root: Dataroot,
     deep: bool,
-    **how: Unpack[Engine],
 ) -> ValidationReport:
     """What was found in scenarios, and in the release as a whole."""
     readable, of_release = check_splits(layout)
     tokens = {check.token for check in checks}
     of_release = [finding for finding in of_release if finding.scenario is None or finding.scenario in tokens]
     of_release += _strays(layout) if scenarios is None else ()
+    files = ((check.token, check.files) for check in checks)
     return ValidationReport(
         dataroot=str(root),
         version=layout.version,
@@ -260,7 +259,7 @@ def _report(
         scenarios=len(checks),
         samples=sum(check.samples for check in checks),
         findings=worst_first([*of_release, *(finding for check in checks for finding in check.findings)]),
-        files=completeness(readable, scenarios, str(root), lenient=True, **how),
+        files=completeness(readable, files, str(root), selected=scenarios is not None),
         velocity=total_fit([check.velocity for check in checks]),
         velocity_frames={check.token: check.velocity.best for check in checks},
     )
@@ -314,6 +313,7 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
         token=scenario.token,
         findings=tuple(found),
         samples=len(scan.agents) * scan.num_frames,
+        files=files_of(scenario),
         velocity=velocity,
     )
 

@@ -71,12 +71,12 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
 @pytest.mark.parametrize(
     ("setup", "told"),
     [
-        (WITHOUT, ("cannot import deepaccident_devkit", "a worker cannot do the work")),
-        (OTHER, ("has deepaccident_devkit 0.0.1; install", "has deepaccident_devkit 0.0.1, and this is")),
+        (WITHOUT, "a worker cannot do the work"),
+        (OTHER, "has deepaccident_devkit 0.0.1, and this is"),
     ],
 )
 def test_a_worker_without_the_package_or_with_another_version(
-    local: Local, scheduler: str, tmp_path: Path, setup: str, told: tuple[str, str], *, late: bool
+    local: Local, scheduler: str, tmp_path: Path, setup: str, told: str, *, late: bool
 ) -> None:
     line = [*words("opencood", {**local.places, "out": tmp_path}), "--scheduler", scheduler]
     if late:
@@ -91,7 +91,7 @@ def test_a_worker_without_the_package_or_with_another_version(
     worker.kill()
     worker.wait()
     assert running.returncode == 2
-    assert told[late] in errors.splitlines()[-1]
+    assert told in errors.splitlines()[-1]
     assert not (tmp_path / "opencood").exists()
 
 

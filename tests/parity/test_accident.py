@@ -205,7 +205,7 @@ def test_accidents_among_drawn_boxes(golden) -> None:
     truth = paths_of(entry["gt_traj"], golden["gt"])
     predictions = [paths_of(*each) for each in zip(entry["pred_traj"], golden["pred"], strict=True)]
     matches = [[tuple(pair) for pair in pairs] for pairs in entry["matches"]]
-    counts, _ = accident_counts(predictions, truth, matches, RULES, step=0.5)
+    counts, _ = accident_counts(predictions, truth, matches)
     assert_array_equal([counts[name] for name in COUNTS[:4]], entry["result"][:4])
     assert_allclose([counts[name] for name in COUNTS[4:]], entry["result"][4:], rtol=0, atol=1e-6)
 
@@ -225,7 +225,7 @@ def distances_of_samples(folder: Path) -> list[tuple[float, float]]:
     result = []
     for index in range(len(whole(folder)["samples"])):
         golden = GoldenCase(folder, "d_accident", "samples", index)
-        truth, _ = paths_of_heads(truth_heads(golden, "released"), config("released").grid, ACCIDENT)
+        truth, _ = paths_of_heads(truth_heads(golden, "released"), config("released").grid)
         pairs, gaps = pair_gaps(truth.drawn[-1], np.array([*truth.paths], dtype=np.int64))
         found = dict(zip(map(tuple, pairs.tolist()), gaps.tolist(), strict=True))
         listed = {(first, second): gap for first, second, gap in golden.entry["out"]["gt_pair_distances_last"]}

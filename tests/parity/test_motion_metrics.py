@@ -15,16 +15,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     PanopticQuality,
-    VpqRules,
+    SegmentationCounts,
+    VpqCounts,
     iou,
+    mask_counts,
     panoptic_quality,
-    segmentation_counts,
-    vpq,
     vpq_counts,
 )
 
 RANGES = ("30x30", "100x100")
 TOLERANCE = 2e-6
+PARTS = ("iou", "true_positive", "false_positive", "false_negative")
 by_range = pytest.mark.parametrize("name", RANGES)
 
 
@@ -37,8 +38,15 @@ def instances(golden, name: str) -> tuple[np.ndarray, np.ndarray]:
     return crop(golden, name, golden["pred"]), crop(golden, name, golden["gt"])
 
 
-def segmentations(golden, name: str) -> tuple[np.ndarray, np.ndarray]:
-    return crop(golden, name, golden["seg_pred"]), crop(golden, name, golden["seg_gt"])
+def segmentations(golden, name: str) -> list[SegmentationCounts]:
+    predicted, true = (crop(golden, name, golden[which]) for which in ("seg_pred", "seg_gt"))
+    return [mask_counts(predicted == index, true == index) for index in (0, 1)]
+
+
+def vpq(counts: Sequence[VpqCounts]) -> list[PanopticQuality]:
+    """Of the background and of the instances, over all frames of all sequences."""
+    sums = [sum(getattr(each, part).sum(axis=0) for each in counts) for part in PARTS]
+    return [panoptic_quality(*numbers) for numbers in zip(*sums, strict=True)]
 
 
 def assert_quality(found: Sequence[PanopticQuality], expected: dict) -> None:
@@ -59,15 +67,8 @@ def test_vpq_of_a_sequence(golden, name: str) -> None:
 
 @by_range
 @pytest.mark.golden_cases("b_vpq", "sequences")
-def test_panoptic_quality_of_a_sequence_frame_by_frame(golden, name: str) -> None:
-    found = vpq_counts(*instances(golden, name), VpqRules(ids_must_stay=False))
-    assert_quality(vpq([found]), golden.entry[name]["not_temporally_consistent"])
-
-
-@by_range
-@pytest.mark.golden_cases("b_vpq", "sequences")
 def test_iou_of_a_sequence(golden, name: str) -> None:
-    found, expected = segmentation_counts(*segmentations(golden, name)), golden.entry[name]
+    found, expected = segmentations(golden, name), golden.entry[name]
     for key in ("true_positive", "false_positive", "false_negative"):
         assert [getattr(each, key) for each in found] == expected["seg_counts"][key]
     support = [each.true_positive + each.false_negative for each in found]
@@ -82,12 +83,11 @@ def test_all_sequences(golden) -> None:
     expected, selected = golden.whole["aggregate"][name], golden.whole["selected_index"]
     cases = [replace(golden, key="sequences", index=number) for number in range(len(golden.whole["sequences"]))]
     counts = [vpq_counts(*instances(case, name)) for case in cases]
-    cells = [segmentation_counts(*segmentations(case, name)) for case in cases]
+    cells = [segmentations(case, name) for case in cases]
 
     assert_quality(vpq(counts), expected["separate"])
     assert_quality(vpq(counts), expected["plain"])
-    parts = ("iou", "true_positive", "false_positive", "false_negative")
-    frames = [[getattr(each, part)[frame] for part in parts] for each in counts for frame in range(len(each.iou))]
+    frames = [[getattr(each, part)[frame] for part in PARTS] for each in counts for frame in range(len(each.iou))]
     wrong = np.sum([frames[number] for number in selected], axis=0)
     assert_quality([panoptic_quality(*sums) for sums in wrong.T], expected["separate_selected_as_released"])
     for key in ("iou_separate", "iou_plain"):

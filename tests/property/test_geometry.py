@@ -1,16 +1,12 @@
 """Laws of boxes, cameras, point clouds and grids; those of SE3 and of the boxes' motion are in test_se3.py."""
 
-from contextlib import suppress
-from pathlib import Path
-
 import numpy as np
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from strategies import arrays, boxes, cameras, clouds, grids, mutations, points, poses, upright_boxes
+from strategies import arrays, boxes, cameras, clouds, grids, points, poses, upright_boxes
 
-from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, BoxVisibility, LidarPointCloud, PinholeCamera, quaternions
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 
@@ -98,16 +94,6 @@ def test_comparing_boxes_does_not_depend_on_the_frame(one: Boxes, two: Boxes, ya
     assert_allclose(moved.distance_bev(moved_too), one.distance_bev(two), rtol=0, atol=1e-9)
 
 
-@given(cameras(), arrays((6, 3), 50.0), st.floats(0.1, 50))
-def test_project_and_unproject_undo_each_other(camera: PinholeCamera, some: np.ndarray, nearest: float) -> None:
-    in_front = some + np.array([0, 0, 50 + nearest])
-    pixels, depth = camera.project(in_front)
-    assert_allclose(camera.unproject(pixels, depth), in_front, rtol=1e-9, atol=1e-9)
-    again, depth_again = camera.project(camera.unproject(pixels, depth))
-    assert_allclose(again, pixels, rtol=1e-9, atol=1e-6)
-    assert_allclose(depth_again, depth, rtol=1e-12)
-
-
 @given(cameras(), poses(5.0), boxes())
 def test_visibility_is_that_of_the_corners(camera: PinholeCamera, pose: SE3, some: Boxes) -> None:
     """The nuScenes devkit's `box_in_image`, box by box and corner by corner."""
@@ -162,26 +148,3 @@ def test_cropping_to_a_grid_keeps_what_has_a_cell(cloud: LidarPointCloud, grid: 
     kept = cloud.crop(grid)
     assert_array_equal(kept.xyz, cloud.xyz[grid.index_of(cloud.xyz)[1]])
     assert_array_equal(cloud.crop(x=grid.x[:2], y=grid.y[:2]).points, kept.points)
-
-
-@given(clouds(), poses(), st.sampled_from(["lidar", "ego", "world"]))
-def test_saved_clouds_come_back_to_the_bit(scratch: Path, cloud: LidarPointCloud, pose: SE3, frame: str) -> None:
-    moved = cloud.transform(pose, frame)
-    moved.save(scratch / "cloud.npz")
-    read = LidarPointCloud.load(scratch / "cloud.npz")
-    assert read.frame == frame
-    assert_array_equal(read.xyz, moved.xyz)
-    assert_array_equal(read.intensity, moved.intensity)
-
-
-def _saved(folder: Path) -> bytes:
-    LidarPointCloud(np.arange(12.0).reshape(4, 3), np.arange(4.0)).save(folder / "whole.npz")
-    return (folder / "whole.npz").read_bytes()
-
-
-@given(st.data())
-def test_a_damaged_file_is_refused_or_harmless(scratch: Path, data: st.DataObject) -> None:
-    content = data.draw(mutations(_saved(scratch)))
-    (scratch / "damaged.npz").write_bytes(content)
-    with suppress(SensorFileError):
-        assert LidarPointCloud.load(scratch / "damaged.npz").xyz.shape[1] == 3

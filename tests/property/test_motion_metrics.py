@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, motion_counts
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import VpqRules, iou, segmentation_counts, vpq, vpq_counts
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import iou, mask_counts, vpq_counts
 from deepaccident_devkit.evaluation.metrics.predictions import instances_of
 from deepaccident_devkit.evaluation.metrics.trajectories import longest, match_trajectories, padded
 from deepaccident_devkit.geometry import BevGrid
@@ -40,7 +40,7 @@ def paths(draw: st.DrawFn) -> dict[int, np.ndarray]:
     }
 
 
-def plain_vpq(prediction: np.ndarray, label: np.ndarray, *, ids_must_stay: bool) -> list[list[float]]:
+def plain_vpq(prediction: np.ndarray, label: np.ndarray) -> list[list[float]]:
     """[iou, tp, fp, fn] of the instances in each frame, as docs/released_code.md, IoU and VPQ, tells it."""
     result, partner = [], {}
     for predicted, true in zip(prediction, label, strict=True):
@@ -50,7 +50,7 @@ def plain_vpq(prediction: np.ndarray, label: np.ndarray, *, ids_must_stay: bool)
             for other in sorted(mine):
                 both, either = (true == name) & (predicted == other), (true == name) | (predicted == other)
                 if both.sum() / either.sum() > 0.5:
-                    changed = ids_must_stay and partner.get(name, other) != other
+                    changed = partner.get(name, other) != other
                     partner[name] = other
                     mine, theirs = mine - {other}, theirs - {name}
                     if changed:
@@ -62,11 +62,11 @@ def plain_vpq(prediction: np.ndarray, label: np.ndarray, *, ids_must_stay: bool)
 
 
 @settings(max_examples=200)
-@given(given_pair=pairs(), ids_must_stay=st.booleans())
-def test_vpq_is_what_the_plain_rules_say(given_pair, ids_must_stay: bool) -> None:
-    found = vpq_counts(*given_pair, VpqRules(ids_must_stay=ids_must_stay))
+@given(given_pair=pairs())
+def test_vpq_is_what_the_plain_rules_say(given_pair) -> None:
+    found = vpq_counts(*given_pair)
     columns = (found.iou, found.true_positive, found.false_positive, found.false_negative)
-    expected = plain_vpq(*given_pair, ids_must_stay=ids_must_stay)
+    expected = plain_vpq(*given_pair)
     assert_allclose(np.stack([values[:, 1] for values in columns], axis=1), expected, rtol=0, atol=1e-12)
 
 
@@ -81,48 +81,36 @@ def test_what_ids_are_called_makes_no_difference(given_pair, names: list[int], l
     assert_array_equal(found.iou, expected.iou)
 
 
-@given(given_pair=pairs())
-def test_frames_alone_treat_both_sides_alike(given_pair) -> None:
-    prediction, label = given_pair
-    rules = VpqRules(ids_must_stay=False)
-    there, back = vpq_counts(prediction, label, rules), vpq_counts(label, prediction, rules)
-    assert_array_equal(there.iou, back.iou)
-    assert_array_equal(there.false_positive, back.false_negative)
-    strict = vpq_counts(prediction, label)
-    assert (strict.true_positive <= there.true_positive).all()
-
-
 @given(label=hnp.arrays(np.int32, SHAPES, elements=IDS))
 def test_the_truth_itself_is_perfect(label: np.ndarray) -> None:
-    quality = vpq([vpq_counts(label, label)])[1]
-    assert quality.pq == quality.sq == quality.rq == float((label > 0).any())
-    assert [iou([each], absent=1.0) for each in segmentation_counts(label, label, 5)] == [1.0] * 5
+    found = vpq_counts(label, label)
+    assert_array_equal(found.iou[:, 1], found.true_positive[:, 1])
+    assert not found.false_positive.any()
+    assert not found.false_negative.any()
+    assert iou([mask_counts(label == 1, label == 1)], absent=1.0) == 1.0
 
 
 @given(given_paths=paths(), length=st.integers(0, 6))
 def test_paths_keep_their_points_and_go_on(given_paths, length: int) -> None:
-    steady, faster = padded(given_paths, length, accelerating=False), padded(given_paths, length)
+    faster = padded(given_paths, length)
     for name, path in given_paths.items():
-        assert_array_equal(steady[name][: len(path)], path)
-        assert len(steady[name]) == len(faster[name]) == max(len(path), length)
-        added = steady[name][len(path) - 1 :]
+        assert_array_equal(faster[name][: len(path)], path)
+        assert len(faster[name]) == max(len(path), length)
         step = path[-1] - path[-2] if len(path) > 1 else np.zeros(2)
-        for first, second in pairwise(added):
-            assert_array_equal(second - first, step)
         for number, (first, second) in enumerate(pairwise(faster[name][len(path) - 1 :]), start=1):
             assert_array_equal(second - first, number * step)
 
 
-@given(prediction=paths(), truth=paths(), gate=st.sampled_from([0.5, 4.0]))
-def test_everybody_is_matched_once_or_not_at_all(prediction, truth, gate: float) -> None:
+@given(prediction=paths(), truth=paths())
+def test_everybody_is_matched_once_or_not_at_all(prediction, truth) -> None:
     length = longest(truth)
-    found = match_trajectories(padded(prediction, length), padded(truth, length), gate=gate)
+    found = match_trajectories(padded(prediction, length), padded(truth, length))
     mine, theirs = ([pair[side] for pair in found.pairs] for side in (0, 1))
     assert sorted([*mine, *found.unmatched_prediction]) == sorted(prediction)
     assert sorted([*theirs, *found.unmatched_truth]) == sorted(truth)
     assert list(found.costs) == sorted(found.costs)
-    assert all(cost <= gate * length for cost in found.costs)
-    perfect = match_trajectories(padded(truth, length), padded(truth, length), gate=gate)
+    assert all(cost <= 4.0 * length for cost in found.costs)
+    perfect = match_trajectories(padded(truth, length), padded(truth, length))
     assert perfect.costs == (0.0,) * len(truth)
 
 

@@ -115,23 +115,3 @@ def test_six_turns_about_z_then_y_then_x(translation: np.ndarray, rx: float, ry:
 def test_a_flipped_six_vector_is_the_flipped_poses(pose: SE3) -> None:
     flipped = handedness.flip_six_vector(pose.to_six())
     assert_allclose(six_vectors.to_matrices(flipped), handedness.flip_pose(pose.matrix), atol=1e-7)
-
-
-@given(poses(), poses(), st.floats(0, 1))
-def test_interpolation_turns_evenly_and_goes_straight(one: SE3, two: SE3, share: float) -> None:
-    assert_array_equal(one.interpolate(two, 0).matrix, one.matrix)
-    assert_array_equal(one.interpolate(two, 1).matrix, two.matrix)
-    between = one.interpolate(two, share)
-    SE3(between.matrix)  # is rigid
-    assert_allclose(between.translation, one.translation + share * (two.translation - one.translation), atol=1e-9)
-    whole = (one.inverse() @ two).quaternion.angle
-    part = (one.inverse() @ between).quaternion.angle
-    assert_allclose(abs(part), share * min(abs(whole), 2 * np.pi - abs(whole)), atol=1e-6)
-
-
-@given(poses(), ANGLES, arrays((3,), 100), st.floats(0, 1))
-def test_interpolation_there_is_interpolation_back(one: SE3, yaw: float, step: np.ndarray, share: float) -> None:
-    two = one @ SE3.from_yaw(yaw * 0.99, step)  # of a half turn, either way round is the shorter
-    assert_allclose(one.interpolate(two, share).matrix, two.interpolate(one, 1 - share).matrix, atol=1e-6)
-    expected = one @ SE3.from_yaw(yaw * 0.99 * share, share * step)
-    assert_allclose(one.interpolate(two, share).matrix, expected.matrix, atol=1e-6)

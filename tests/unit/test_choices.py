@@ -25,7 +25,7 @@ from deepaccident_devkit.render.axes import layers_of
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.testing import SmallRelease
 from deepaccident_devkit.text import choice, meant_text
-from deepaccident_devkit.v2x import AgentConfig, PoseNoise, cooperating_agents
+from deepaccident_devkit.v2x import AgentConfig, cooperating_agents
 
 SETTINGS = {"grid_conf": {"xbound": (-50.0, 50.0, 0.5), "ybound": (-30.0, 50.0, 0.5)}}
 
@@ -63,9 +63,7 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
     ("Motion", "motion", "motoin", ChoiceError, lambda word: EvaluationSetup(task=word)),
     ("Accident", "accident", "acident", ChoiceError, lambda word: SampleSelection(split="val", scope=word)),
     ("Lidar01", "lidar01", "lidar", ChoiceError, lambda word: McapConfig(channels=[word])),
-    ("Skip", "skip", "skipp", ChoiceError, lambda word: McapConfig(on_missing=word)),
     ("Boxes", "boxes", "box", ChoiceError, lambda word: layers_of([word], ())),
-    ("Zero-Mean", "zero-mean", "zero", ConfigError, lambda word: PoseNoise(law=word)),
     ("Other", "other", "othr", ChoiceError, lambda word: AgentConfig("mine", (word,))),
     ("Hidden", "hidden", "hiden", ConfigError, lambda word: SynthConfig(view=word)),
     ("INFRASTRUCTURE", "infrastructure", "infra", ConfigError, lambda w: SmallRelease(agents=(w,))),

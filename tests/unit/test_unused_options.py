@@ -42,7 +42,6 @@ CASES = [
     ("split release --seed 3 --out mine.txt", "--seed changes nothing with --where or a split file"),
     ("split release --overwrite", "--overwrite changes nothing without --out"),
     ("synth out --design mine.yaml --unplanned 0.5", "--unplanned changes nothing with a scenario file or --view"),
-    ("synth --design mine.yaml --check --layout B", "--layout changes nothing with --check"),
     ("predict tiny release --out out --horizon 3", "--horizon changes nothing with a trained model"),
     (BASELINE + " --device cpu", "--device changes nothing with a baseline"),
     ("results pyproject.toml release --out out --method me", "--method changes nothing without --truth"),

@@ -126,7 +126,7 @@ def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -
     (begun / "before").mkdir()
     for name in ("one", "two"):
         (begun / "before" / f"{name}.yaml").write_bytes(b"written by the killed one\n")
-    windows = WindowRules(observe=0, ahead=1, stride=0.5, partial_past=True)
+    windows = WindowRules(observe=0, ahead=1, stride=0.5)
     export_release(dataset, folder / "questions", Questions(window=windows), workers=1)
     truth = [json.loads(line) for line in (folder / "questions" / "truth.jsonl").read_bytes().splitlines()]
     answers = [

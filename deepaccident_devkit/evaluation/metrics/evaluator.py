@@ -82,28 +82,6 @@ class Evaluator(ABC, Generic[Result]):
     def update(self, token: str, *arguments: Any) -> None:
         """Count one sample: its token, then prediction, truth and other arguments of the evaluator."""
 
-    def update_batch(self, tokens: Sequence[str], *columns: Sequence[Any]) -> None:
-        """Count several samples, such as those of a data loader's batch, one after another.
-
-        Args:
-            tokens: of the samples.
-            *columns: what `update` takes after the token, one sequence an argument, one entry a sample.
-
-        Raises:
-            EvaluationError: a column is not as long as the tokens, or as of `update`; then the samples before the one
-                that cannot be counted are.
-        """
-        if isinstance(tokens, str):
-            raise EvaluationError(f"tokens: expected a sequence of them, found the text {tokens!r}; see `update`")
-        for number, column in enumerate(columns):
-            if len(column) != len(tokens):
-                raise EvaluationError(
-                    f"batch: {len(tokens)} tokens, and column {number} after them has {len(column)} entries; give one "
-                    "for each sample"
-                )
-        for token, *arguments in zip(tokens, *columns, strict=True):
-            self.update(token, *arguments)
-
     def fresh(self: EvaluatorT) -> EvaluatorT:
         """An evaluator of the same settings without samples."""
         other = copy.copy(self)

@@ -27,10 +27,12 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.orientations import cells_in
 
 Paths = Mapping[int, FloatArray]
-GATE: Final = 4.0
+_GATE: Final = 4.0
 """Metres, the mean over the frames, within which two paths can be the same."""
 _ADE_LIMIT, _FDE_LIMIT = 8.0, 10.0
 """Metres: a larger mean error, or final error, counts as this."""
+_MISS_DISTANCE: Final = 5.0
+"""Metres; a larger final error is a miss."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,32 +58,31 @@ def longest(paths: Paths) -> int:
     return max((len(path) for path in paths.values()), default=0)
 
 
-def padded(paths: Paths, length: int, *, accelerating: bool = True) -> dict[int, FloatArray]:
+def padded(paths: Paths, length: int) -> dict[int, FloatArray]:
     """The paths, those shorter than `length` points continued; longer ones stay as they are.
+
+    The released quirk: a path whose last step is d goes on by d, 2 d, 3 d, … a frame. A path of one point stands still.
 
     Args:
         paths: of at least one point each.
         length: points wanted.
-        accelerating: the released quirk: a path whose last step is d goes on by d, 2 d, 3 d, … a frame; else by d each
-            time. A path of one point stands still.
     """
-    return {name: _continued(path, length, accelerating=accelerating) for name, path in paths.items()}
+    return {name: _continued(path, length) for name, path in paths.items()}
 
 
-def match_trajectories(prediction: Paths, truth: Paths, *, gate: float = GATE) -> TrajectoryMatches:
+def match_trajectories(prediction: Paths, truth: Paths) -> TrajectoryMatches:
     """Pair paths greedily, the nearest two first; a pair that is too far apart uses up both and counts as unmatched.
 
     Args:
         prediction: id → (≥ T, 2) metres, of which the first T points count (see `padded`).
         truth: id → (T, 2) metres.
-        gate: metres a frame that the paths of a pair may be apart at most, on average.
 
     Raises:
         GeometryError: true paths of several lengths, or a predicted one that is shorter.
     """
     predicted, true = list(prediction), list(truth)
     costs = _costs(prediction, truth)
-    limit = gate * longest(truth)
+    limit = _GATE * longest(truth)
     free_predicted, free_true = dict.fromkeys(sorted(predicted)), dict.fromkeys(sorted(true))
     near: list[tuple[tuple[int, int], float]] = []
     far: list[tuple[tuple[int, int], float]] = []
@@ -108,13 +109,12 @@ def distances(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]))
 
 
-def _continued(path: FloatArray, length: int, *, accelerating: bool) -> FloatArray:
+def _continued(path: FloatArray, length: int) -> FloatArray:
     missing = length - len(path)
     if missing <= 0:
         return path
     step = path[-1] - path[-2] if len(path) > 1 else np.zeros(2)
-    factor = np.arange(1.0, missing + 1) if accelerating else np.ones(missing)
-    added: FloatArray = np.cumsum([path[-1], *(factor[:, None] * step)], axis=0)[1:]
+    added: FloatArray = np.cumsum([path[-1], *(np.arange(1.0, missing + 1)[:, None] * step)], axis=0)[1:]
     return np.concatenate([path, added])
 
 
@@ -162,20 +162,6 @@ def instance_paths(instance: AnyArray, grid: BevGrid) -> dict[int, FloatArray]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrajectoryRules:
-    """The choices of the errors; the defaults are the released ones.
-
-    Attributes:
-        miss_distance: metres; a larger final error is a miss.
-        first_prediction_empty_ends: the released quirk: where the first prediction has no path at all, the sample
-            does not count, even if other predictions have paths.
-    """
-
-    miss_distance: float = 5.0
-    first_prediction_empty_ends: bool = True
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryErrors:
     """Sums over the true paths of a sample that have a partner in some prediction.
 
@@ -193,22 +179,21 @@ class TrajectoryErrors:
 
 
 def trajectory_errors(
-    predictions: Sequence[Paths],
-    truth: Paths,
-    matches: Sequence[TrajectoryMatches],
-    rules: TrajectoryRules = TrajectoryRules(),
+    predictions: Sequence[Paths], truth: Paths, matches: Sequence[TrajectoryMatches]
 ) -> TrajectoryErrors:
     """The errors of a sample; for each true path, those of the prediction that ends nearest to it (the first of ties).
+
+    The released quirk: where the first prediction has no path at all, the sample does not count, even if other
+    predictions have paths.
 
     Args:
         predictions: K times id → (≥ T, 2) metres.
         truth: id → (T, 2) metres.
         matches: of each prediction with the truth.
-        rules: what is a miss, and a quirk.
     """
     ade, fde, missed, count = 0.0, 0.0, 0, 0
     frames = longest(truth)
-    if predictions and not predictions[0] and rules.first_prediction_empty_ends:
+    if predictions and not predictions[0]:
         return TrajectoryErrors(ade=ade, fde=fde, missed=missed, count=count)
     partners = [{true: mine for mine, true in match.pairs} for match in matches]
     for name, path in truth.items():
@@ -221,6 +206,6 @@ def trajectory_errors(
             best = min(errors, key=lambda each: each.item(-1))
             ade += min(sum(best.tolist()) / frames, _ADE_LIMIT)
             fde += min(best.item(-1), _FDE_LIMIT)
-            missed += best.item(-1) > rules.miss_distance
+            missed += best.item(-1) > _MISS_DISTANCE
             count += 1
     return TrajectoryErrors(ade=ade, fde=fde, missed=missed, count=count)

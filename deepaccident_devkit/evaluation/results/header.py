@@ -53,19 +53,15 @@ def told_of(path: Path) -> Iterator[None]:
 
 
 def shown(value: object) -> str:
-    """A value of a JSON file as it stands there, cut if it is long: no more of it is written than is shown."""
-    text = ""
-    for part in json.JSONEncoder(ensure_ascii=False, default=repr).iterencode(value):
-        text += part
-        if len(text) > _SHOWN:
-            return f"{text[:_SHOWN]}…"
-    return text
+    """A value of a JSON file as it stands there, cut if it is long."""
+    text = json.dumps(value, ensure_ascii=False, default=repr)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
-def parsed_json(content: bytes) -> Any:
+def parsed_json(content: bytes, levels: int = json_text.MOST_LEVELS) -> Any:
     """The value of JSON text; raises ContentError that names the place of a fault."""
     try:
-        return json_text.parsed_json(content)
+        return json_text.parsed_json(content, levels=levels)
     except ValueError as error:
         raise ContentError(str(error)) from error
 
@@ -106,7 +102,7 @@ class MotionForm:
     """How motion results are stored: the same for all samples of a file.
 
     Attributes:
-        stored: `instances`: maps of ids, and paths; `heads`: the model's own maps.
+        stored: `instances`: maps of ids; `heads`: the model's own maps.
         grid: the cells; its orientation is how the maps lie.
         predictions: how many a sample has at most, K; of several, the last one is the mean.
         frames: T, the present one first.
@@ -174,8 +170,7 @@ def json_meta(meta: object) -> dict[str, Any]:
     except (TypeError, ValueError, RecursionError) as error:
         raise ContentError(f"meta: cannot be written as JSON ({error})") from error
     with at("meta"):
-        copied: dict[str, Any] = parsed_json(text.encode())
-        _check_levels(copied, _MOST_LEVELS)
+        copied: dict[str, Any] = parsed_json(text.encode(), _MOST_LEVELS)
     return copied
 
 
@@ -189,12 +184,3 @@ def check_token(token: object) -> str:
             f"expected a sample's token, <scenario_type>/<name>/<agent>/<NNN>, found {shortened(token)!r}"
         )
     return token
-
-
-def _check_levels(value: object, most: int) -> None:
-    if not isinstance(value, dict | list):
-        return
-    if most == 0:
-        raise ContentError(f"is nested more than {_MOST_LEVELS} levels deep")
-    for each in value.values() if isinstance(value, dict) else value:
-        _check_levels(each, most - 1)

@@ -7,19 +7,18 @@ import gc
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.errors import NotAvailableError, ResultsError, TokenError
+from deepaccident_devkit.errors import ResultsError, TokenError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results.entries import ENTRIES, Entries, entry_place, read_entries
@@ -34,9 +33,9 @@ from deepaccident_devkit.evaluation.results.header import (
     shown,
     told_of,
 )
-from deepaccident_devkit.evaluation.results.motion_arrays import paths_of, stored_output, stored_paths
+from deepaccident_devkit.evaluation.results.motion_arrays import stored_output
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, MotionFile, ResultsFile, ResultsTask
-from deepaccident_devkit.evaluation.results.shards import OpenShards, check_shard, read_manifest
+from deepaccident_devkit.evaluation.results.shards import check_shard, read_manifest, shared_archive
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import NO_NAME, fault_text, irregular_text, read_bytes
@@ -121,7 +120,6 @@ def _tell(content: bytes, path: Path) -> None:
 
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
-Read = TypeVar("Read")
 
 
 class EntryContents:
@@ -157,30 +155,21 @@ class MotionContents:
         """Check the manifest; raises ContentError."""
         self._path, self._root = path, path.parent
         self.meta = meta
-        self._manifest = read_manifest(document, self._root)
-        self.form: MotionForm = self._manifest.form
-        self._shards = OpenShards(self._root)
+        self._shards = document.shards
+        self.form, self._shard_of = read_manifest(document, self._root)
 
     @property
     def tokens(self) -> Collection[str]:
         """The samples."""
-        return self._manifest.shard_of.keys()
+        return self._shard_of.keys()
 
     def prediction(self, token: str) -> MotionOutput:
         """The prediction of a sample; raises ResultsError."""
-        return self._read(token, stored_output)
-
-    def trajectories(self, token: str) -> dict[int, FloatArray]:
-        """Those stored with a sample, or else those of its maps; raises ResultsError."""
-        stored = self._read(token, stored_paths)
-        return paths_of(self.prediction(token), self.form.labels) if stored is None else stored
-
-    def _read(self, token: str, read: Callable[..., Read]) -> Read:
-        shard = self._manifest.shards[self._manifest.shard_of[token]]
+        shard = self._shard_of[token]
         with told_of(self._path), at(shard.file):
-            archive = self._shards.archive(shard)
+            archive = shared_archive(self._root, shard, os.getpid())
             with at(token):
-                return read(archive, token, self.form)
+                return stored_output(archive, token, self.form)
 
     def check(self, **how: Any) -> None:
         """Read every array, as `run_batch` is told.
@@ -189,7 +178,7 @@ class MotionContents:
             ResultsError: names shard, token and array.
         """
         check = partial(check_shard, self._root, self.form)
-        run_batch(check, self._manifest.shards, label="shards", places=Places(reads=(self._root,)), **how)
+        run_batch(check, self._shards, label="shards", places=Places(reads=(self._root,)), **how)
 
 
 Contents = EntryContents | MotionContents
@@ -312,23 +301,10 @@ class Results:
             TokenError: the sample is not here.
             ResultsError: its arrays are missing or damaged, or the file was changed.
         """
-        return self._with(token).prediction(token)
-
-    def trajectories(self, token: str) -> dict[int, FloatArray]:
-        """Where the instances of the last prediction of a sample go, as stored, or as its maps say.
-
-        Returns:
-            Id → (T, 2) float64, x forward, y left, metres in the present ego frame; NaN in frames without it.
-
-        Raises:
-            TokenError: the sample is not here.
-            NotAvailableError: not of motion.
-            ResultsError: its arrays are missing or damaged, or the file was changed.
-        """
-        contents = self._with(token)
-        if not isinstance(contents, MotionContents):
-            raise NotAvailableError(f"{self.path}: {self.task} results have no trajectories; motion results have")
-        return contents.trajectories(token)
+        contents = self._contents
+        if token not in contents.tokens:
+            raise TokenError(f"{self.path}: has no prediction of {token!r}; `tokens` lists those that it has")
+        return contents.prediction(token)
 
     def check(
         self,
@@ -357,12 +333,6 @@ class Results:
     @property
     def _contents(self) -> Contents:
         return contents_of(self._file, self.fingerprint)[0]
-
-    def _with(self, token: str) -> Contents:
-        contents = self._contents
-        if token not in contents.tokens:
-            raise TokenError(f"{self.path}: has no prediction of {token!r}; `tokens` lists those that it has")
-        return contents
 
 
 def read_results(path: str | os.PathLike[str]) -> Results:

@@ -78,7 +78,7 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
 class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """How motion is stored."""
 
-    stored: Annotated[Stored, Meta(description="Maps of ids and paths, or a model's own maps.")]
+    stored: Annotated[Stored, Meta(description="Maps of ids, or a model's own maps.")]
     x: Annotated[Axis, Meta(description="Start, end and cell size, metres, x forward in the present ego frame.")]
     y: Annotated[Axis, Meta(description="Start, end and cell size, metres, y left in the present ego frame.")]
     orientation: Annotated[Orientation, Meta(description="How cells lie in the maps.")]

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from contextlib import suppress
-from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from types import MappingProxyType
 from typing import Any, Final
 
 import msgspec
@@ -29,43 +26,31 @@ from deepaccident_devkit.evaluation.results.header import (
     told_of,
 )
 from deepaccident_devkit.evaluation.results.motion_arrays import (
-    PATHS,
-    check_sample,
+    NOT_READ,
     head_arrays,
     instance_arrays,
     member_name,
     members,
     put_array,
+    stored_output,
 )
 from deepaccident_devkit.evaluation.results.records import MotionFile, Shard, Stored
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.reading import check_size, file_checksum, irregular_text, shortened
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Manifest:
-    """The form and the shards of motion results.
-
-    Attributes:
-        form: how predictions are stored.
-        shards: the archives.
-        shard_of: token → number of its shard, in the order of the shards.
-    """
-
-    form: MotionForm
-    shards: tuple[Shard, ...]
-    shard_of: Mapping[str, int]
-
-
-def read_manifest(document: MotionFile, root: Path) -> Manifest:
+def read_manifest(document: MotionFile, root: Path) -> tuple[MotionForm, dict[str, Shard]]:
     """The manifest of the results in a folder, with a check that its shards exist and have their sizes.
+
+    Returns:
+        How predictions are stored, and token → its shard, in the order of the shards.
 
     Raises:
         ContentError: names the field, or the shard.
     """
     with at("form"):
         form = MotionForm.from_record(document.form)
-    shard_of: dict[str, int] = {}
+    shard_of: dict[str, Shard] = {}
     files: set[str] = set()
     for number, shard in enumerate(document.shards):
         with at(f"shards[{number}]"):
@@ -75,10 +60,10 @@ def read_manifest(document: MotionFile, root: Path) -> Manifest:
             with at(f"shards[{number}].tokens"):
                 check_token(token)
             if token in shard_of:
-                others = "twice" if shard_of[token] == number else f"also in {document.shards[shard_of[token]].file}"
+                others = "twice" if shard_of[token] is shard else f"also in {shard_of[token].file}"
                 raise ContentError(f"{shard.file}: {token}: stands there {others}; store a sample once")
-            shard_of[token] = number
-    return Manifest(form, tuple(document.shards), MappingProxyType(shard_of))
+            shard_of[token] = shard
+    return form, shard_of
 
 
 def _is_inside(path: PurePosixPath) -> bool:
@@ -110,28 +95,14 @@ def _check_file(shard: Shard, root: Path, others: AbstractSet[str]) -> None:
 _OPEN_FILES: Final = 8
 
 
-class OpenShards:
-    """Archives of a folder, the last few of which stay open; safe in threads and in forked workers."""
+@lru_cache(maxsize=_OPEN_FILES)
+def shared_archive(root: Path, shard: Shard, _process: int) -> zipfile.ZipFile:
+    """A shard's archive, one of the last few, which stay open; raises ContentError.
 
-    def __init__(self, root: Path) -> None:
-        """Start without any open."""
-        self._root = root
-        self._open: OrderedDict[str, zipfile.ZipFile] = OrderedDict()
-        self._process = os.getpid()
-
-    def archive(self, shard: Shard) -> zipfile.ZipFile:
-        """The open archive; raises ContentError. Threads may share it, so the garbage collector closes it."""
-        if self._process != os.getpid():  # a fork shares positions in open files with its parent
-            self._open, self._process = OrderedDict(), os.getpid()
-        archive = self._open.get(shard.file)
-        if archive is None:
-            archive = opened(self._root, shard)
-            self._open[shard.file] = archive
-            while len(self._open) > _OPEN_FILES:
-                self._open.popitem(last=False)
-        with suppress(KeyError):
-            self._open.move_to_end(shard.file)
-        return archive
+    Threads may share it, so the garbage collector closes it. A fork shares positions in open files with its parent, and
+    so must name its own process.
+    """
+    return opened(root, shard)
 
 
 def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
@@ -144,7 +115,7 @@ def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
             _check_members(archive, shard, form)
             for token in shard.tokens:
                 with at(token):
-                    check_sample(archive, token, form)
+                    stored_output(archive, token, form)
 
 
 def opened(root: Path, shard: Shard) -> zipfile.ZipFile:
@@ -156,7 +127,7 @@ def opened(root: Path, shard: Shard) -> zipfile.ZipFile:
 
 
 def _check_members(archive: zipfile.ZipFile, shard: Shard, form: MotionForm) -> None:
-    possible = {member_name(token, name) for token in shard.tokens for name in (*members(form), *PATHS)}
+    possible = {member_name(token, name) for token in shard.tokens for name in (*members(form), *NOT_READ)}
     for name, times in Counter(archive.namelist()).items():
         if name not in possible:
             raise ContentError(f"{name}: belongs to no sample of the shard; store the arrays of its tokens alone")
@@ -257,7 +228,7 @@ class ShardWriter:
         if output.instances is not None and output.instances.min() < 0:
             raise ResultsError(f"instances: expected ids from 1, and 0 elsewhere, found {output.instances.min()}")
         if self._store == "instances":
-            return instance_arrays(output, self._labels)
+            return instance_arrays(output)
         if output.heads is None:
             raise ResultsError("expected heads, found instance maps; write those with store='instances'")
         if any(heads.ignore_index is not None for heads in output.heads):

@@ -51,11 +51,11 @@ class ResultsWriter:
             meta: what readers should know: method, training, author; as JSON holds it.
             grid: of motion, that of all predictions; None takes the first one's.
             step: of motion, seconds between two frames.
-            labels: of motion, the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned from, which says
-                where in its cell a point is; None if it is not known.
-            store: of motion, `instances` keeps instance maps and paths, some 30 KB a sample of five predictions; heads
-                are post-processed as the released evaluation of motion does (docs/released_code.md, Post-processing).
-                The released accident evaluation does that in its own way, and from instance maps its numbers differ
+            labels: of motion, the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned from, which it is
+                compared with; None if it is not known.
+            store: of motion, `instances` keeps instance maps, some 30 KB a sample of five predictions; heads are
+                post-processed as the released evaluation of motion does (docs/released_code.md, Post-processing). The
+                released accident evaluation does that in its own way, and from instance maps its numbers differ
                 slightly. `heads` keeps the maps of the model as they are: 34 MB a sample of six predictions.
 
         Raises:

@@ -24,7 +24,15 @@ from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import path_of, remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.json_text import Record, as_record, parsed_json
-from deepaccident_devkit.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes, shortened
+from deepaccident_devkit.reading import (
+    MOST_TOLD,
+    check_size,
+    fault_text,
+    file_checksum,
+    irregular_text,
+    read_bytes,
+    shortened,
+)
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
 SUMMARY_FILE: Final = "metrics_summary.json"
@@ -43,8 +51,6 @@ Line = Annotated[
     ),
 ]
 """A name, a path, a checksum: what shows in a terminal, in a line."""
-_MOST_TOLD: Final = 600
-"""Characters of what is wrong, names in the file among them."""
 _REMEDY: Final = "give a folder that `deepaccident evaluate … --out` wrote, or evaluate again"
 
 
@@ -108,30 +114,14 @@ class Bundle(ShortRepr):
     Attributes:
         folder: where.
         summary: of `metrics_summary.json`.
+        setup: task and rules.
+        selection: which samples.
     """
 
     folder: Path
     summary: Mapping[str, Any]
-
-    @property
-    def setup(self) -> EvaluationSetup:
-        """Task and rules; raises ResultsError if there are no such ones."""
-        try:
-            return EvaluationSetup(**{name: self.summary[name] for name in ("task", "protocol", "switches", "horizon")})
-        except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # whatever a switch's value can cause
-            raise self._damaged(error) from error
-
-    @property
-    def selection(self) -> SampleSelection:
-        """Which samples; raises ResultsError if there is no such choice."""
-        try:
-            agents = self.summary["agents"]
-            return SampleSelection(
-                agents=None if agents is None else tuple(agents),
-                **{name: self.summary[name] for name in ("split", "samples", "scope", "horizon")},
-            )
-        except (TypeError, ValueError) as error:
-            raise self._damaged(error) from error
+    setup: EvaluationSetup
+    selection: SampleSelection
 
     @property
     def dataroot(self) -> str:
@@ -222,10 +212,6 @@ class Bundle(ShortRepr):
             raise ResultsError(f"{copies}: expected one results file or folder, found {len(inside)}; {_REMEDY}")
         return inside[0]
 
-    def _damaged(self, reason: object) -> ResultsError:
-        told = shortened(str(reason), _MOST_TOLD)
-        return ResultsError(f"{self.folder / SUMMARY_FILE}: does not say what was evaluated: {told}; {_REMEDY}")
-
 
 def read_bundle(folder: Path) -> Bundle:
     """Open a bundle; raises ResultsError if there is none that this devkit can read."""
@@ -234,8 +220,17 @@ def read_bundle(folder: Path) -> Bundle:
         raise ResultsError(f"{folder}: no such folder; {_REMEDY}")
     path = folder / SUMMARY_FILE
     summary = read_json(path, SUMMARY_FORMAT)
-    _record(path, summary, _Summary, "does not say what was evaluated: ")
-    return Bundle(folder=folder, summary=summary)
+    unclear = "does not say what was evaluated: "
+    _record(path, summary, _Summary, unclear)
+    try:
+        setup = EvaluationSetup(**{name: summary[name] for name in ("task", "protocol", "switches", "horizon")})
+        selection = SampleSelection(
+            agents=None if summary["agents"] is None else tuple(summary["agents"]),
+            **{name: summary[name] for name in ("split", "samples", "scope", "horizon")},
+        )
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # whatever a switch's value can cause
+        raise ResultsError(f"{path}: {unclear}{shortened(str(error), MOST_TOLD)}; {_REMEDY}") from error
+    return Bundle(folder=folder, summary=summary, setup=setup, selection=selection)
 
 
 def _stated(path: Path, form: str, kind: type[Record]) -> Record:

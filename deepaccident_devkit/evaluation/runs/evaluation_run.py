@@ -43,7 +43,6 @@ from deepaccident_devkit.evaluation.runs.selection import (
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
-from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
@@ -187,22 +186,8 @@ class EvaluationRun:
 
     def __repr__(self) -> str:
         """Task, protocol, whether it is partial, and the first headlines."""
-        return f"EvaluationRun({self._title}: {self.result!r})"
-
-    def _repr_html_(self) -> str:
-        """The headlines, with the intervals of the breakdown `all`."""
-        everyone = next((each for each in self.breakdowns if each.by == "all" and each.groups), None)
-        intervals = everyone.groups[0].intervals if everyone else {}
-        heading = f"{everyone.resampling.confidence:.0%} interval" if everyone and intervals else ""
-        ends = {path: f"[{low:.3f}, {high:.3f}]" for path, (low, high) in intervals.items()}
-        shown = headlines(self.setup.task, self.result)
-        rows = [(each.name, each.text(), ends.get(each.path, "")) for each in shown]
-        return table_html([("number", "value", heading), *rows], f"{self._title}, {len(self.evaluator):,} samples")
-
-    @property
-    def _title(self) -> str:
         mark = "" if self.partial is None else f", {self.partial.text()}"
-        return f"{self.setup.task}, protocol {self.setup.protocol}{mark}"
+        return f"EvaluationRun({self.setup.task}, protocol {self.setup.protocol}{mark}: {self.result!r})"
 
     @property
     def stamp(self) -> dict[str, Any]:
@@ -424,8 +409,9 @@ def _covered_tokens(
 ) -> list[str]:
     if not covered.is_complete and not allow_partial:
         remedy = (
-            "; give results of these samples, choose the list that they are of, or evaluate the samples that have a "
-            "prediction with allow_partial=True (--allow-partial), which marks every number as partial"
+            "; give results of these samples, choose the list that they are of (--split, --agents, --samples, --scope, "
+            "--horizon; in Python a SampleSelection), or evaluate the samples that have a prediction with "
+            "allow_partial=True (--allow-partial), which marks every number as partial"
         )
         raise ResultsError(f"{results.path}: {covered.to_text()}{remedy if covered.missing or covered.unknown else ''}")
     tokens = [token for token in selection.tokens(dataset) if token in results]

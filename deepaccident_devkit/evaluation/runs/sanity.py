@@ -7,11 +7,10 @@ first share is large enough, and clearly larger than the second.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxAccidents
 from deepaccident_devkit.evaluation.metrics.alarms.raised import LABEL_STEP, by_sureness, position_difference
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
@@ -75,56 +74,31 @@ _STRAIGHT: Final = np.deg2rad(15)
 """A heading that is nearer to one of the true box's four directions is right; at random, a third of them are."""
 _RANDOM: Final = 0.5
 """Share of right headings below which they look random."""
-_LATEST: Final = 2.0
-"""Horizons: half of the alarms are later only in another unit of time."""
 _ORDERS: Final = {
     f"sizes in the order {', '.join(('length', 'width', 'height')[axis] for axis in order)}": order
     for order in permutations(range(3))
     if order != (0, 1, 2)
 }
 _CLASSES: Final = "classes swapped"
-_LATE: Final = {"one step late": 1, "two steps late": 2}
+_FEWEST_FRAMES: Final = 3
+"""In so few frames, slow predictions look late."""
 _SAYS: Final[Mapping[Group, Mapping[str, str]]] = {
     "place": {
         **dict.fromkeys(_AXES, "x is forward and y to the left; of maps, state the orientation that they have"),
-        "world y mirrored": "the world frame is right-handed, and CARLA's is not: negate y, and headings with it",
         "world frame for ego frame": "places are given in the world frame; give them in the present ego frame",
         "ego frame for world frame": 'boxes are given in the ego frame; move them by da.world_from(token, "ego")',
         "LiDAR frame for world frame": 'boxes are given in the LiDAR frame; move them by da.world_from(token, "lidar")',
         "LiDAR frame for ego frame": "boxes of the LiDAR frame were moved by the ego pose; take the LiDAR's pose",
         "ego frame for LiDAR frame": "boxes of the ego frame were moved by the LiDAR's pose; take the ego pose",
-        "actors and background swapped": "channel 0 and id 0 are the background; channel 1, and ids from 1, actors",
     },
     "time": {
         "frames reversed": "the first frame of a prediction is the present, and times are counted from there",
-        **dict.fromkeys(_LATE, "frames and boxes show earlier moments; the first frame is the sample's own: no past"),
+        "one step late": "frames and boxes show earlier moments; the first frame is the sample's own: no past",
     },
     "size": dict.fromkeys(_ORDERS, "results files hold width, length, height; Boxes hold length, width, height"),
     "class": {_CLASSES: f"the classes are, counted from 0, {', '.join(CATEGORIES)}"},
 }
-MISTAKES: Final[Mapping[str, str]] = MappingProxyType(
-    {name: says for group in _SAYS.values() for name, says in group.items()}
-)
-"""All mistakes that are undone on trial → what is right."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate(FrozenMappings):
-    """How well predictions fit the labels once one mistake is undone.
-
-    Attributes:
-        name: of `MISTAKES`.
-        description: what is right.
-        score: the share of the truth that is hit once it is undone, in [0, 1].
-        given: that share of the predictions as they were given.
-        suspected: whether the score is so much better that it should be looked into.
-    """
-
-    name: str
-    description: str
-    score: float
-    given: float
-    suspected: bool
+"""Group → mistakes that are undone on trial → what is right."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,18 +107,15 @@ class SanityReport(FrozenMappings):
 
     Attributes:
         samples: how many were looked at.
-        candidates: all mistakes that these samples can show, suspected or not.
         warnings: sentences; none if nothing looks wrong.
     """
 
     samples: int
-    candidates: tuple[Candidate, ...]
     warnings: tuple[str, ...]
 
     def to_text(self) -> str:
         """How much was looked at, and the warnings."""
-        head = f"Sanity check of {self.samples} samples; {len(self.candidates)} mistakes looked for."
-        return "\n".join([head, self.warnings_text() or NOTHING_WRONG])
+        return f"Sanity check of {self.samples} samples.\n{self.warnings_text() or NOTHING_WRONG}"
 
     def warnings_text(self) -> str:
         """The warnings alone, a line each; empty if there is none."""
@@ -156,56 +127,35 @@ def check_sanity(
     results: Results,
     setup: EvaluationSetup,
     tokens: Collection[str],
-    *,
-    samples: int | None = None,
     **how: Unpack[Engine],
 ) -> SanityReport:
-    """Whether predictions look as if a classic mistake (`MISTAKES`) was made in all of them; or empty, or constant.
+    """Whether predictions look as if a classic mistake was made in all of them; or empty, or constant.
 
-    Correct predictions raise no suspicion, nor do bad ones that make none of these mistakes.
+    Correct predictions raise no suspicion, nor do bad ones that make none of these mistakes. Looked at are 20 samples,
+    or 60 of accident lists, always the same.
 
     Args:
         dataset: the release.
         results: the predictions.
         setup: the rules that they are evaluated by.
         tokens: the samples that are evaluated, each with a prediction.
-        samples: how many of them are looked at, always the same; None for 20, or 60 of accident lists.
         **how: `workers` (1 if not given), `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
-        ConfigError: `samples` is less than 1.
         EvaluationError: the results are not of a kind that the task takes, or there is no sample.
     """
     lists = results.task == "accident"
-    count = (_LISTS if lists else _SAMPLES) if samples is None else samples
-    if count < 1:
-        raise ConfigError(f"samples: expected at least 1, found {samples}")
     if not tokens:
         raise EvaluationError("tokens: there is no sample to look at")
     alarmed = [token for token in tokens if lists and results.prediction(token)]  # few may be
     listed = sorted(alarmed or tokens)
-    drawn = np.random.default_rng(0).permutation(len(listed))[:count]
+    drawn = np.random.default_rng(0).permutation(len(listed))[: _LISTS if lists else _SAMPLES]
     loader = SampleLoader(dataset, results, setup)
     how = {"workers": 1, **how}
-    seen = run_batch(
-        partial(_seen, loader),
-        [listed[each] for each in drawn],
-        places=loader.places,
-        **how,
-    )
-    candidates = _candidates(seen, results.task)
-    suspected = [each for each in candidates if each.suspected]
-    warnings = [
-        f"{each.name}: {each.description} ({each.score:.0%} of the truth is hit once that is undone, "
-        f"{each.given:.0%} as it is)"
-        for each in suspected
-    ]
-    warnings += _facts(
-        seen, setup, ranked=not lists or setup.task == "warning" or isinstance(setup.rules, BoxAccidents)
-    )
-    if not any(each.name in _SAYS["place"] for each in suspected):
-        warnings += _headings_text(seen)
-    return SanityReport(samples=len(seen), candidates=candidates, warnings=tuple(warnings))
+    seen = run_batch(partial(_seen, loader), [listed[each] for each in drawn], places=loader.places, **how)
+    ranked = not lists or setup.task == "warning" or isinstance(setup.rules, BoxAccidents)
+    warnings = (*_mistakes(seen, results.task), *_facts(seen, ranked=ranked))
+    return SanityReport(samples=len(seen), warnings=warnings)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -218,7 +168,6 @@ class _Seen:
             are found under the name of each (columns).
         empty: whether nothing is predicted.
         scores: of all boxes or accidents.
-        time: of the surest accident, seconds.
         probabilities: whether all logits are in [0, 1].
         headings: of the boxes found, those that are right, and all.
     """
@@ -226,7 +175,6 @@ class _Seen:
     tallies: Mapping[str, FloatArray]
     empty: bool = False
     scores: Sequence[float] = ()
-    time: float | None = None
     probabilities: bool = False
     headings: tuple[int, int] = (0, 0)
 
@@ -244,28 +192,30 @@ def _seen(loader: SampleLoader, token: str) -> _Seen:
     return _accidents_seen(loader, token, prediction, more[0])
 
 
-def _candidates(seen: Sequence[_Seen], task: str) -> tuple[Candidate, ...]:
-    """All that was looked for; of a group at most the best one is suspected, and none beside a wrong place."""
+def _mistakes(seen: Sequence[_Seen], task: str) -> Iterator[str]:
+    """What undoing a mistake shows: of a group at most the best one, and nothing beside a wrong place."""
     sums: dict[str, FloatArray] = {}
     for name, tally in (each for one in seen for each in one.tallies.items()):
         sums[name] = sums.get(name, 0.0) + tally
     if _CLASSES in sums:
         sums[_CLASSES] = _class_tally(sums[_CLASSES])
-    found: list[Candidate] = []
-    misplaced = False
     for group, says in _SAYS.items():
-        told = [name for name in says if name in sums and sums[name][1].any()]
-        tried = [_candidate(name, sums[name], _LEAST[group], _EVIDENCE[task]) for name in told]
-        best = max((each for each in tried if each.suspected), key=lambda each: each.score, default=None)
-        found += [replace(each, suspected=each is best and not misplaced) for each in tried]
-        misplaced = misplaced or (group == "place" and best is not None)
-    return tuple(found)
-
-
-def _candidate(name: str, tally: FloatArray, least: float, evidence: int) -> Candidate:
-    score, given = _worst(*tally[:2]), _worst(*tally[2:])
-    suspected = score >= max(least, _MARGIN * given) and tally[0].sum() >= evidence
-    return Candidate(name=name, description=MISTAKES[name], score=score, given=given, suspected=bool(suspected))
+        suspected = []
+        for name in (each for each in says if each in sums):
+            score, given = map(_worst, sums[name][::2], sums[name][1::2])
+            if score >= max(_LEAST[group], _MARGIN * given) and sums[name][0].sum() >= _EVIDENCE[task]:
+                suspected.append((score, given, name))
+        if suspected:
+            score, given, name = max(suspected, key=lambda each: each[0])
+            yield f"{name}: {says[name]} ({score:.0%} of the truth is hit once that is undone, {given:.0%} as it is)"
+            if group == "place":
+                return
+    right, every = (sum(each.headings[index] for each in seen) for index in (0, 1))
+    if every >= _EVIDENCE["detection"] and right < _RANDOM * every:
+        yield (
+            f"headings look random: {right} of {every} are right, apart from quarters of a turn; are they degrees in "
+            "place of radians, or not predicted? A heading is counted counter-clockwise from x of the world"
+        )
 
 
 def _worst(part: FloatArray, whole: FloatArray) -> float:
@@ -273,7 +223,7 @@ def _worst(part: FloatArray, whole: FloatArray) -> float:
     return float((part[tells] / whole[tells]).min(initial=1.0))
 
 
-def _facts(seen: Sequence[_Seen], setup: EvaluationSetup, *, ranked: bool) -> Iterable[str]:
+def _facts(seen: Sequence[_Seen], *, ranked: bool) -> Iterator[str]:
     """What shows without the labels."""
     if all(each.empty for each in seen):
         yield f"all {len(seen)} predictions looked at are empty: nothing is predicted in them"
@@ -287,21 +237,6 @@ def _facts(seen: Sequence[_Seen], setup: EvaluationSetup, *, ranked: bool) -> It
         yield (
             "all values of the heads' segmentation are between 0 and 1: write logits and not probabilities, which the "
             "released accident rule takes for actors everywhere"
-        )
-    times = [each.time for each in seen if each.time is not None]
-    if times and np.median(times) > _LATEST * setup.horizon:
-        yield (
-            f"half of the accidents are more than {np.median(times):g} s ahead, the horizon is {setup.horizon:g} s: "
-            "times are seconds after the present, not frames, and not of the recording"
-        )
-
-
-def _headings_text(seen: Sequence[_Seen]) -> Iterable[str]:
-    right, every = (sum(each.headings[index] for each in seen) for index in (0, 1))
-    if every >= _EVIDENCE["detection"] and right < _RANDOM * every:
-        yield (
-            f"headings look random: {right} of {every} are right, apart from quarters of a turn; are they degrees in "
-            "place of radians, or not predicted? A heading is counted counter-clockwise from x of the world"
         )
 
 
@@ -319,14 +254,12 @@ def _motion_seen(prediction: MotionOutput, label: MotionLabels) -> _Seen:
     places = {
         name: _turned_maps(given[:1], axes) for name, axes in _AXES.items() if grid.x == grid.y or abs(axes[0]) == 1
     }
-    places["actors and background swapped"] = ~given[:1]
     tallies = {name: _overlap(undone, true[:1], given[:1], true[:1]) for name, undone in places.items()}
     changing = np.asarray(true.any(axis=0) & ~true.all(axis=0))
     true, given, backwards = true & changing, given & changing, every[::-1][:frames] & changing
     times = {"frames reversed": _overlap(backwards, true, given, true)}
-    for name, lag in _LATE.items():
-        if frames > lag + 2:  # in fewer frames, slow predictions look late
-            times[name] = _overlap(given[lag:], true[:-lag], given[lag:], true[lag:])
+    if frames > _FEWEST_FRAMES:
+        times["one step late"] = _overlap(given[1:], true[:-1], given[1:], true[1:])
     tallies |= {name: np.pad(each, ((0, 0), (0, len(every) - each.shape[1]))) for name, each in times.items()}
     values = (prediction.heads or ())[-1].segmentation if prediction.instances is None else None
     empty = not every.any()
@@ -416,7 +349,6 @@ def _moved_back(dataset: Dataset, token: str, center: FloatArray) -> dict[str, F
     in_ego = ego.inverse().apply(center)
     return {
         **{name: ego.apply(_turned(in_ego, axes)) for name, axes in _AXES.items()},
-        "world y mirrored": center * (1, -1, 1),
         "ego frame for world frame": ego.apply(center),
         "LiDAR frame for world frame": lidar.apply(center),
         "LiDAR frame for ego frame": lidar.apply(in_ego),
@@ -429,17 +361,13 @@ def _same_size(found: FloatArray, true: FloatArray) -> BoolArray:
 
 
 def _class_tally(names: FloatArray) -> FloatArray:
-    """(4, N) of the N classes that have another one's name by the one-to-one renaming that explains most."""
-    from scipy.optimize import linear_sum_assignment
-
+    """(4, N) of the N classes that are mostly found under the name of another one, each of a different one."""
     number = names.sum(axis=1)
-    share = names / np.maximum(number, 1.0)[:, None]
-    _, other = linear_sum_assignment(
-        share + 1e-3 * np.eye(len(names)), maximize=True
-    )  # who is not found keeps its name
+    other = names.argmax(axis=1)
     changed = np.flatnonzero((other != np.arange(len(names))) & (number >= _FEWEST))
-    if len(changed) == 1 and 2 * number[changed].sum() < number.sum():
-        changed = changed[:0]  # one rare class that is taken for another is no mistake of order
+    alone = len(changed) == 1 and 2 * number[changed].sum() < number.sum()
+    if alone or len(set(other[changed])) < len(changed):
+        changed = changed[:0]  # a rare class, or several, that are taken for another: no mistake of order
     whole = number[changed]
     return np.array([names[changed, other[changed]], whole, names[changed, changed], whole])
 
@@ -451,7 +379,7 @@ def _accidents_seen(loader: SampleLoader, token: str, alarms: Sequence[Accident]
         return _Seen(tallies={}, empty=True)
     surest = min(alarms, key=by_sureness)
     if context.truth is None or context.truth.accident is None:
-        return _Seen(tallies={}, scores=scores, time=surest.time)
+        return _Seen(tallies={}, scores=scores)
     true, given = context.truth.accident, surest.positions
     world = np.column_stack([given, np.zeros(2)])
     places = {name: _turned(given, axes) for name, axes in _AXES.items()}
@@ -465,13 +393,12 @@ def _accidents_seen(loader: SampleLoader, token: str, alarms: Sequence[Accident]
         )
         for name, undone in places.items()
     }
-    times = {name: surest.time - lag * LABEL_STEP for name, lag in _LATE.items()}
-    times["frames reversed"] = loader.setup.horizon - surest.time
+    times = {"one step late": surest.time - LABEL_STEP, "frames reversed": loader.setup.horizon - surest.time}
     tallies |= {
         name: _told(abs(undone - true.time), abs(surest.time - true.time), abs(undone - surest.time), _NEAR_IN_TIME)
         for name, undone in times.items()
     }
-    return _Seen(tallies=tallies, scores=scores, time=surest.time)
+    return _Seen(tallies=tallies, scores=scores)
 
 
 def _told(undone: float, given: float, change: float, near: float) -> FloatArray:

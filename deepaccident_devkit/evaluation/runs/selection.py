@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import shlex
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.arrays import ShortRepr
@@ -20,18 +19,6 @@ SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
 _SHOWN: Final = 3
 """Samples that a message names."""
-_LISTS: Final[tuple[tuple[SampleList, ScopeName, float], ...]] = (
-    ("evaluate", "accident", 2.0),
-    ("evaluate", "all", 2.0),
-    ("evaluate", "accident", 3.0),
-    ("evaluate", "accident", 4.0),
-    ("evaluate", "all", 3.0),
-    ("evaluate", "all", 4.0),
-    ("all", "all", 2.0),
-    ("all", "accident", 2.0),
-)
-"""The lists of a split's samples that a user could mean."""
-_DEFAULT_HORIZON: Final = 2.0
 LIST_STEP: Final = 0.5
 """Seconds from one sample of a list to the next."""
 
@@ -52,7 +39,7 @@ class SampleSelection:
     samples: SampleList = "evaluate"
     scope: ScopeName = "accident"
     agents: tuple[str, ...] | None = None
-    horizon: float = _DEFAULT_HORIZON
+    horizon: float = 2.0
 
     def __post_init__(self) -> None:
         """Check and put the agents in order; raises ChoiceError."""
@@ -98,15 +85,6 @@ class SampleSelection:
         whose = "all agents" if self.agents is None else f"agents {', '.join(self.agents)}"
         return f"split {self.split}, samples {self.samples}{within}, scope {self.scope}, {whose}"
 
-    def choices(self) -> dict[str, Any]:
-        """The fields that say which list it is: all but agents and a horizon that are the default."""
-        named: dict[str, Any] = {"split": self.split, "samples": self.samples, "scope": self.scope}
-        if self.agents is not None:
-            named["agents"] = self.agents
-        if self.samples == "evaluate" and self.horizon != _DEFAULT_HORIZON:
-            named["horizon"] = self.horizon
-        return named
-
 
 def scenario_of(token: str) -> str:
     """The scenario's token in a sample's."""
@@ -138,16 +116,16 @@ class Coverage(ShortRepr):
         missing: of the list, without a prediction.
         extra: samples of this release with a prediction that are not in the list.
         unknown: tokens of predictions that are no samples of this release.
-        guess: the list that the results were probably made for; None where they cover theirs, or fit none.
-        guess_share: the share of samples that this list and the results have in common, of all in either.
+        splits: that the predictions are of.
+        agents: likewise, in the order of `taxonomy.AGENTS`.
     """
 
     expected: int
     missing: tuple[str, ...] = ()
     extra: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()
-    guess: SampleSelection | None = None
-    guess_share: float = 0.0
+    splits: tuple[str, ...] = ()
+    agents: tuple[str, ...] = ()
 
     @property
     def is_complete(self) -> bool:
@@ -155,7 +133,7 @@ class Coverage(ShortRepr):
         return not (self.missing or self.extra or self.unknown)
 
     def to_text(self) -> str:
-        """The differences: how many, three of each, and the list that was probably meant; or that all are there."""
+        """The differences: how many, three of each, and what predictions there are; or that all are there."""
         if self.is_complete:
             return f"all {self.expected} samples have a prediction, and nothing else has"
         parts = [
@@ -168,19 +146,11 @@ class Coverage(ShortRepr):
                 "leave them out with --allow-partial (allow_partial=True); no sample lacks a prediction, so the "
                 "numbers are not partial then"
             )
-        if self.guess is not None:
-            shared = "they have just its samples" if self.guess_share == 1 else f"{self.guess_share:.0%} in common"
-            parts += [f"the results were probably made for {self.guess.text()} ({shared})", _again(self.guess)]
+        if self.agents:
+            parts.append(
+                f"the predictions are of the splits {', '.join(self.splits)} and the agents {', '.join(self.agents)}"
+            )
         return "; ".join(part for part in parts if part)
-
-
-def _again(guess: SampleSelection) -> str:
-    """How to evaluate another list, with options of the command line and in Python."""
-    choices = guess.choices()
-    words = {name: ",".join(value) if name == "agents" else str(value) for name, value in choices.items()}
-    options = " ".join(f"--{name} {shlex.quote(value)}" for name, value in words.items())
-    arguments = ", ".join(f"{name}={value!r}" for name, value in choices.items())
-    return f"repeat with {options}, in Python with SampleSelection({arguments})"
 
 
 def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelection) -> Coverage:
@@ -199,48 +169,16 @@ def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelect
     expected, given = selection.tokens(dataset), set(results)
     others = sorted(given.difference(expected))
     unknown = {token for token in others if not _is_sample(dataset, token)}
-    found = Coverage(
+    present = {agent_of(token) for token in given - unknown}
+    splits = {dataset.get("scenario", name)["split"] for name in set(map(scenario_of, given - unknown))}
+    return Coverage(
         expected=len(expected),
         missing=tuple(token for token in expected if token not in given),
         extra=tuple(token for token in others if token not in unknown),
         unknown=tuple(token for token in others if token in unknown),
+        splits=tuple(name for name in SPLITS if name in splits),
+        agents=tuple(name for name in AGENTS if name in present),
     )
-    if found.is_complete:
-        return found
-    guess, share = _probably_meant(dataset, given, selection)
-    return found if guess is None else replace(found, guess=guess, guess_share=share)
-
-
-def _probably_meant(
-    dataset: Dataset, given: Collection[str], selection: SampleSelection
-) -> tuple[SampleSelection | None, float]:
-    """The list with the largest share of common samples, the first of equal ones; none if the asked one is no worse."""
-    present = {agent_of(token) for token in given}
-    here = {agent["name"] for agent in dataset.agent}  # a partial release may lack some
-    agents = None if present.issuperset(here) else tuple(name for name in AGENTS if name in present)
-    best, most = None, _overlap(given, selection.tokens(dataset))
-    for candidate in _candidates(selection, agents):
-        try:
-            share = _overlap(given, candidate.tokens(dataset))
-        except (ChoiceError, NotAvailableError):  # this release has no such split, or nothing of it
-            continue
-        if share > most:
-            best, most = candidate, share
-    return best, most
-
-
-def _candidates(selection: SampleSelection, agents: Sequence[str] | None) -> Iterator[SampleSelection]:
-    whose = None if agents is None else tuple(agents)
-    if whose == ():
-        return
-    for split in dict.fromkeys([selection.split, *SPLITS, *MINI_SPLITS]):
-        for name, scope, horizon in _LISTS:
-            yield SampleSelection(split=split, samples=name, scope=scope, agents=whose, horizon=horizon)
-
-
-def _overlap(first: Collection[str], second: Collection[str]) -> float:
-    common = len(set(first).intersection(second))
-    return common / (len(first) + len(second) - common) if common else 0.0
 
 
 def _is_sample(dataset: Dataset, token: str) -> bool:

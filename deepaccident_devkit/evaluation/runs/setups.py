@@ -19,6 +19,7 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     detection_truth,
 )
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenDict
 from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningEvaluator
 from deepaccident_devkit.evaluation.results import Results
@@ -75,7 +76,7 @@ class EvaluationSetup:
         object.__setattr__(self, "protocol", protocol)
         if not 0 < self.horizon <= _LONGEST_HORIZON:
             raise ConfigError(f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}")
-        object.__setattr__(self, "switches", MappingProxyType(dict(self.switches)))
+        object.__setattr__(self, "switches", FrozenDict(self.switches))
         switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)  # refuses impossible choices
 
     @property
@@ -96,14 +97,6 @@ class EvaluationSetup:
             "horizon": self.horizon,
             "settings": self.evaluator().settings,
         }
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle without the view of the switches, which cannot be."""
-        return _setup, (self.task, self.protocol, dict(self.switches), self.horizon)
-
-
-def _setup(task: TaskName, protocol: str, switches: dict[str, Any], horizon: float) -> EvaluationSetup:
-    return EvaluationSetup(task=task, protocol=protocol, switches=switches, horizon=horizon)
 
 
 _EVALUATORS: Final[Mapping[str, Callable[[Any], Evaluator[Any]]]] = {

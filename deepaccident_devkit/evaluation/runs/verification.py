@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -63,23 +63,18 @@ class Difference(ShortRepr):
         where = shortened(self.where if self.where.isprintable() else ascii(self.where), _LONGEST_PLACE)
         return f"{where}: stored {_short(self.stored)}, found {_short(self.found)}"
 
-    def as_dict(self) -> dict[str, Any]:
-        """By name."""
-        return {"where": self.where, "stored": self.stored, "found": self.found}
 
-
-def differing(stored: Any, found: Any, *, without: Collection[str] = ()) -> Iterator[tuple[str, Any, Any]]:
+def differing(
+    stored: Any, found: Any, *, without: Collection[str] = (), path: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
     """The paths at which two values differ that JSON can hold, and what is there; numbers must be exactly equal.
 
     Args:
         stored: one of them.
         found: the other.
         without: paths that do not count, with all below them.
+        path: of both.
     """
-    yield from _differing(stored, found, "", frozenset(without))
-
-
-def _differing(stored: Any, found: Any, path: str, without: frozenset[str]) -> Iterator[tuple[str, Any, Any]]:
     if path in without:
         return
     parts: Mapping[Any, tuple[Any, Any]] | None = None
@@ -93,7 +88,7 @@ def _differing(stored: Any, found: Any, path: str, without: frozenset[str]) -> I
             yield path, stored, found
         return
     for name, (one, other) in parts.items():
-        yield from _differing(one, other, f"{path}/{name}" if path else str(name), without)
+        yield from differing(one, other, without=without, path=f"{path}/{name}" if path else str(name))
 
 
 def _short(value: Any) -> str:
@@ -143,7 +138,7 @@ class Verification(ShortRepr):
             "folder": os.fspath(self.folder),
             "same": self.is_same,
             "samples": self.samples,
-            "differences": [each.as_dict() for each in self.differences],
+            "differences": [asdict(each) for each in self.differences],
             "notes": list(self.notes),
         }
 

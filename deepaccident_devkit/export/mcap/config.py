@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.results import Prediction, Results
-from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.motion.config import label_config
-from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OnError
-from deepaccident_devkit.text import choice, possible_text, settle_choices, spelled
+from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
+from deepaccident_devkit.text import choice, possible_text
 from deepaccident_devkit.v2x import Agents
 
 EPOCH: Final = 1_704_067_200
 """Unix seconds of every scenario's first frame: recordings have no date, but viewers need one (2024-01-01 UTC)."""
 EXPORTED_CHANNELS: Final = (*CAMERAS, LIDAR)
-Predictions = Results | Mapping[str, Prediction]
-"""Predictions by sample token."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,29 +26,20 @@ class McapConfig:
             there (`v2x.Agents`).
         channels: sensors to export: cameras and `lidar01`; None for all of these.
         frames: numbers of frames, from 1; None for all.
-        points: `all`, or n for every n-th point of a cloud.
-        labels: whether to write the boxes.
-        motion_labels: configuration of motion labels, or the name of a preset (`motion.PRESETS`); None for none.
-        on_missing: what to do about missing sensor files: `skip` leaves them out and logs their number, `raise` raises
-            MissingFileError.
+        points: n for every n-th point of a cloud; 1 for all.
     """
 
     agents: Agents = None
     channels: Iterable[str] | None = None
     frames: Iterable[int] | None = None
-    points: Literal["all"] | int = "all"
-    labels: bool = True
-    motion_labels: MotionLabelConfig | str | None = None
-    on_missing: OnError = "skip"
+    points: int = 1
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError."""
         object.__setattr__(self, "channels", _channel_names(self.channels))
         object.__setattr__(self, "frames", _frame_numbers(self.frames))
-        settle_choices(self, {"on_missing": get_args(OnError)})
-        if self.motion_labels is not None:
-            object.__setattr__(self, "motion_labels", label_config(self.motion_labels))
-        _ = self.point_step
+        if checked_whole("points", self.points, "n for every n-th point", ChoiceError) < 1:
+            raise ChoiceError(f"points: expected a number from 1, for every n-th point, found {self.points!r}")
 
     @classmethod
     def of(cls, **choices: Any) -> McapConfig:
@@ -63,16 +49,6 @@ class McapConfig:
             if name not in names:
                 raise ChoiceError(f"export_mcap has no {name!r}; there are {possible_text(name, names)}")
         return cls(**choices)
-
-    @property
-    def point_step(self) -> int:
-        """The n of "every n-th point is written"."""
-        if spelled(self.points, ("all",)) == "all":
-            return 1
-        step = checked_whole("points", self.points, "'all', or n for every n-th point", ChoiceError)
-        if step < 1:
-            raise ChoiceError(f"points: expected 'all', or a number from 1 for every n-th point, found {self.points!r}")
-        return step
 
     def frame_numbers(self, last: int) -> tuple[int, ...]:
         """The wanted frames of a scenario with `last` frames, ascending; raises ChoiceError if one is not there."""

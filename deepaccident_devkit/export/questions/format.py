@@ -17,6 +17,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableErr
 from deepaccident_devkit.evaluation.metrics.accident import box_truth
 from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.questions.observed import (
+    RATE,
     Observations,
     Seen,
     Window,
@@ -113,11 +114,10 @@ class Questions(ShortRepr, Format):
             NotAvailableError: all of them are too short for a window.
         """
         lengths = {token: dataset.scenario.get(token)["num_frames"] for token in scenarios}
-        if not any(self.window.windows(length, token, self.seed) for token, length in lengths.items()):
+        if not any(self.window.windows(length) for length in lengths.values()):
             raise NotAvailableError(
                 f"no recording is long enough for a window of {self.window.observe:g} s: the longest has "
-                f"{max(lengths.values()) * FRAME_PERIOD:.1f} s; observe less (--observe), or let windows begin before "
-                "the recording (WindowRules(partial_past=True))"
+                f"{max(lengths.values()) * FRAME_PERIOD:.1f} s; observe less (--observe)"
             )
         return super().units(dataset, scenarios)
 
@@ -192,7 +192,7 @@ def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Outpu
     output.leave_out(_ABSENT, sum(agent not in here for agent in form.agents))
     for ego in (agent for agent in here if agent in form.agents):
         agents = _agents_of(dataset, scenario, ego, form.observers)
-        windows = form.window.windows(record["num_frames"], f"{scenario}/{ego}", form.seed)
+        windows = form.window.windows(record["num_frames"])
         output.leave_out(_ALONE, not agents)
         output.leave_out(_SHORT, bool(agents) and not windows)
         if agents and windows:
@@ -217,7 +217,7 @@ def _pairs(
         sample = sample_token(observed.scenario, observed.agents[0], window.present)
         seen, paths = observed.seen(window), observed.paths(window)
         names = names_of(seen, paths, observed.own_ids, window.times)
-        what = (sample, *observed.agents, f"{rules.observe:g}", str(rules.rate), form.seen)
+        what = (sample, *observed.agents, f"{rules.observe:g}", str(RATE), form.seen)
         key = digest(form.seed, "question", *what)  # the same for the same sample, observers and moments
         question = {
             "id": key,

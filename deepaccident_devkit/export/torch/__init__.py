@@ -11,7 +11,7 @@
 
 `V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch; without `collate_fn` a loader uses
 `collate`. `AllEgosDataset` and `collate_all_egos` have the targets of all agents for one reading of their sensors.
-docs/training.md has a training loop. `EvaluationSampler` and `merged_evaluator` are for several GPUs.
+docs/training.md has a training loop. `merged_evaluator` is for several GPUs.
 Only this package imports torch; importing it without torch raises MissingExtraError.
 """
 
@@ -30,11 +30,10 @@ from deepaccident_devkit.export.torch.all_egos import AllEgosDataset
 from deepaccident_devkit.export.torch.collate import collate, collate_all_egos, collate_fusion
 from deepaccident_devkit.export.torch.config import RandomAugmentation, V2XConfig
 from deepaccident_devkit.export.torch.dataset import V2XDataset
-from deepaccident_devkit.export.torch.distributed import EvaluationSampler, merged_evaluator
+from deepaccident_devkit.export.torch.distributed import merged_evaluator
 
 __all__ = [
     "AllEgosDataset",
-    "EvaluationSampler",
     "ImageConfig",
     "RandomAugmentation",
     "V2XConfig",

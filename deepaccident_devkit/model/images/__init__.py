@@ -12,14 +12,11 @@ from deepaccident_devkit.model.images.encoder import (
     image_encoder,
     normalised,
 )
-from deepaccident_devkit.model.images.resnet import ResNet, ResNetConfig
 from deepaccident_devkit.model.images.swin import Swin, SwinConfig, from_official
 
 __all__ = [
     "EncoderConfig",
     "FpnNeck",
-    "ResNet",
-    "ResNetConfig",
     "SmallConv",
     "SmallConvConfig",
     "Swin",

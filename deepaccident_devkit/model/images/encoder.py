@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.images.resnet import ResNet, ResNetConfig
 from deepaccident_devkit.model.images.swin import Swin, SwinConfig
 
 
@@ -111,29 +109,24 @@ def _convolution(in_channels: int, out_channels: int, *, stride: int = 1) -> tup
     return convolution, nn.BatchNorm2d(out_channels)
 
 
-EncoderConfig = SwinConfig | ResNetConfig | SmallConvConfig
-_BACKBONES: Final[Mapping[type, Callable[[Any], Swin | ResNet | SmallConv]]] = {
-    SwinConfig: Swin,
-    ResNetConfig: ResNet,
-    SmallConvConfig: SmallConv,
-}
+EncoderConfig = SwinConfig | SmallConvConfig
 _MEAN: Final = (0.485, 0.456, 0.406)
 _STD: Final = (0.229, 0.224, 0.225)
-"""Of ImageNet's R, G, B in [0, 1]; the published weights of Swin and ResNet expect them."""
+"""Of ImageNet's R, G, B in [0, 1]; the published weights of Swin expect them."""
 
 
-def image_encoder(config: EncoderConfig) -> tuple[Swin | ResNet | SmallConv, FpnNeck]:
+def image_encoder(config: EncoderConfig) -> tuple[Swin | SmallConv, FpnNeck]:
     """A backbone and its neck; `neck(backbone(images))` are the features.
 
     They map (N, 3, h, w) to (N, `config.neck_channels`, h', w'), with h' and w' the rounded up h / `config.stride` and
     w / `config.stride`. They come apart because the release keeps them under the names `img_backbone` and `img_neck`.
 
     Raises:
-        ConfigError: the configuration is of none of the three encoders.
+        ConfigError: the configuration is of neither encoder.
     """
-    if type(config) not in _BACKBONES:
-        raise ConfigError(f"expected a SwinConfig, a ResNetConfig or a SmallConvConfig, found {config!r}")
-    backbone = _BACKBONES[type(config)](config)
+    if not isinstance(config, EncoderConfig):
+        raise ConfigError(f"expected a SwinConfig or a SmallConvConfig, found {config!r}")
+    backbone = Swin(config) if isinstance(config, SwinConfig) else SmallConv(config)
     # the small encoder saves time where most of its neck's work would be
     first_kernel = 1 if isinstance(config, SmallConvConfig) else 3
     return backbone, FpnNeck(sum(backbone.out_channels), config.neck_channels, first_kernel=first_kernel)

@@ -15,7 +15,6 @@ from deepaccident_devkit.v2x import AgentConfig, Agents
 _WHOLE: Final = {
     "steps": 1,
     "moments": 1,
-    "accumulate": 1,
     "validate_every": 1,
     "validation_samples": 0,
     "save_every": 1,
@@ -35,7 +34,6 @@ class TrainConfig:
         steps: of the optimizer.
         moments: of a step, on each process; all agents of a moment are encoded once.
         egos: of a moment, how many agents are the ego in turn, drawn in each step; None for all that are there.
-        accumulate: how many times as many moments a step has, one after another, for GPUs with little memory.
         agents: who cooperates with each ego (`v2x.cooperating_agents`); None for all that are there.
         partner_dropout: the probability that a partner is not heard in a step.
         alone: the probability that none is heard.
@@ -58,7 +56,6 @@ class TrainConfig:
     steps: int = 1500
     moments: int = 1
     egos: int | None = None
-    accumulate: int = 1
     agents: Agents = "all"
     partner_dropout: float = 0.3
     alone: float = 0.2

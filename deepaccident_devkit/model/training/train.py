@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import logging
 import os
@@ -55,8 +54,6 @@ from deepaccident_devkit.render.training import save_training
 logger = logging.getLogger(__name__)
 RUN: Final = "run.json"
 CURVES: Final = "curves.png"
-_TIMED: Final = 2
-"""Steps that are timed before a run, and then not taken."""
 Say = Callable[[str], None]
 
 
@@ -86,7 +83,7 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
         device: `auto`, `cpu`, `cuda`, …
         workers: processes that read; 0 for this one.
         images_cache: of `V2XConfig`.
-        say: told how long it will take, and each validation; None for silence, and no progress bar.
+        say: told each validation; None for silence, and no progress bar.
 
     Returns:
         The path of the best weights; the last ones if nothing was validated.
@@ -185,12 +182,10 @@ class _Run:
         tokens = validation_samples(self.dataset, self.config)
         if self.place.is_first:
             cut_log(self.folder, progress.step)
-        if progress.step < self.config.steps:
-            self.say(self._estimate(model, progress, len(tokens)))
         numbers = positions(
             len(self.moments),
             self.config,
-            first=progress.step * self.config.moments * self.config.accumulate,
+            first=progress.step * self.config.moments,
             rank=self.place.rank,
             ranks=self.place.ranks,
         )
@@ -213,35 +208,32 @@ class _Run:
 
     def _step(self, number: int, step: nn.Module, optimizer: AdamW, given: Any) -> dict[str, Any]:
         """One step of the optimizer; all that is random depends on its number."""
-        config, began, waited = self.config, time.perf_counter(), 0.0
+        began = time.perf_counter()
         step.train()
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate(number, config)
+            group["lr"] = learning_rate(number, self.config)
         optimizer.zero_grad(set_to_none=True)
-        sums: dict[str, float] = {}
-        for part in range(config.accumulate):
-            asked = time.perf_counter()
-            batch = next(given)
-            waited += time.perf_counter() - asked
-            losses = self._losses(step, batch, (number, part))
-            torch.stack(list(losses.values())).sum().div(config.accumulate).backward()
-            for name, value in losses.items():
-                sums[name] = sums.get(name, 0.0) + float(value.detach()) / config.accumulate
+        asked = time.perf_counter()
+        batch = next(given)
+        waited = time.perf_counter() - asked
+        losses = self._losses(step, batch, number)
+        torch.stack(list(losses.values())).sum().backward()
         trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        norm = float(nn.utils.clip_grad_norm_(trained, config.clip))
+        norm = float(nn.utils.clip_grad_norm_(trained, self.config.clip))
         optimizer.step()
+        values = {name: float(loss.detach()) for name, loss in losses.items()}
         return {
             "step": number + 1,
-            "loss": sum(sums.values()),
-            "losses": sums,
-            "rate": learning_rate(number, config),
+            "loss": sum(values.values()),
+            "losses": values,
+            "rate": learning_rate(number, self.config),
             "norm": norm,
             "seconds": time.perf_counter() - began,
             "waiting": waited,
         }
 
-    def _losses(self, step: nn.Module, batch: Mapping[str, Any], numbers: tuple[int, int]) -> dict[str, Tensor]:
-        seeds = (self.config.seed, *numbers, self.place.rank)
+    def _losses(self, step: nn.Module, batch: Mapping[str, Any], number: int) -> dict[str, Tensor]:
+        seeds = (self.config.seed, number, 0, self.place.rank)  # the 0 keeps the draws of published runs
         generator = generator_of(*seeds)
         torch.manual_seed(generator_of(*seeds).initial_seed())  # dropout, and the latents' noise
         inputs, targets = training_batch(batch, self.moments.model, self.config, generator)
@@ -289,25 +281,3 @@ class _Run:
 
     def _draw(self) -> None:
         save_training(read_log(self.folder), self.folder.name, self.folder / CURVES)
-
-    def _estimate(self, model: V2XFormer, progress: Progress, samples: int) -> str:
-        """How long the run will take, by steps on a copy of the model that are not taken."""
-        config, left = self.config, self.config.steps - progress.step
-        trial = TrainingStep(copy.deepcopy(model))
-        numbers = positions(len(self.moments), config, first=0)
-        took = []
-        for index, batch in zip(range(_TIMED), batches(self.moments, numbers, config), strict=False):
-            began = time.perf_counter()
-            torch.stack(list(self._losses(trial, batch, (index, 0)).values())).sum().backward()
-            took.append(time.perf_counter() - began)
-        each = min(took) * config.accumulate
-        times = samples and -(-config.steps // config.validate_every) - progress.step // config.validate_every
-        return f"{left:,} steps on {self.place.device}, {each:.2f} s each: some {_duration(left * each)}" + (
-            f", and {times} × {samples} samples to validate" if times else ""
-        )
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -11,7 +11,7 @@ from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, Alarm
+from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, ERRORS_AT, Alarm, hit_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.boxes import write_beside
@@ -129,15 +129,15 @@ def accuracy_by_distance(evaluator: AccidentEvaluator, distances: FloatArray) ->
     protocol = evaluator.protocol
     if not isinstance(protocol, BoxAccidents | PaperAccidents):
         return None
-    samples, scoring = _samples(evaluator), protocol.scoring
+    samples = _samples(evaluator)
     accuracy = []
     for distance in distances.tolist():
         tp = fp = fn = 0
         for positive, alarms in samples:
-            hit = positive and scoring.hit(alarms, distance) is not None
+            hit = positive and hit_of(alarms, distance) is not None
             tp += hit
             fp += len(alarms) - hit
-            fn += positive and not hit and (scoring.far_is_missed or not alarms)
+            fn += positive and not hit
         accuracy.append(ratio(tp, tp + fp / 2 + fn / 2))
     return np.array(accuracy)
 
@@ -169,9 +169,9 @@ def alarm_precision_recall(evaluator: AccidentEvaluator) -> tuple[FloatArray, Fl
     """
     if not isinstance(evaluator.protocol, BoxAccidents):
         return np.zeros(0), np.zeros(0)
-    scoring, scored, positives = evaluator.protocol.scoring, [], 0
+    scored, positives = [], 0
     for positive, alarms in _samples(evaluator):
-        hit = scoring.hit(alarms, scoring.errors_at) if positive else None
+        hit = hit_of(alarms, ERRORS_AT) if positive else None
         scored += [(alarm["score"], alarm is hit) for alarm in alarms]
         positives += positive
     if not scored or not positives:

@@ -139,15 +139,7 @@ def _groups(task: str, broken: Breakdown[Any], groups: Sequence[Group[Any]], who
 
 def _sanity(report: Mapping[str, Any]) -> dict[str, Any]:
     """What a sanity check says, as `SanityReport.as_dict` has it."""
-    return {
-        "samples": report["samples"],
-        "warnings": report["warnings"],
-        "said": [] if report["warnings"] else [NOTHING_WRONG],
-        "looked": [
-            [each["name"], _share(each["given"]), _share(each["score"]), scalar(each["suspected"]), each["description"]]
-            for each in report["candidates"]
-        ],
-    }
+    return {"warnings": report["warnings"], "said": [] if report["warnings"] else [NOTHING_WRONG]}
 
 
 def _choices(run: EvaluationRun) -> Iterator[tuple[str, Any]]:
@@ -179,10 +171,6 @@ def _interval_text(headline: Headline, group: Group[Any] | None) -> str:
         return ""
     digits = 2 if headline.unit == "%" else 3
     return f"{low:.{digits}f} to {high:.{digits}f}"
-
-
-def _share(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
 
 
 def save_report(

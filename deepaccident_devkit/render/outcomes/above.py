@@ -19,8 +19,7 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     detection_matches,
     detection_protocol,
 )
-from deepaccident_devkit.evaluation.metrics.motion import MotionProtocol
-from deepaccident_devkit.evaluation.metrics.motion.evaluator import RANGES, motion_protocol
+from deepaccident_devkit.evaluation.metrics.motion.evaluator import RANGES
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_matches
 from deepaccident_devkit.evaluation.metrics.predictions import (
     Accident,
@@ -30,7 +29,7 @@ from deepaccident_devkit.evaluation.metrics.predictions import (
     labels_at_present,
 )
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.motion import POST_PROCESSING, MotionLabels
 from deepaccident_devkit.render.axes import Layer, axes_or_new, layers_of, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, draw_trail, write_beside
 from deepaccident_devkit.render.chips import keep_free
@@ -314,27 +313,23 @@ class MotionOutcome(ShortRepr):
         return {name: np.unique(maps[kinds == kind]).astype(np.int64) for name, kind in named.items()}
 
 
-def motion_outcome(
-    prediction: MotionOutput, label: MotionLabels, protocol: str | MotionProtocol = "released"
-) -> MotionOutcome:
-    """Which instances match by a motion protocol's VPQ, in its widest range.
+def motion_outcome(prediction: MotionOutput, label: MotionLabels) -> MotionOutcome:
+    """Which instances match by VPQ, in its widest range.
 
     Args:
         prediction: a model's output; of several predictions the last one is taken.
         label: the truth on the same grid; frames in their own ego frames are warped to the present.
-        protocol: name, or a protocol.
 
     Raises:
-        ChoiceError: no such protocol.
         EvaluationError: the present is not recorded.
     """
-    rules, frames = motion_protocol(protocol), frames_there(label)
+    frames = frames_there(label)
     true = _cut(maps_of_labels(labels_at_present(label)), frames)
-    predicted = maps_of_output(prediction, step=true.step, post_processing=rules.instances)
+    predicted = maps_of_output(prediction, step=true.step, post_processing=POST_PROCESSING["motion"])
     predicted = _cut(predicted, frames)
     extent = max(RANGES.values())
     within = (slice(None), *cells_within(true.grid, extent))
-    matches = vpq_matches(predicted.instance[within], true.instance[within], rules.vpq)
+    matches = vpq_matches(predicted.instance[within], true.instance[within])
     return MotionOutcome(true=true, predicted=predicted, matches=matches, extent=extent)
 
 

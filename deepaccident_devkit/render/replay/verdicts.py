@@ -8,6 +8,7 @@ from typing import Any, Final
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Accident, AccidentContext, BoxAccidents, MotionOutput, accident_context
 from deepaccident_devkit.evaluation.metrics.accident import Prediction
+from deepaccident_devkit.evaluation.metrics.accident.scoring import ERRORS_AT, hit_of
 from deepaccident_devkit.evaluation.metrics.alarms.raised import Pair, named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.truth import RELEASED_HORIZON
 from deepaccident_devkit.evaluation.metrics.predictions import checked_prediction
@@ -51,7 +52,7 @@ def verdicts(recording: Recording, prediction: Foreseen) -> dict[str, Any]:
         )
     rule = (
         f"Protocol boxes: an accident within {horizon:g} s counts as foreseen if the errors of the two places "
-        f"are less than {_RULES.scoring.errors_at:g} m in sum."
+        f"are less than {ERRORS_AT:g} m in sum."
     )
     return {"rule": rule, "samples": samples}
 
@@ -97,7 +98,7 @@ def _verdict(given: Prediction, label: MotionLabels | None, context: AccidentCon
     counts = _RULES.counts(given, label, context)
     if counts["unjudged"] and not (counts["positive"] or counts["alarms"]):
         return "not judged"
-    return count_words(_RULES.result([counts]).within[_RULES.scoring.errors_at])
+    return count_words(_RULES.result([counts]).within[ERRORS_AT])
 
 
 def _alarm(
@@ -105,7 +106,7 @@ def _alarm(
 ) -> dict[str, Any]:
     counts = _RULES.counts([accident], None, context)
     off = counts["alarms"][0] if counts["alarms"] else None
-    right = bool(off and _RULES.scoring.hit([off], _RULES.scoring.errors_at))
+    right = bool(off and hit_of([off], ERRORS_AT))
     text = f"foreseen in {accident.time:.1f} s, score {accident.score:.2g}"
     if off and off["position"] is not None:
         text += f": places off by {off['position']:.1f} m, time by {off['time']:+.1f} s"

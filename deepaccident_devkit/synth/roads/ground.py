@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays
 from deepaccident_devkit.release.npz import TAGS
-from deepaccident_devkit.synth.roads.layout import EXTENT, LANE_WIDTH, OUTWARD, Arm, RoadSpec, slot_edges
+from deepaccident_devkit.synth.roads.layout import EXTENT, KERB_RADIUS, LANE_WIDTH, OUTWARD, Arm, RoadSpec, slot_edges
 
 MAP_EXTENT = EXTENT
 """The raster covers −`MAP_EXTENT` to `MAP_EXTENT` in x and y, metres."""
@@ -118,11 +118,11 @@ def _has_left_neighbour(arm: Arm, spec: RoadSpec) -> bool:
 def _round_left_corner(view: ByteArray, axis: FloatArray, spec: RoadSpec) -> None:
     """Make the corner between an arm and the one to its left round, in place."""
     along = axis[_HALF:]
-    low, high = spec.road_edge, spec.road_edge + spec.kerb_radius
+    low, high = spec.road_edge, spec.road_edge + KERB_RADIUS
     rows, columns = np.flatnonzero((axis > low) & (axis < high)), np.flatnonzero((along > low) & (along < high))
     off = np.hypot(axis[rows, None] - high, along[None, columns] - high)
     patch = view[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    patch[off > spec.kerb_radius] = ROAD
+    patch[off > KERB_RADIUS] = ROAD
 
 
 def _paint_arm(view: ByteArray, beside: FloatArray, spec: RoadSpec, *, yields: bool) -> None:
@@ -135,12 +135,10 @@ def _paint_arm(view: ByteArray, beside: FloatArray, spec: RoadSpec, *, yields: b
     for divider in range(1, spec.lanes):
         _paint(view, np.abs(across - divider * LANE_WIDTH) < 0.06, dashes, WHITE)
     edge = np.abs(across - spec.lanes_edge) < 0.06
-    _paint(view, edge, dashes if spec.parking else before, WHITE)
-    if spec.parking:
-        _paint(view, (across > spec.lanes_edge) & (across < spec.road_edge), _slot_lines(along, spec), WHITE)
-    if spec.crosswalks:
-        low, high = spec.crosswalk
-        _paint(view, _stripes(beside, spec.road_edge), (along > low) & (along < high), WHITE)
+    _paint(view, edge, dashes, WHITE)
+    _paint(view, (across > spec.lanes_edge) & (across < spec.road_edge), _slot_lines(along, spec), WHITE)
+    low, high = spec.crosswalk
+    _paint(view, _stripes(beside, spec.road_edge), (along > low) & (along < high), WHITE)
     incoming = (beside > 0.2) & (beside < spec.lanes_edge)
     stop = (along > spec.stop_line[0]) & (along < spec.stop_line[1])
     if spec.signalized or yields:

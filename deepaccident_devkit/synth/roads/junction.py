@@ -9,7 +9,7 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray, ShortRepr, readonly
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads.ground import GroundMap, paint_junction
-from deepaccident_devkit.synth.roads.layout import ARMS, OUTWARD, Arm, RoadSpec, Terrain, parking_places
+from deepaccident_devkit.synth.roads.layout import ARMS, KERB_RADIUS, OUTWARD, Arm, RoadSpec, Terrain, parking_places
 from deepaccident_devkit.synth.roads.paths import (
     Meeting,
     Path,
@@ -208,7 +208,7 @@ def _tangent(spec: RoadSpec, offset: float, turn: Turn) -> float:
     """Metres before the crossing of the lanes where a turn begins: as wide as kerb and usual driving allow."""
     if turn == "left":
         return tangent_of_radius(_LEFT_RADIUS)
-    kerb = np.sqrt(2) * (spec.road_edge - offset) + (np.sqrt(2) - 1) * spec.kerb_radius
+    kerb = np.sqrt(2) * (spec.road_edge - offset) + (np.sqrt(2) - 1) * KERB_RADIUS
     return min(tangent_of_corner(float(kerb) - _CLEARANCE), tangent_of_radius(_MAX_RIGHT_RADIUS))
 
 

@@ -168,12 +168,12 @@ LANE_WIDTH = 3.5
 PARKING_WIDTH = 2.4
 SIDEWALK_WIDTH = 3.0
 CROSSWALK_WIDTH = 3.0
+KERB_RADIUS = 5.0
+"""Radius of the rounded corners, metres."""
 MAX_LANES = 2
-_GUTTER = 0.4
 _MOUTH = 2.0
 """How many metres the mouth of an arm lies before the end of the rounded kerb."""
 _STOP_LINE = 0.4
-_KERB_RADII = (3.0, 10.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,28 +184,19 @@ class RoadSpec:
         kind: a three-way junction has no north arm.
         signalized: whether it has traffic lights.
         lanes: number of lanes in each direction, 1 or 2.
-        crosswalks: whether there are zebra crossings across the arms.
-        parking: whether there are parking strips beside the lanes.
         hump: a rise on one arm, or None.
-        kerb_radius: radius of the rounded corners, metres.
     """
 
     kind: RoadKind = "four-way"
     signalized: bool = True
     lanes: int = 1
-    crosswalks: bool = True
-    parking: bool = True
     hump: Hump | None = None
-    kerb_radius: float = 5.0
 
     def __post_init__(self) -> None:
         """Check every field."""
         object.__setattr__(self, "kind", choice("road.kind", self.kind, get_args(RoadKind), error=ConfigError))
         if not 1 <= self.lanes <= MAX_LANES:
             raise ConfigError(f"road.lanes: expected 1 or {MAX_LANES} in each direction, found {self.lanes}")
-        low, high = _KERB_RADII
-        if not low <= self.kerb_radius <= high:
-            raise ConfigError(f"road.kerb_radius: expected {low:g} to {high:g} metres, found {self.kerb_radius:g}")
         if self.hump is not None:
             self._check_hump(self.hump)
 
@@ -229,7 +220,7 @@ class RoadSpec:
     @property
     def road_edge(self) -> float:
         """Metres from an arm's middle line to the kerb."""
-        return self.lanes_edge + (PARKING_WIDTH if self.parking else _GUTTER)
+        return self.lanes_edge + PARKING_WIDTH
 
     @property
     def sidewalk_edge(self) -> float:
@@ -239,7 +230,7 @@ class RoadSpec:
     @property
     def mouth(self) -> float:
         """Metres from the junction's middle along an arm to where the arm and its crosswalk begin."""
-        return self.road_edge + self.kerb_radius - _MOUTH
+        return self.road_edge + KERB_RADIUS - _MOUTH
 
     @property
     def crosswalk(self) -> tuple[float, float]:
@@ -249,7 +240,7 @@ class RoadSpec:
     @property
     def stop_line(self) -> tuple[float, float]:
         """Where the stop line begins and ends, metres along an arm."""
-        near = self.crosswalk[1] + 0.7 if self.crosswalks else self.road_edge + self.kerb_radius + 0.4
+        near = self.crosswalk[1] + 0.7
         return near, near + _STOP_LINE
 
     def lane_center(self, lane: int) -> float:
@@ -285,8 +276,6 @@ def slot_edges(spec: RoadSpec) -> FloatArray:
 
 def parking_places(spec: RoadSpec) -> FloatArray:
     """x, y (metres), yaw (radians) of the middles of all slots (N, 3), in the direction of the traffic beside them."""
-    if not spec.parking:
-        return np.zeros((0, 3))
     edges = slot_edges(spec)
     along = (edges[:-1] + edges[1:]) / 2
     beside = spec.road_edge - PARKING_WIDTH / 2

@@ -2,43 +2,37 @@
 
 A file is read into a `SpecTemplate`, whose ranges and choices are still open; `draw` makes a `ScenarioSpec` from it.
 The parts, lowest layer first: `model` (the fields and their open choices), `reading` (YAML and types), `checks` (the
-rest), `catalogue` (templates, the designs, and the fields as text).
+rest), `catalogue` (templates and the designs).
 """
 
 from deepaccident_devkit.synth.spec.catalogue import (
     DESIGN_NUMBERS,
-    DESIGNS,
     SpecTemplate,
     design_text,
-    designs_text,
     draw,
-    field_tables,
     parse_spec,
+    read_design,
     read_spec,
 )
 from deepaccident_devkit.synth.spec.model import (
     ActorSpec,
     BackgroundSpec,
-    EndSpec,
     MeetSpec,
     ScenarioSpec,
     View,
 )
 
 __all__ = [
-    "DESIGNS",
     "DESIGN_NUMBERS",
     "ActorSpec",
     "BackgroundSpec",
-    "EndSpec",
     "MeetSpec",
     "ScenarioSpec",
     "SpecTemplate",
     "View",
     "design_text",
-    "designs_text",
     "draw",
-    "field_tables",
     "parse_spec",
+    "read_design",
     "read_spec",
 ]

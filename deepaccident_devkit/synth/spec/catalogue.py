@@ -1,13 +1,10 @@
-"""Scenario files from text to template, how to draw from it, the paper's twelve designs, and the table of fields."""
+"""Scenario files from text to template, how to draw from it, and the paper's twelve designs."""
 
-import dataclasses
 import os
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from inspect import cleandoc
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import numpy as np
 
@@ -22,12 +19,8 @@ from deepaccident_devkit.synth.spec.model import (
     Part,
     Role,
     ScenarioSpec,
-    default_of,
-    has_list,
-    key_of,
 )
-from deepaccident_devkit.synth.spec.reading import FieldType, field_types, parse_yaml, read_part, required_fields
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.synth.spec.reading import parse_yaml, read_part
 
 _EXCHANGED: dict[Role, Role] = {
     "ego": "other", "other": "ego", "ego_behind": "other_behind", "other_behind": "ego_behind",
@@ -69,19 +62,6 @@ class SpecTemplate:
         """Where the file names a field, for messages, such as `mine.yaml:6: meet`."""
         return f"{self.root.line(field)}: {self.root.path_of(field)}"
 
-    @property
-    def draws_alike(self) -> bool:
-        """Whether only numbers differ between draws: nobody's way, kind or lane is drawn from several."""
-        if self.root.values("exchange")[0] or self._has_two_lanes:
-            return False
-        parts = (self.root.fields[name] for name in ("road", "view", "actors", "meet") if name in self.root.fields)
-        return not any(has_list(part) for part in parts)
-
-    @property
-    def _has_two_lanes(self) -> bool:
-        """Whether a draw can have a road with two lanes, of which a driver's lane may be drawn."""
-        return any(isinstance(road, Part) and road.values("lanes") != (1,) for road in self.root.values("road"))
-
 
 def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
     """Make every choice of a scenario.
@@ -91,7 +71,7 @@ def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
     from the same arm as before.
 
     Args:
-        template: from `read_spec`, or one of `DESIGNS`.
+        template: from `read_spec` or `read_design`.
         rng: random numbers; the same numbers give the same scenario.
     """
     spec = cast("ScenarioSpec", template.root.draw(rng))
@@ -187,25 +167,6 @@ DESIGN_NUMBERS: Final = tuple(range(1, 13))
 """1 to 6 at signalised junctions, 7 to 12 at unsignalised ones."""
 
 
-class _Designs(Mapping[int, SpecTemplate]):
-    """Reads a design's file when it is first asked for."""
-
-    def __getitem__(self, number: int) -> SpecTemplate:
-        if number not in DESIGN_NUMBERS:
-            raise KeyError(number)
-        return _design(number)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(DESIGN_NUMBERS)
-
-    def __len__(self) -> int:
-        return len(DESIGN_NUMBERS)
-
-
-DESIGNS: Final[Mapping[int, SpecTemplate]] = _Designs()
-"""Number → design."""
-
-
 def design_text(number: int) -> str:
     """The text of a design's scenario file.
 
@@ -219,96 +180,6 @@ def design_text(number: int) -> str:
 
 
 @cache
-def _design(number: int) -> SpecTemplate:
+def read_design(number: int) -> SpecTemplate:
+    """The scenario of a design; raises ConfigError if there is no such design."""
     return parse_spec(design_text(number), f"design {number}")
-
-
-@dataclass(frozen=True, slots=True)
-class FieldEntry:
-    """A row of the table of fields.
-
-    Attributes:
-        key: the field's key in the file.
-        values: the possible values.
-        default: the value if the file does not have the key.
-        meaning: one or more sentences.
-    """
-
-    key: str
-    values: str
-    default: str
-    meaning: str
-
-
-def field_tables() -> dict[str, tuple[FieldEntry, ...]]:
-    """Path of a part of a scenario file, such as `road.hump`, → its fields; the path of the whole file is empty."""
-    return dict(_tables(ScenarioSpec, ""))
-
-
-def designs_text() -> str:
-    """The twelve designs: number, name, junction."""
-    rows = [("design  name", "junction")]
-    for number, template in DESIGNS.items():
-        (road,) = template.root.values("road")
-        lights = "signalised" if road.values("signalized")[0] else "unsignalised"
-        rows.append((f"{number:>6}  {template.name}", f"{road.values('kind')[0]}, {lights}"))
-    return columns_text(rows)
-
-
-def _tables(kind: type[Any], path: str) -> Iterator[tuple[str, tuple[FieldEntry, ...]]]:
-    types_of, meanings = field_types(kind), _meanings(kind)
-    required = required_fields(kind)
-    yield (
-        path,
-        tuple(
-            FieldEntry(
-                key_of(name),
-                _values(wanted),
-                "required" if name in required else _default(default_of(kind, name)),
-                meanings[name],
-            )
-            for name, wanted in types_of.items()
-        ),
-    )
-    for name, wanted in types_of.items():
-        inner, ending = (wanted.items, "[]") if wanted.items else (wanted, "")
-        if dataclasses.is_dataclass(inner.base):
-            yield from _tables(inner.base, f"{path}.{key_of(name)}{ending}".lstrip("."))
-
-
-def _values(wanted: FieldType) -> str:
-    if wanted.items is not None:
-        many = f"list of {wanted.length}" if wanted.length else "list"
-        return f"{many}: {_values(wanted.items)}"
-    if dataclasses.is_dataclass(wanted.base):
-        text = "keys and values"
-    elif wanted.words:
-        text = ", ".join(wanted.words)
-    else:
-        names = {str: "text", bool: "true, false", int: "whole number", float: "number"}
-        text = names[wanted.base] + (f", {wanted.bounds}" if wanted.bounds else "")
-    return f"{text}; or null" if wanted.optional else text
-
-
-def _default(value: Any) -> str:
-    if dataclasses.is_dataclass(value):
-        return "its defaults"
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(str, value))}]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "null" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _meanings(kind: type[Any]) -> dict[str, str]:
-    """Field name → its text in the docstring's section Attributes."""
-    lines = cleandoc(kind.__doc__ or "").partition("Attributes:\n")[2].splitlines()
-    meanings: dict[str, str] = {}
-    name = ""
-    for line in lines:
-        if line.startswith(" " * 8):
-            meanings[name] += f" {line.strip()}"
-        elif line.strip():
-            name, _, text = line.strip().partition(": ")
-            meanings[name] = text
-    return meanings

@@ -7,7 +7,7 @@ from typing import Final, TypeAlias, cast
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ARMS, Arm, Junction, RoadSpec, Turn
-from deepaccident_devkit.synth.spec.model import Items, Part, Role, default_of
+from deepaccident_devkit.synth.spec.model import Items, Part, Role
 
 _Way: TypeAlias = tuple[Arm, Turn, int]
 """Arm, turn and lane."""
@@ -18,16 +18,13 @@ _AGENTS: Final = (*_LEADING, *LEADERS)
 _AGENT_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
 _WALKING: Final = "pedestrian"
 _MOST_ACTORS: Final = 100
-_PARKED_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
-_ROLE_OF_CATEGORY: Final[Mapping[str, Role]] = {"cyclist": "background", _WALKING: _WALKING}
-"""Category that no agent can have → the role for it."""
 _FASTEST_WALK: Final = 3.0
 """m/s: from kerb to kerb no pedestrian becomes faster."""
 _FORBIDDEN: Final[Mapping[str, tuple[str, ...]]] = {
-    **dict.fromkeys(LEADERS, ("from_arm", "turn", "lane", "start_distance", "delay", "side", "lane_change")),
+    **dict.fromkeys(LEADERS, ("from_arm", "turn", "lane", "start_distance", "side", "lane_change")),
     **dict.fromkeys((*_LEADING, "background"), ("gap", "side")),
     _WALKING: ("turn", "lane", "gap", "ignores", "lane_change"),
-    "parked": ("turn", "lane", "gap", "ignores", "max_speed", "delay", "lane_change"),
+    "parked": ("turn", "lane", "gap", "ignores", "max_speed", "lane_change"),
 }
 """Role → fields that it cannot have."""
 
@@ -48,7 +45,6 @@ def check_scenario(root: Part) -> None:
         _check_way(actor, junctions)
         _check_lane(actor, junctions)
         _check_speed(actor)
-        _check_parking(root, actor)
     _check_view(root, actors)
     _check_meeting(root, actors, junctions)
 
@@ -101,24 +97,16 @@ def _check_category(actor: Part) -> None:
     possible = _possible_categories(role)
     for category in actor.values("category") if "category" in actor.fields else ():
         if category not in possible:
-            instead = (
-                f"; give the {category} the role {_ROLE_OF_CATEGORY[category]}" if _moves_to(role, category) else ""
+            remedy = (
+                f"choose {', '.join(possible)}; a cyclist has the role background, a pedestrian the role pedestrian"
             )
-            remedy = f"choose {', '.join(possible)}{instead}"
             raise _fault(actor, "category", f"the role {role} cannot be a {category}", remedy)
-
-
-def _moves_to(role: Role, category: str) -> bool:
-    """Whether another role is the remedy for a category that a role cannot have."""
-    return category in _ROLE_OF_CATEGORY and role in (*_AGENTS, "background")
 
 
 def _possible_categories(role: Role) -> tuple[str, ...]:
     if role == _WALKING:
         return (_WALKING,)
-    if role in _AGENTS:
-        return _AGENT_CATEGORIES
-    return _PARKED_CATEGORIES if role == "parked" else (*_AGENT_CATEGORIES, "cyclist")
+    return (*_AGENT_CATEGORIES, "cyclist") if role == "background" else _AGENT_CATEGORIES
 
 
 def _check_way(actor: Part, junctions: Sequence[Junction]) -> None:
@@ -158,13 +146,6 @@ def _check_speed(actor: Part) -> None:
     if _role(actor) == _WALKING and fastest > _FASTEST_WALK:
         sentence = f"expected 0.5 to {_FASTEST_WALK:g} m/s for a pedestrian, found {fastest:g}"
         raise _fault(actor, "max_speed", sentence, "walking is 1 to 2 m/s, running 3")
-
-
-def _check_parking(root: Part, actor: Part) -> None:
-    for road in root.values("road"):
-        if _role(actor) == "parked" and isinstance(road, Part) and False in road.values("parking"):
-            sentence = f"a vehicle cannot park where the road has no parking strips ({road.line('parking')})"
-            raise _fault(actor, "role", sentence, "leave it out, or set road.parking to true")
 
 
 def _check_roads(root: Part) -> None:
@@ -213,19 +194,18 @@ def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junct
                 raise _fault(meeting, "actors", sentence, "choose roles that one actor has")
         if first == second:
             raise _fault(meeting, "actors", f"{first} cannot meet itself", "name two roles")
-        if None not in root.values("meet"):
-            _check_timed(meeting, by_role[first])
-            _check_timed(meeting, by_role[second])
+        for role in (first, second) if None not in root.values("meet") else ():
+            _check_timed(meeting, by_role[role])
         if all(_drives(by_role[role]) and by_role[role].values("lane_change") == (None,) for role in (first, second)):
             _check_crossing(meeting, by_role[first], by_role[second], junctions)
 
 
 def _check_timed(meeting: Part, actor: Part) -> None:
-    """Start and delay of those who are timed follow from the meeting; of a pedestrian the start is its place."""
-    for name in ("delay",) if _role(actor) == _WALKING else ("start_distance", "delay"):
-        if any(value != default_of(actor.kind, name) for value in actor.values(name)):
-            sentence = f"follows from meet ({meeting.where}) for {_role(actor)}, who is timed"
-            raise _fault(actor, name, sentence, "leave it out; meet.offset says who comes later")
+    """The start of those who are timed follows from the meeting; that of a pedestrian is its place."""
+    role = _role(actor)
+    if role != _WALKING and actor.values("start_distance") != (None,):
+        sentence = f"follows from meet ({meeting.where}) for {role}, who is timed"
+        raise _fault(actor, "start_distance", sentence, "leave it out; meet.offset says who comes later")
 
 
 def meeting_roles(meeting: Part) -> tuple[Role, Role]:

@@ -38,7 +38,7 @@ class Bounds:
 
 Side = Literal["left", "right"]
 View = Literal["open", "hidden"]
-Rule = Literal["signal", "priority", "crosswalk"]
+Rule = Literal["signal", "priority"]
 Role = Literal["ego", "ego_behind", "other", "other_behind", "background", "pedestrian", "parked"]
 Category = Literal["car", "truck", "van", "cyclist", "motorcycle", "pedestrian"]
 Weather = Literal["Clear", "Cloudy", "HardRain", "MidRain", "SoftRain", "Wet", "WetCloudy"]
@@ -68,7 +68,6 @@ class ActorSpec:
             from there it stands; a pedestrian: how far from there it steps onto the road. If not given, it is drawn.
             Drivers of `meet` cannot have it: their start follows from their timing.
         gap: distance at the start, from bumper to bumper, to the vehicle that it follows; only for those behind.
-        delay: time that it waits before it starts to move; not for those of `meet`.
         side: side of the road, as a driver towards the junction sees it: where a parked vehicle stands, or from where
             a pedestrian steps onto the road.
         lane_change: how far before the middle of the junction it begins to change into the other lane of its road;
@@ -84,7 +83,6 @@ class ActorSpec:
     max_speed: Annotated[float, Bounds(0.5, 20, "m/s")] | None = None
     start_distance: Annotated[float, Bounds(0, 120, "m")] | None = None
     gap: Annotated[float, Bounds(2, 40, "m")] | None = None
-    delay: Annotated[float, Bounds(0, 10, "s")] = 0.0
     side: Side = "right"
     lane_change: Annotated[float, Bounds(10, 110, "m")] | None = None
     ignores: tuple[Rule, ...] = ()
@@ -123,20 +121,6 @@ class BackgroundSpec:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EndSpec:
-    """When the recording ends; a collision always ends it.
-
-    Attributes:
-        time: time at which it ends at the latest; but at least 4 s are recorded, and never less than up to the
-            accident's collision, which is planned for 5.5 s or later.
-        arrival: it also ends when ego is this far past the middle of the junction, along its path.
-    """
-
-    time: Annotated[float, Bounds(1, 20, "s")] = 10.0
-    arrival: Annotated[float, Bounds(10, 90, "m")] = 25.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioSpec:
     """A scenario to simulate, with every choice made.
 
@@ -152,7 +136,6 @@ class ScenarioSpec:
         background: all other road users.
         weather: weather of the whole recording, in the release's words.
         time_of_day: it decides the light.
-        end: when the recording ends.
     """
 
     name: str = "scenario"
@@ -165,7 +148,6 @@ class ScenarioSpec:
     background: BackgroundSpec = field(default_factory=BackgroundSpec)
     weather: Weather = "Clear"
     time_of_day: TimeOfDay = "Noon"
-    end: EndSpec = field(default_factory=EndSpec)
 
     def actor(self, role: Role) -> ActorSpec:
         """The first actor of a role; KeyError if there is none."""
@@ -306,15 +288,6 @@ Choice: TypeAlias = Fixed | Range | OneOf | Items | Part
 def _instances(choice: Choice) -> Iterator[Any]:
     for value in choice.alternatives():
         yield from value.instances() if isinstance(value, Part) else (value,)
-
-
-def has_list(choice: Choice) -> bool:
-    """Whether a value in it is drawn from a list of several."""
-    if isinstance(choice, Items):
-        return any(has_list(item) for item in choice.items)
-    if isinstance(choice, Part):
-        return any(has_list(inner) for inner in choice.fields.values())
-    return isinstance(choice, OneOf)
 
 
 def key_of(name: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 import types
 from collections.abc import Mapping
@@ -35,12 +34,10 @@ class Node:
     Attributes:
         where: such as `mine.yaml:12`; for the value of a key, the line of the key.
         value: a scalar, the entries of a mapping, or the items of a list.
-        quoted: whether it is a scalar in quotes.
     """
 
     where: str
     value: Scalar | Mapping[str, Node] | tuple[Node, ...]
-    quoted: bool = False
 
 
 def parse_yaml(text: str, source: str) -> Node:
@@ -101,8 +98,7 @@ class _Tree:
         if isinstance(raw, yaml.SequenceNode):
             items = enumerate(raw.value)
             return Node(where, tuple(self.node(item, item.start_mark.line, f"{path}[{k}]") for k, item in items))
-        quoted = isinstance(raw, yaml.ScalarNode) and raw.style in ("'", '"')
-        return Node(where, self._scalar(raw, line, path), quoted)
+        return Node(where, self._scalar(raw, line, path))
 
     def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
         try:
@@ -139,7 +135,6 @@ _MOST = 1e9
 """All numbers of a scenario are smaller."""
 _SHOWN_LENGTH = 80
 """The most characters of a found value that a message shows."""
-_KMH_OF_MS = 3.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +256,7 @@ def _read_one(node: Node, wanted: FieldType, path: str) -> Choice:
     value = spelled(value, wanted.words)
     fits = value in wanted.words if wanted.words else isinstance(value, wanted.base)
     if not fits:
-        remedy = _remedy(wanted, node) + meant_text(value, wanted.words)
+        remedy = _remedy(wanted, value) + meant_text(value, wanted.words)
         raise _wrong(node, path, _described(wanted), node, remedy)
     return Fixed(value)
 
@@ -270,9 +265,9 @@ def _number(node: Node, wanted: FieldType, path: str) -> float:
     value, bounds = node.value, wanted.bounds
     possible = (int,) if wanted.base is int else (int, float)
     if isinstance(value, bool) or not isinstance(value, possible) or not abs(value) < _MOST:
-        raise _wrong(node, path, _described(wanted), node, _remedy(wanted, node))
+        raise _wrong(node, path, _described(wanted), node, _remedy(wanted, value))
     if bounds is not None and not bounds.low <= value <= bounds.high:
-        raise _wrong(node, path, _described(wanted), node, _converted(bounds, value))
+        raise _wrong(node, path, _described(wanted), node)
     return wanted.base(value)  # type: ignore[no-any-return]
 
 
@@ -282,43 +277,13 @@ def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "") 
     return ConfigError(f"{node.where}: {path}: expected {expected}, found {clipped}{remedy}")
 
 
-def _remedy(wanted: FieldType, node: Node) -> str:
-    """The remedy if only quotes are wrong or missing, or if YAML reads a number as a text."""
-    value = node.value
+def _remedy(wanted: FieldType, value: Scalar) -> str:
+    """The remedy if only quotes are wrong or missing, or if YAML reads a number such as `1e1` as a text."""
     if wanted.base is str and not wanted.words and not isinstance(value, Mapping | tuple) and value is not None:
         return "; put it in quotes"
-    if wanted.base in (int, float) and isinstance(value, str) and _is_number(value):
-        return f"; write {_decimal(value)}, without quotes" if node.quoted else f"; {_as_yaml_number(value)}"
+    if wanted.base in (int, float) and isinstance(value, str):
+        return "; write a decimal number, without quotes and without e"
     return "; leave the quotes out" if wanted.base is bool and value in ("true", "false") else ""
-
-
-def _converted(bounds: Bounds, value: float) -> str:
-    """The hint for a speed that is possible in km/h."""
-    speed = value / _KMH_OF_MS
-    fits = bounds.unit == "m/s" and bounds.low <= speed <= bounds.high
-    return f"; {value:g} km/h are {speed:.1f} m/s" if fits else ""
-
-
-def _decimal(text: str) -> str:
-    """A number without an exponent."""
-    digits = f"{float(text):.9f}"
-    return digits.rstrip("0").rstrip(".")
-
-
-def _as_yaml_number(text: str) -> str:
-    """How to write a number that YAML reads as a text: `1e1` lacks the point, and the sign of the exponent."""
-    mantissa, _, exponent = text.lower().partition("e")
-    if not exponent:
-        return f"write {_decimal(text)}"
-    point, sign = "" if "." in mantissa else ".0", "" if exponent[0] in "+-" else "+"
-    return f"YAML reads it as a text: write {_decimal(text)}, or {mantissa}{point}e{sign}{exponent}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
 
 
 def _described(wanted: FieldType) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, TREE, Arm, GroundMap, RoadSpec, Terrain
-from deepaccident_devkit.synth.roads.layout import OUTWARD
+from deepaccident_devkit.synth.roads.layout import KERB_RADIUS, OUTWARD
 from deepaccident_devkit.synth.solids import Block, Color, Solids, build
 
 BASEMENT = 0.2
@@ -95,14 +95,10 @@ class SignalHead:
 
     Attributes:
         arm: by which the traffic comes.
-        position: x, y, z of the middle lamp, metres, ground frame.
-        yaw: direction in which the lamps shine, radians.
         rows: rows of the red, amber and green lamp in `World.props`.
     """
 
     arm: Arm
-    position: tuple[float, float, float]
-    yaw: float
     rows: tuple[int, int, int]
 
 
@@ -137,17 +133,11 @@ def signal_head(arm: Arm, light: Prop, first_row: int) -> SignalHead:
 
     Args:
         arm: whose light it is.
-        light: from `traffic_light`, at the height of its ground.
+        light: from `traffic_light`.
         first_row: row of the light's first block in the world's solids.
     """
-    amber, red_row = light.blocks[-2], first_row + len(light.blocks) - len(LAMP_COLORS)
-    out_x, out_y = OUTWARD[arm]
-    return SignalHead(
-        arm=arm,
-        position=(float(np.mean(amber.x)), float(np.mean(amber.y)), float(np.mean(amber.z))),
-        yaw=float(np.arctan2(out_y, out_x)),
-        rows=(red_row, red_row + 1, red_row + 2),
-    )
+    red_row = first_row + len(light.blocks) - len(LAMP_COLORS)
+    return SignalHead(arm=arm, rows=(red_row, red_row + 1, red_row + 2))
 
 
 def lanterns(spec: RoadSpec) -> Iterator[Prop]:
@@ -250,8 +240,8 @@ def kerb_house(spec: RoadSpec, corner: tuple[int, int]) -> Prop:
     Between it and the road there is only room for a mast.
     """
     near = spec.road_edge + KERB_INSET + _MAST_ROOM
-    kept = spec.kerb_radius - KERB_INSET - _MAST_ROOM
-    near = max(near, spec.road_edge + spec.kerb_radius - kept / float(np.sqrt(2)))
+    kept = KERB_RADIUS - KERB_INSET - _MAST_ROOM
+    near = max(near, spec.road_edge + KERB_RADIUS - kept / float(np.sqrt(2)))
     x, y = (_mirrored((near, near + _KERB_HOUSE_LENGTH), sign) for sign in corner)
     wall = _WALLS[0]
     return Prop(FIRST_BUILDING, (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), wall, facade=True),))

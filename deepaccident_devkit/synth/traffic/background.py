@@ -169,7 +169,7 @@ def _crosser(
     """A pedestrian on a crosswalk that no named road user drives over, while its arm has red."""
     used = {arm for user in named if user.route for arm in (user.route.from_arm, user.route.to_arm)}
     arms = [arm for arm in junction.arms if arm not in used]
-    if not arms or not junction.spec.crosswalks:
+    if not arms:
         return None
     arm = arms[rng.integers(len(arms))]
     delay = float(rng.uniform(0.0, 8.0))

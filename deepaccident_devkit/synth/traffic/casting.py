@@ -176,14 +176,13 @@ def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, ti
             start=0.0,
             start_speed=0.0,
             max_speed=max_speed,
-            delay=actor.delay,
             span=(0.0, path.length),
             ignores=actor.ignores,
         )
     route = junction.route(arm, actor.turn, actor.lane)
     start, speed = _FIRST_PLACE + 2 * _GAPS[1] + body.size[0], 0.0
     if actor.start_distance is not None:
-        start, speed = middle_of(route) - actor.start_distance, 0.0 if actor.delay else max_speed
+        start, speed = middle_of(route) - actor.start_distance, max_speed
     elif not timed:
         start, speed = middle_of(route) - float(rng.uniform(*_STARTS)), 0.8 * max_speed
     return RoadUser(
@@ -193,7 +192,6 @@ def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, ti
         start=start,
         start_speed=speed,
         max_speed=max_speed,
-        delay=actor.delay,
         route=route,
         span=lane_span(route),
         ignores=actor.ignores,

@@ -14,7 +14,7 @@ from deepaccident_devkit.synth.spec import ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
 from deepaccident_devkit.synth.traffic.casting import WARM_UP, Cast, cast_actors
-from deepaccident_devkit.synth.traffic.impact import Impact, Miss, impact_of, least_gap, measured_miss, touching_pairs
+from deepaccident_devkit.synth.traffic.impact import Impact, impact_of, least_gap, touching_pairs
 from deepaccident_devkit.synth.traffic.rights import AXIS_OF_ARM, SignalPlan, find_rights, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import Simulation, simulate
 from deepaccident_devkit.synth.traffic.users import RoadUser, middle_of
@@ -105,26 +105,22 @@ def _held(user: RoadUser, seconds: float) -> RoadUser:
     return user if seconds == 0 else replace(user, start_speed=0.0, delay=user.delay + seconds)
 
 
-def perform_accident(stage: Stage) -> Performance | None:
-    """What happens up to the contact of a pair that breaks its rules; None if they do not touch, or others do first."""
-    tried = try_accident(stage)
-    return tried if isinstance(tried, Performance) else None
+def try_accident(stage: Stage) -> Performance | float:
+    """What happens up to the contact of a pair that breaks its rules; if they do not touch, their least distance.
 
-
-def try_accident(stage: Stage) -> Performance | Miss:
-    """As `perform_accident`, but it says how the two missed each other."""
+    It is in metres; infinite if their paths do not cross, or if others touch before.
+    """
     pair = stage.cast.pair
     if pair is None:
-        return Miss()
+        return np.inf
     unruly = [replace(user, ignores=("signal", "priority")) for user in stage.cast.users]
     users = [unruly[row] if row in pair else user for row, user in enumerate(stage.users)]
     performance = _perform(stage, users, _LATEST, watched=pair)
-    if isinstance(performance, _Touching):
-        return Miss(gap=0.0, touched=performance.roles)
+    if performance is None:
+        return np.inf
     if performance.simulation.contact is not None:
         return performance
-    offset = stage.spec.meet.offset if stage.spec.meet else 0.0
-    return measured_miss(performance.simulation, pair, stage.cast.users, planned=(0.0, offset))
+    return least_gap(performance.simulation.poses, _sizes(stage.cast.users), list(pair), np.inf)
 
 
 def perform_twin(stage: Stage, end: float) -> Performance | None:
@@ -137,7 +133,7 @@ def perform_twin(stage: Stage, end: float) -> Performance | None:
     for late in _DELAYS:
         users = [_later(user.obeying(), late) if user.role in roles else user.obeying() for user in stage.users]
         performance = _perform(stage, users, end)
-        if isinstance(performance, _Touching):
+        if performance is None:
             continue
         if _keep_clear(stage, performance):
             return performance
@@ -167,24 +163,11 @@ def _keep_clear(stage: Stage, performance: Performance) -> bool:
     return least_gap(performance.simulation.poses, size, rows, _CLEAR) >= _CLEAR
 
 
-@dataclass(frozen=True, slots=True)
-class _Touching:
-    """Why a run is no performance: two touch, and none of the two can be left out.
-
-    Attributes:
-        roles: of the two.
-    """
-
-    roles: tuple[Role, Role]
-
-
 def _perform(
     stage: Stage, users: Sequence[RoadUser], end: float, watched: tuple[int, int] | None = None
-) -> Performance | _Touching:
-    """Simulate until nobody touches, each time without those of the background who did."""
+) -> Performance | None:
+    """Simulate until nobody touches, each time without those of the background who did; None if named ones touch."""
     present = list(range(len(users)))
-    named = len(stage.cast.users)
-    touching: tuple[Role, Role] = ("background", "background")
     for _ in range(_ROUNDS):
         there = [users[row] for row in present]
         rights = find_rights(there, minor=stage.spec.road.yielding_arms, blind=watched)
@@ -194,13 +177,11 @@ def _perform(
         pairs = set(_touching(stage, there, simulation)) - {tuple(sorted(watched or ()))}
         if not pairs:
             return Performance(simulation=simulation, present=tuple(present))
-        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j): (i, j) for i, j in sorted(pairs)}
-        first, second = leaving[min(leaving)]
-        touching = (there[first].role, there[second].role if second < len(there) else "parked")
-        if min(leaving) < named:
-            break
+        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j) for i, j in pairs}
+        if min(leaving) < len(stage.cast.users):
+            return None
         present = [row for place, row in enumerate(present) if place not in leaving]
-    return _Touching(touching)
+    return None
 
 
 def _touching(stage: Stage, users: Sequence[RoadUser], simulation: Simulation) -> list[tuple[int, int]]:
@@ -228,8 +209,10 @@ def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
 
 _LEAST_FRAMES, _MOST_FRAMES = 40, 100
 """The fewest and the most frames of a recording if no number is given, as in the release."""
-_EARLIEST = 5.5
-"""The least time from the beginning until the pair meets, seconds."""
+_EARLIEST, _LATEST_END = 5.5, 10.0
+"""The least time from the beginning until the pair meets, and the latest end of a normal scenario, seconds."""
+_ARRIVAL = 25.0
+"""A normal scenario also ends when ego is so many metres past the middle of the junction."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -249,15 +232,15 @@ class Recorded:
     impact: Impact | None
 
 
-def usual_duration(rng: np.random.Generator, spec: ScenarioSpec, frames: int | None) -> float:
+def usual_duration(rng: np.random.Generator, frames: int | None) -> float:
     """Seconds from the beginning until the pair meets: drawn, or as many as the wanted number of frames needs."""
-    natural = float(rng.uniform(_EARLIEST, max(spec.end.time, _EARLIEST) + 0.3))
+    natural = float(rng.uniform(_EARLIEST, _LATEST_END + 0.3))
     return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
 
 
 def latest_end(stage: Stage, frames: int | None) -> float:
     """The time until which a normal scenario is simulated, seconds."""
-    longest = max(stage.spec.end.time, (frames or 0) * FRAME_PERIOD)
+    longest = max(_LATEST_END, (frames or 0) * FRAME_PERIOD)
     return stage.cast.begin + WARM_UP + longest
 
 
@@ -272,7 +255,7 @@ def recorded_accident(stage: Stage, performance: Performance, frames: int | None
     pair = stage.cast.pair or (0, 0)
     size = np.array([stage.users[row].body.size[:2] for row in pair])
     impact = impact_of(performance.simulation, pair, size)
-    count = frames or _natural_frames(stage, impact.time, _MOST_FRAMES)
+    count = frames or _natural_frames(stage, impact.time)
     return Recorded(
         performance=performance, start=impact.time - FRAME_PERIOD * (count - 1), frames=count, impact=impact
     )
@@ -281,18 +264,16 @@ def recorded_accident(stage: Stage, performance: Performance, frames: int | None
 def recorded_normal(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
     """The recording that ends when ego has arrived, or when time is over; arguments as in `recorded_accident`."""
     begin = stage.cast.begin + WARM_UP
-    longest = round(stage.spec.end.time / FRAME_PERIOD)
-    arrival = _arrival_time(stage, performance)
-    natural = _natural_frames(stage, min(arrival, begin + stage.spec.end.time), max(longest, _LEAST_FRAMES))
+    natural = _natural_frames(stage, min(_arrival_time(stage, performance), begin + _LATEST_END))
     if frames is None:
         return Recorded(performance=performance, start=begin, frames=natural, impact=None)
     end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
     return Recorded(performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None)
 
 
-def _natural_frames(stage: Stage, end: float, most: int) -> int:
+def _natural_frames(stage: Stage, end: float) -> int:
     since = end - (stage.cast.begin + WARM_UP)
-    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, _LEAST_FRAMES, most))
+    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, _LEAST_FRAMES, _MOST_FRAMES))
 
 
 def _arrival_time(stage: Stage, performance: Performance) -> float:
@@ -303,5 +284,5 @@ def _arrival_time(stage: Stage, performance: Performance) -> float:
         return np.inf
     coarse = slice(None, None, 5)
     along, _ = ego.path.project(simulation.poses[coarse, performance.present.index(row), :2])
-    arrived = along > middle_of(ego.route) + stage.spec.end.arrival
+    arrived = along > middle_of(ego.route) + _ARRIVAL
     return float(simulation.time[coarse][arrived.argmax()]) if arrived.any() else np.inf

@@ -173,8 +173,6 @@ def find_rights(
         for j, other in enumerate(users):
             together[i, j] = _go_together(one, other)
             waits[i, j] = _waits(one, other, minor)
-            if other.walks and "crosswalk" in one.ignores:
-                sees[i, j] = False
     if blind is not None:
         waits[:, list(blind)] = True
         for row in blind:
@@ -198,7 +196,7 @@ def _waits(one: RoadUser, other: RoadUser, minor: Sequence[Arm]) -> bool:
     if one.route is None:
         return False
     if other.route is None:
-        return "crosswalk" not in one.ignores
+        return True
     if "priority" in one.ignores:
         return False
     if (one.route.from_arm in minor) != (other.route.from_arm in minor):

@@ -32,21 +32,19 @@ BREAKAGES: Mapping[str, Breakage] = {breakage.name: breakage for group in _GROUP
 """Name → breakage."""
 
 
-def break_release(root: Path, name: str, *, scenario: str | None = None) -> BrokenRelease:
-    """Break a release in place: one that this kit made, or any copy that you can lose. Hard links are safe.
+def break_release(root: Path, name: str) -> BrokenRelease:
+    """Break the first labelled scenario of a release, in place: one that this kit made, or a copy; hard links are safe.
 
     Args:
         root: the release's folder.
         name: one of `BREAKAGES`.
-        scenario: token of the scenario to break; None for the first labelled accident, or, if there is none, the first
-            labelled scenario.
 
     Raises:
         ChoiceError: there is no such breakage.
-        ConfigError: the release has no such scenario, or lacks a part that this breaks.
+        ConfigError: the release has no labelled scenario, or it lacks a part that this breaks.
     """
     breakage = checked_breakage(name)
-    editor = _Watched(root, _chosen(root, scenario))
+    editor = _Watched(root, _first_labelled(root))
     agent = next((agent for agent in editor.agents if agent in VEHICLE_AGENTS), editor.agents[0])
     frame = editor.frames[len(editor.frames) // 2]
     victim = Victim(editor=editor, agent=agent, frame=frame, marker=root.with_name(f"{root.name} - code has run"))
@@ -115,16 +113,11 @@ def _digest(path: Path) -> bytes | None:
     return sha256(path.read_bytes()).digest() if path.is_file() else None
 
 
-def _chosen(root: Path, token: str | None) -> ScenarioFolder:
-    scenarios = find_release(root).scenarios
-    labelled = [one for one in scenarios if one.kind_folder(one.agents[0], "label").is_dir()]
-    chosen = [one for one in scenarios if one.token == token] if token else labelled
-    if not chosen:
-        wanted, remedy = (
-            (f"scenario {token!r}", "choose one of its own") if token else ("labelled scenario", "name one")
-        )
-        raise ConfigError(f"{root}: has no {wanted} to break; {remedy}")
-    return chosen[0]
+def _first_labelled(root: Path) -> ScenarioFolder:
+    labelled = [one for one in find_release(root).scenarios if one.kind_folder(one.agents[0], "label").is_dir()]
+    if not labelled:
+        raise ConfigError(f"{root}: has no labelled scenario to break; give another release")
+    return labelled[0]
 
 
 __all__ = ["BREAKAGES", "Breakage", "BrokenRelease", "break_release", "broken_release", "checked_breakage"]

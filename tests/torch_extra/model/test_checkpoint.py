@@ -14,7 +14,7 @@ from torch_extra.model.small_model import small, small_released
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
 from deepaccident_devkit.model.fusion import CobevtConfig
-from deepaccident_devkit.model.images import ResNetConfig, SwinConfig
+from deepaccident_devkit.model.images import SwinConfig
 from deepaccident_devkit.model.network import V2XFormer
 
 Model = Callable[[int], V2XFormer]
@@ -192,18 +192,6 @@ def test_official_swin_weights_go_into_the_image_encoder(tmp_path: Path) -> None
     assert (state["img_backbone.stages.0.blocks.0.ffn.layers.0.0.bias"] == 3).all()
     merged = state["img_backbone.stages.0.downsample.reduction.weight"]
     assert torch.equal(merged.view(16, 8, 4)[:, :, 1], weight.view(16, 4, 8)[:, 2])
-
-
-def test_torchvision_s_resnet_goes_into_the_image_encoder(tmp_path: Path) -> None:
-    config = replace(small(), encoder=ResNetConfig(depth=18))
-    model, path = V2XFormer(replace(config, lift=lift_of(config, 16, 512))), tmp_path / "resnet18.pth"
-    own = {name: each for name, each in model.state_dict().items() if name.startswith("img_backbone.")}
-    given = {name.removeprefix("img_backbone."): torch.full_like(each, 0.5) for name, each in own.items()}
-    torch.save(given | {"fc.weight": torch.zeros(5, 512), "fc.bias": torch.zeros(5)}, path)
-    done = load_weights(model, read_weights(path))
-    assert done.unused == ("img_backbone.fc.bias", "img_backbone.fc.weight")
-    assert set(done.loaded) == {name for name in own if not name.endswith("num_batches_tracked")}
-    assert (model.state_dict()["img_backbone.layer4.1.conv2.weight"] == 0.5).all()
 
 
 def lift_of(config: Any, stride: int, channels: int) -> Any:

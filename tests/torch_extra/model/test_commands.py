@@ -35,15 +35,13 @@ def trained(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     out = tmp_path_factory.mktemp("model") / "a run"
     result = run("train", release_root, "--steps", 2, "--out", out, *QUICK)
     assert result.exit_code == 0
-    assert re.search(r"2 steps on cpu, \d+\.\d\d s each: some \d+ s", result.output)
     assert f"weights: {out / 'final.safetensors'}" in result.output
     return out
 
 
 def test_the_same_command_again_finds_all_steps_done(trained: Path, release_root: Path) -> None:
     before = (trained / "final.safetensors").read_bytes()
-    result = run("train", release_root, "--steps", 2, "--out", trained, *QUICK)
-    assert "steps on cpu" not in result.output
+    run("train", release_root, "--steps", 2, "--out", trained, *QUICK)
     assert (trained / "final.safetensors").read_bytes() == before
 
 

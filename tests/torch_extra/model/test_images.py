@@ -6,9 +6,6 @@ from torch import nn
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.images import (
-    ResNet,
-    ResNetConfig,
-    SmallConv,
     SmallConvConfig,
     Swin,
     SwinConfig,
@@ -16,14 +13,12 @@ from deepaccident_devkit.model.images import (
     image_encoder,
     normalised,
 )
-from deepaccident_devkit.model.images.resnet import BasicBlock, Bottleneck
 from deepaccident_devkit.model.images.swin import PatchMerging
 
 SMALL_SWIN = {"embed_dims": 8, "depths": (2, 2, 2, 2), "num_heads": (1, 2, 2, 4), "neck_channels": 16}
 ENCODERS = [
     SwinConfig(**SMALL_SWIN),
     SwinConfig(embed_dims=8, depths=(1, 2), num_heads=(1, 2), window_size=4, out_stages=(0, 1), neck_channels=16),
-    ResNetConfig(depth=18, neck_channels=16),
     SmallConvConfig(),
 ]
 
@@ -75,8 +70,7 @@ def test_images_are_normalised_channel_by_channel():
     ("make", "message"),
     [
         (lambda: normalised(torch.zeros(1, 3, 4, 4)), "expected uint8, found torch.float32"),
-        (lambda: image_encoder("swin"), "expected a SwinConfig, a ResNetConfig or a SmallConvConfig, found 'swin'"),
-        (lambda: ResNetConfig(depth=34), "depth: expected 18 or 50, found 34"),
+        (lambda: image_encoder("swin"), "expected a SwinConfig or a SmallConvConfig, found 'swin'"),
         (lambda: SmallConvConfig(widths=(8, 8)), "widths: expected three"),
         (lambda: SwinConfig(num_heads=(3, 6)), "num_heads: expected 4"),
         (lambda: SwinConfig(num_heads=(3, 6, 12, 25)), "768 channels cannot be shared by 25 heads"),
@@ -87,65 +81,6 @@ def test_images_are_normalised_channel_by_channel():
 def test_what_does_not_fit_is_named(make, message):
     with pytest.raises(ConfigError, match=message):
         make()
-
-
-# --- ResNet
-
-
-def torchvision_shapes(depth: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of torchvision's ResNet without `fc`, by the rule of its paper."""
-    blocks, kernels, expansion = {
-        18: ((2, 2, 2, 2), (3, 3), 1),
-        50: ((3, 4, 6, 3), (1, 3, 1), 4),
-    }[depth]
-    shapes = {"conv1.weight": (64, 3, 7, 7), **norm_shapes("bn1", 64)}
-    before = 64
-    for layer, count in enumerate(blocks, start=1):
-        width = 32 * 2**layer
-        for b in range(count):
-            name, inner = f"layer{layer}.{b}", before
-            for c, kernel in enumerate(kernels, start=1):
-                out = width * expansion if c == len(kernels) else width
-                shapes[f"{name}.conv{c}.weight"] = (out, inner, kernel, kernel)
-                shapes |= norm_shapes(f"{name}.bn{c}", out)
-                inner = out
-            if b == 0 and (layer > 1 or expansion > 1):
-                shapes[f"{name}.downsample.0.weight"] = (inner, before, 1, 1)
-                shapes |= norm_shapes(f"{name}.downsample.1", inner)
-            before = inner
-    return shapes
-
-
-def norm_shapes(name: str, channels: int) -> dict[str, tuple[int, ...]]:
-    parts = ("weight", "bias", "running_mean", "running_var")
-    return {**{f"{name}.{part}": (channels,) for part in parts}, f"{name}.num_batches_tracked": ()}
-
-
-@pytest.mark.parametrize(
-    ("block", "last_norm"),
-    [
-        (BasicBlock(32, 32), "bn2"),
-        (Bottleneck(32, 8), "bn3"),
-        (SmallConv(SmallConvConfig()).fine[3], "layers.4"),
-    ],
-    ids=["BasicBlock", "Bottleneck", "SmallConv"],
-)
-def test_a_block_without_its_last_norm_is_its_shortcut(block, last_norm):
-    features = noise(2, 32, 4, 6)
-    assert not torch.equal(block(features), features.relu())
-    nn.init.zeros_(block.get_submodule(last_norm).weight)
-    assert torch.equal(block(features), features.relu())
-
-
-@pytest.mark.parametrize(("depth", "weights"), [(18, 11_176_512), (50, 23_508_032)])
-def test_resnet_has_the_names_of_torchvision(depth, weights):
-    """The counts are those that torchvision states, less the classifier's."""
-    with torch.device("meta"):
-        network = ResNet(ResNetConfig(depth=depth))
-        fine, coarse = network(torch.zeros(1, 3, 256, 704))
-    assert {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()} == torchvision_shapes(depth)
-    assert sum(weight.numel() for weight in network.parameters()) == weights
-    assert (fine.shape, coarse.shape) == ((1, network.out_channels[0], 16, 44), (1, network.out_channels[1], 8, 22))
 
 
 # --- Swin

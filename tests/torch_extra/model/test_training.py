@@ -282,9 +282,7 @@ def whole(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
     said: list[str] = []
     path = trained(da, folder, curves=True, say=said.append)
     assert path == folder / BEST
-    assert said[0].startswith("6 steps on cpu, ")
-    assert said[0].endswith("2 × 1 samples to validate")
-    assert [each.split(":")[0] for each in said[1:]] == ["step 4", "step 6"]
+    assert [each.split(":")[0] for each in said] == ["step 4", "step 6"]
     return folder
 
 
@@ -444,30 +442,6 @@ def test_the_best_weights_are_kept(da: DeepAccident, tmp_path: Path) -> None:
     assert read_weights(tmp_path / LAST).meta["best"] == 0.6
 
 
-@pytest.mark.slow
-def test_accumulated_gradients_are_the_mean(da: DeepAccident, tmp_path: Path) -> None:
-    """Of the three batches of a step, which are different moments; and so are the losses in the log."""
-    run = replace(SHORT, steps=1, egos=None, accumulate=3, clip=1e6)
-    seen: list[tuple[dict[str, float], tuple[torch.Tensor, ...]]] = []
-    losses = training._Run._losses
-
-    def watched(self: Any, step: Any, *arguments: Any) -> dict[str, torch.Tensor]:
-        found = losses(self, step, *arguments)
-        gradients = torch.autograd.grad(sum(found.values()), list(step.parameters()), retain_graph=True)
-        seen.append(({name: float(each.detach()) for name, each in found.items()}, gradients))
-        return found
-
-    with patch.object(training._Run, "_losses", watched):
-        trained(da, tmp_path, run)
-    parts = seen[-3:]  # the others were for the estimate
-    assert len({str(values) for values, _ in parts}) == 3
-    [row] = read_log(tmp_path)
-    for name, value in row["losses"].items():
-        assert value == pytest.approx(sum(values[name] for values, _ in parts) / 3, rel=1e-6)
-    means = [torch.stack(each).mean(0) for each in zip(*(gradients for _, gradients in parts), strict=True)]
-    assert row["norm"] == pytest.approx(float(torch.stack([each.norm() for each in means]).norm()), rel=1e-4)
-
-
 def test_workers_and_epochs_give_the_same_moments(da: DeepAccident, config: ModelConfig) -> None:
     """A moment's augmentation is that of its number, which runs on through the epochs."""
     moments = Moments(da, config, replace(RUN, egos=None))
@@ -550,7 +524,6 @@ def test_a_run_adds_nothing_to_a_file_elsewhere(tmp_path: Path, linked: Callable
         ({"steps": 0}, ConfigError, "steps: expected a whole number from 1, found 0"),
         ({"moments": 1.5}, ConfigError, "moments: expected a whole number from 1"),
         ({"egos": 0}, ConfigError, "egos: expected a whole number from 1"),
-        ({"accumulate": 0}, ConfigError, "accumulate: expected a whole number from 1"),
         ({"seed": -1}, ConfigError, "seed: expected a whole number from 0"),
         ({"save_every": 0}, ConfigError, "save_every"),
         ({"partner_dropout": 1.1}, ConfigError, r"partner_dropout: expected a share from 0 to 1, found 1\.1"),

@@ -50,21 +50,6 @@ def test_wrong_shapes_are_refused_and_the_intrinsic_is_a_copy() -> None:
     )
 
 
-def test_unproject_by_hand() -> None:
-    camera = PinholeCamera(np.array([[500.0, 0, 800], [0, 400, 450], [0, 0, 1]]), 1600, 900)
-    points = camera.unproject([[800, 450], [900, 450], [800, 530], [np.nan] * 2], [5, 5, 10, 1])
-    assert_allclose(points, [[0, 0, 5], [1, 0, 5], [0, 2, 10], [np.nan] * 3], atol=1e-12)
-    assert camera.unproject(np.zeros((0, 2)), []).shape == (0, 3)
-    assert_refused(
-        (lambda: camera.unproject([[1, 2]], [1, 2]), GeometryError, r"depth: expected shape \(1\), found \(2,\)"),
-        (
-            lambda: PinholeCamera(np.zeros((3, 3)), 10, 10).unproject([[1, 2]], [1]),
-            GeometryError,
-            r"has no inverse; is a focal length 0\?",
-        ),
-    )
-
-
 def test_in_image_by_depth_and_margin() -> None:
     camera = PinholeCamera.from_field_of_view(100, 50, 1.2)
     pixels = [[50, 25], [50, 25], [1, 25], [-1, 25], [98, 25], [99, 25]]

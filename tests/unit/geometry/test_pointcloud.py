@@ -1,12 +1,11 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
-from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid, LidarPointCloud
 from deepaccident_devkit.geometry.pointcloud import concatenate
 
@@ -111,13 +110,12 @@ def test_clouds_of_one_frame_join(cloud: LidarPointCloud) -> None:
         concatenate([cloud], "ego")
 
 
-def test_points_keep_their_sources(cloud: LidarPointCloud, tmp_path: Path) -> None:
+def test_points_keep_their_sources(cloud: LidarPointCloud) -> None:
     of_two = replace(cloud, agent=[0, 0, 4, 4, 4], time_lag=[0, 0, 0.1, 0.1, 0.2])
     assert (of_two.agent.dtype, of_two.time_lag.dtype) == (np.int8, np.float32)
     part = of_two.transform(SE3.identity(), "ego").crop(x=(1, 11)).select([0, 2])
     assert rows(part) == [1, 4]
-    part.save(tmp_path / "part.npz")
-    for each in (part, LidarPointCloud.load(tmp_path / "part.npz"), concatenate([part], "ego")):
+    for each in (part, concatenate([part], "ego")):
         assert_array_equal(each.agent, [0, 4])
         assert_array_equal(each.time_lag, np.float32([0, 0.2]))
     with pytest.raises(ValueError, match="read-only"):
@@ -127,28 +125,6 @@ def test_points_keep_their_sources(cloud: LidarPointCloud, tmp_path: Path) -> No
     assert len(joined.time_lag) == 10
     with pytest.raises(GeometryError, match=r"LidarPointCloud.time_lag: expected shape \(5\), found \(2,\)"):
         replace(cloud, time_lag=[0, 0])
-
-
-def test_the_same_cloud_is_the_same_bytes(cloud: LidarPointCloud, tmp_path: Path) -> None:
-    for name in ("one.npz", "two"):
-        cloud.save(str(tmp_path / "new" / name))
-    assert (tmp_path / "new" / "one.npz").read_bytes() == (tmp_path / "new" / "two").read_bytes()
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["one.npz", "two"]
-    assert LidarPointCloud.load(str(tmp_path / "new" / "two")).frame == "lidar"
-
-
-def test_what_is_no_saved_cloud_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(MissingFileError, match=r"nowhere.npz: no such file"):
-        LidarPointCloud.load(tmp_path / "nowhere.npz")
-    np.savez(tmp_path / "release.npz", data=np.zeros((2, 4)))
-    np.savez(tmp_path / "objects.npz", xyz=np.array([{}]), intensity=np.zeros(1), frame="lidar")
-    np.savez(tmp_path / "shapes.npz", xyz=np.zeros((2, 4)), intensity=np.zeros(2), frame="lidar")
-    np.save(tmp_path / "bare.npz.npy", np.zeros(3))
-    (tmp_path / "text.npz").write_text("points")
-    (tmp_path / "empty.npz").touch()
-    for path in tmp_path.iterdir():
-        with pytest.raises(SensorFileError, match=f"{path.name}: not a cloud that LidarPointCloud.save wrote"):
-            LidarPointCloud.load(path)
 
 
 def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:

@@ -94,20 +94,6 @@ def test_repr_shows_translation_and_yaw() -> None:
     assert repr(SE3.from_yaw(0.5, (1, -2, 3))) == "SE3(translation=[1.000, -2.000, 3.000], yaw=0.5000)"
 
 
-def test_half_way() -> None:
-    there, here = SE3.from_yaw(1.0, (4, 0, 0)), SE3.identity()
-    assert_allclose(here.interpolate(there, 0.5).matrix, SE3.from_yaw(0.5, (2, 0, 0)).matrix, atol=1e-15)
-    across = SE3.from_yaw(-3.0).interpolate(SE3.from_yaw(3.0), 0.5)  # over π, the shorter way
-    assert_allclose(across.rotation, SE3.from_yaw(np.pi).rotation, atol=1e-12)
-    assert_allclose(there.interpolate(there, 0.3).matrix, there.matrix, atol=1e-15)
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.1, np.nan])
-def test_shares_beyond_the_ends_are_refused(share: float) -> None:
-    with pytest.raises(GeometryError, match="share: expected a number from 0 to 1"):
-        SE3.identity().interpolate(SE3.identity(), share)
-
-
 @pytest.fixture
 def boxes() -> Boxes:
     return Boxes.from_arrays(
@@ -175,11 +161,6 @@ def test_other_misuse_says_what_to_give(boxes: Boxes) -> None:
     for wrong in (None, 7, "abcd", [None] * 4):
         with pytest.raises(GeometryError, match="quaternion: expected"):
             SE3.from_quaternion(wrong)
-    with pytest.raises(GeometryError, match="other: expected an SE3, found NoneType; of a matrix"):
-        pose.interpolate(None, 0.5)
-    for wrong in ("half", None, [0.1, 0.2]):
-        with pytest.raises(GeometryError, match="share: expected a number from 0 to 1, found"):
-            pose.interpolate(pose, wrong)
 
 
 def test_points_at_infinity_warn_of_nothing() -> None:

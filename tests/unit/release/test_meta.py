@@ -56,7 +56,6 @@ ACCIDENT_META = Meta(
 
 def test_the_real_accident(write) -> None:
     assert read_meta(write(ACCIDENT)) == ACCIDENT_META
-    assert read_meta(write(ACCIDENT), raw=True) == tuple(ACCIDENT.splitlines())
 
 
 def test_no_collision(write) -> None:

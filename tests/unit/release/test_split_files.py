@@ -33,7 +33,7 @@ def test_tokens_in_the_files_order_each_once(path: Path, text: str) -> None:
 
 def test_raw_keeps_repeated_lines(path: Path) -> None:
     path.write_text(f"{TYPE} {NAME}\n\n{TYPE} {NAME}\n")
-    assert read_split_file(path, raw=True) == [(TYPE, NAME)] * 2
+    assert read_split_file(path, raw=True) == [f"{TYPE}/{NAME}"] * 2
 
 
 def test_an_empty_file_names_no_scenario(path: Path) -> None:

@@ -107,7 +107,7 @@ def test_the_pair_its_motion_and_its_contact(made: Made) -> None:
         assert check.margin == pytest.approx(float(last), abs=LEANING)
         assert accident.duration == pytest.approx((truth.frames - 1) / 10)
         assert accident.duration - 0.01 <= check.time <= accident.duration
-        assert contact.agrees
+        assert not contact.disagreements
         assert contact.gap == pytest.approx(float(last), abs=LEANING)
         yaws = truth.fine[:, -1, 2]
         turn = np.abs(np.arctan2(np.sin(yaws[1] - yaws[0]), np.cos(yaws[1] - yaws[0])))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.actors import Actor, Actors, Sampled, Uniform
+from deepaccident_devkit.synth.actors import Actor, Actors, Motion
 from deepaccident_devkit.synth.shapes import shape_of
 
 SAMPLES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.2], [3.0, 1.0, 0.4]])
@@ -10,7 +10,7 @@ VELOCITIES = np.array([[5.0, 0.0], [10.0, 2.0], [12.0, 4.0]])
 
 @pytest.fixture
 def motion():
-    return Sampled(start=-0.1, period=0.1, samples=SAMPLES, sample_velocities=VELOCITIES)
+    return Motion(start=-0.1, period=0.1, samples=SAMPLES, sample_velocities=VELOCITIES)
 
 
 @pytest.fixture
@@ -38,9 +38,10 @@ def test_before_and_after_it_stands(motion):
 
 def test_actors_are_where_each_of_them_is(motion, make_actor):
     """Those sampled at the same times are looked up together."""
-    later = Sampled(start=0.0, period=0.1, samples=SAMPLES + 9, sample_velocities=VELOCITIES)
-    other = Sampled(start=-0.1, period=0.1, samples=SAMPLES - 5, sample_velocities=-VELOCITIES)
-    actors = Actors.of([make_actor(k, each) for k, each in enumerate((motion, later, Uniform(1, 2, 0.5, 3), other))])
+    later = Motion(start=0.0, period=0.1, samples=SAMPLES + 9, sample_velocities=VELOCITIES)
+    other = Motion(start=-0.1, period=0.1, samples=SAMPLES - 5, sample_velocities=-VELOCITIES)
+    parked = Motion(start=0.0, period=0.1, samples=SAMPLES[:1] + 3, sample_velocities=np.zeros((1, 2)))
+    actors = Actors.of([make_actor(k, each) for k, each in enumerate((motion, later, parked, other))])
     assert len(actors.motions) == 3
     for time in (-1.0, 0.03, 0.1, 2.0):
         snapshot = actors.at(time)

@@ -19,11 +19,11 @@ def test_accidents_and_twins_by_turns_go_round_the_designs():
     plans = plans_of(scenarios=26)
     assert [plan.accident for plan in plans] == [True, False] * 13
     assert [plan.design for plan in plans[::2]] == [1, 7, 2, 8, 3, 9, 4, 10, 5, 11, 6, 12, 1]
-    assert {plan.subtype for plan in plans[:4]} == {1, 2}
+    assert {plan.traits.subtype for plan in plans[:4]} == {1, 2}
     for accident, twin in zip(plans[::2], plans[1::2], strict=True):
         assert (accident.name, accident.split, accident.traits) == (twin.name, twin.split, twin.traits)
-        assert accident.scenario_type == f"type1_subtype{accident.subtype}_accident"
-        assert twin.scenario_type == f"type1_subtype{twin.subtype}_normal"
+        assert accident.scenario_type == f"type1_subtype{accident.traits.subtype}_accident"
+        assert twin.scenario_type == f"type1_subtype{twin.traits.subtype}_normal"
 
 
 def test_names_are_the_release_s_and_unique():
@@ -34,7 +34,7 @@ def test_names_are_the_release_s_and_unique():
     assert towns <= set(TOWNS)
     assert len(towns) > 4
     number = 1 + plans[6].pair
-    assert plans[6].name.endswith(f"_type001_subtype{plans[6].subtype:04d}_scenario{number:05d}")
+    assert plans[6].name.endswith(f"_type001_subtype{plans[6].traits.subtype:04d}_scenario{number:05d}")
 
 
 def test_seeds_differ_and_repeat():
@@ -56,7 +56,7 @@ def test_a_draw_has_the_plan_s_traits(design):
     for plan in plans_of(scenarios=20, designs=(design,)):
         for seed in range(3):
             spec = plan.draw(np.random.default_rng(seed))
-            assert spec.road.signalized == (plan.subtype == 1) == (design < 7)
+            assert spec.road.signalized == (plan.traits.subtype == 1) == (design < 7)
             assert f"{spec.road.kind} junction" == plan.traits.road_type
             assert spec.spawn_side == plan.traits.spawn_side
             assert spec.view == "open" or design in (1, 2, 6, 7, 8, 12)
@@ -157,11 +157,11 @@ def test_an_own_file_takes_the_designs_place(tmp_path):
     path.write_text(OWN.replace("turn: right}", "turn: straight}", 1) + "meet: {}\n")
     plans = plans_of(spec=path, scenarios=40, unplanned=1.0)
     assert {plan.design for plan in plans} == {None}
-    assert {plan.subtype for plan in plans} == {1, 2}
+    assert {plan.traits.subtype for plan in plans} == {1, 2}
     assert not any(plan.unplanned for plan in plans)
     for plan in plans:
         spec = plan.draw(np.random.default_rng(plan.pair))
-        assert spec.road.signalized == (plan.subtype == 1)
+        assert spec.road.signalized == (plan.traits.subtype == 1)
         assert spec.view == "hidden"
 
 

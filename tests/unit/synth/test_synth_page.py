@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from scripts import loaded_script
 
-from deepaccident_devkit.synth.spec import DESIGNS
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +40,7 @@ def test_what_was_measured_is_still_so(script, number):
 
 def test_the_generator_keeps_its_promises(script):
     pairs = script.measured()["pairs"]
-    for design in DESIGNS:
+    for design in DESIGN_NUMBERS:
         of_design = [pair for pair in pairs if pair["design"] == design]
         assert len(of_design) == script.SEEDS
         assert sum(pair["draws"] == 1 for pair in of_design) >= 0.7 * len(of_design)

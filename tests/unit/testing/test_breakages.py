@@ -11,7 +11,6 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError
 from deepaccident_devkit.release import (
-    find_release,
     read_bev,
     read_calib,
     read_image,
@@ -98,16 +97,6 @@ def test_the_other_scenarios_stay_as_they_were(make_deepaccident_release, tmp_pa
         if path.is_file() and path.read_bytes() != (broken.root / path.relative_to(release)).read_bytes()
     }
     assert changed == {broken.scenario.split("/")[0]}
-
-
-def test_a_scenario_can_be_chosen(make_deepaccident_release, tmp_path: Path) -> None:
-    root = copied(make_deepaccident_release(BARE), tmp_path / "release")
-    token = find_release(root).scenarios[1].token
-    broken = break_release(root, "label-empty", scenario=token)
-    assert (broken.scenario, broken.agent, broken.frame) == (token, "ego_vehicle", 2)
-    assert broken.path.read_bytes() == b""
-    with pytest.raises(ConfigError, match="has no scenario 'a/b' to break"):
-        break_release(root, "label-empty", scenario="a/b")
 
 
 def test_what_cannot_be_broken(make_deepaccident_release, tmp_path: Path) -> None:

@@ -44,28 +44,23 @@ def test_a_latency_longer_than_the_past_names_what_there_is(da_b: DeepAccident, 
 
 
 def test_settings_that_are_not_possible() -> None:
-    assert_refused(
-        (lambda: Link(packet_loss=2), ConfigError, "packet_loss: 2 is no probability"),
-        (lambda: PoseNoise(std=-1), ConfigError, "std is -1; choose a finite number"),
-        (lambda: Link(pose_noise="much"), ConfigError, "pose_noise: expected metres or a PoseNoise, found 'much'"),
-        (lambda: PoseNoise(law="cauchy"), ConfigError, "law: expected one of paper, zero-mean, found 'cauchy'"),
-        (lambda: PoseNoise(mean=0.3, law="zero-mean"), ConfigError, r"zero-mean takes no mean, found 0\.3"),
-    )
-    assert Link(pose_noise=0.3) == Link(pose_noise=PoseNoise(mean=0.3, std=0.02, heading_std=0, law="paper"))
+    with pytest.raises(ConfigError, match="packet_loss: 2 is no probability"):
+        Link(packet_loss=2)
+    with pytest.raises(ConfigError, match="std is -1; choose a finite number"):
+        PoseNoise(std=-1)
+    with pytest.raises(ConfigError, match="pose_noise: expected metres or a PoseNoise, found 'much'"):
+        Link(pose_noise="much")  # type: ignore[arg-type]
+    assert Link(pose_noise=0.3) == Link(pose_noise=PoseNoise(mean=0.3, std=0.02, heading_std=0))
     assert pickle.loads(pickle.dumps(Link(pose_noise=0.3))) == Link(pose_noise=0.3)
 
 
-def test_the_laws_have_the_moments_that_they_say() -> None:
+def test_draws_have_the_moments_that_they_say() -> None:
     keys = [str(number) for number in range(20000)]
     paper = np.array([PoseNoise(mean=0.5, std=0.02, heading_std=0.1).draw(key) for key in keys])
     distance = np.hypot(paper[:, 0], paper[:, 1])
     assert_allclose([distance.mean(), distance.std()], [0.5, 0.02], atol=2e-3)
     assert_allclose(paper.mean(axis=0), 0, atol=0.02)
     assert_allclose(paper[:, 2].std(), 0.1, atol=5e-3)
-    normal = np.array([PoseNoise(std=0.2, law="zero-mean").draw(key) for key in keys])
-    assert_allclose(normal.mean(axis=0), 0, atol=0.02)
-    assert_allclose(normal.std(axis=0), [0.2, 0.2, 0], atol=0.01)
-    assert abs(np.corrcoef(normal[:, 0], normal[:, 1])[0, 1]) < 0.05
 
 
 def test_draws_are_the_same_on_every_machine() -> None:

@@ -11,7 +11,7 @@ from deepaccident_devkit.evaluation.metrics.accident.evaluator import (
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
 from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, AccidentResult, AccidentsWithin
-from deepaccident_devkit.evaluation.metrics.alarms.raised import accidents_of, foreseen_accident
+from deepaccident_devkit.evaluation.metrics.alarms.raised import foreseen_accident
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
@@ -32,7 +32,6 @@ __all__ = [
     "Prediction",
     "ReleasedAccidents",
     "accident_context",
-    "accidents_of",
     "box_truth",
     "compared_accidents",
     "foreseen_accident",

@@ -9,18 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.scoring import (
+    ERRORS_AT,
     AccidentResult,
     Alarm,
-    Scoring,
     alarms_tally,
     exact_parts,
     foreseen,
+    hit_of,
     named,
     tally_result,
     united,
@@ -44,7 +45,7 @@ _LEFT_OUT = ("unjudged", "beyond", *_ASIDE)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxAccidentResult(AccidentResult):
-    """Accident metrics, and numbers on alarms; these at the distance of `Scoring.errors_at`.
+    """Accident metrics, and numbers on alarms; these at the distance `ERRORS_AT`.
 
     Without any accident to foresee APA and the accuracies are NaN, and the false alarm rate says how good predictions
     are.
@@ -93,7 +94,6 @@ class BoxAccidents:
     """
 
     reading: AccidentReading = field(default_factory=AccidentReading)
-    scoring: ClassVar[Scoring] = Scoring()
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.
@@ -101,8 +101,7 @@ class BoxAccidents:
         Args:
             prediction: motion in maps, or explicit accidents; an empty list for no alarm.
             label: says how far apart in time maps are and how they lie in their cells; None for the released way.
-            context: with `truth`, from `accident_context(dataset, sample, horizon)`; `AccidentEvaluator.update` takes
-                it or the truth as label, too.
+            context: with `truth`, from `accident_context(dataset, sample, horizon)`.
 
         Returns:
             `positive`: whether an accident comes; `named`: whom the boxes bring nearer to each other than the danger
@@ -116,8 +115,8 @@ class BoxAccidents:
         truth = context.truth
         if not isinstance(truth, BoxTruth):
             raise EvaluationError(
-                "label: the accident protocol 'boxes' compares with boxes; give box_truth(dataset, sample), or "
-                "accident_context(dataset, sample, horizon=2.0), as label or as context"
+                "context: the accident protocol 'boxes' compares with boxes; give "
+                "accident_context(dataset, sample, horizon=2.0)"
             )
         raised = named_alarms(checked_prediction(prediction), label, truth, self.reading)
         within = within_horizon(raised, truth)
@@ -135,12 +134,12 @@ class BoxAccidents:
 
     def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
         """The metrics of some samples' counts, in any order."""
-        given = self._united(counts)
-        base = tally_result(given["tally"], self.scoring.errors_at)
+        given = _united(counts)
+        base = tally_result(given["tally"], ERRORS_AT)
         if not base.positives:
             nothing = {distance: replace(each, accuracy=math.nan) for distance, each in base.within.items()}
             base = replace(base, apa=math.nan, within=nothing)
-        at = base.within[self.scoring.errors_at]
+        at = base.within[ERRORS_AT]
         late = given["beyond"]
         beyond = [f"{late} alarms are for later than the horizon and do not count"] if late else []
         if given["unplaced"]:
@@ -158,41 +157,43 @@ class BoxAccidents:
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """The sums of all counts, which have the same result; alarms are kept one by one."""
-        return [self._united(counts)]
+        return [_united(counts)]
 
-    def _united(self, counts: Collection[Counts]) -> dict[str, Any]:
-        """What samples add, those of `pooled` among them.
 
-        Returns:
-            `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
-            `false_samples`: how many raise an alarm without an accident to come; and of `_LEFT_OUT` each.
-        """
-        complete = [{"unplaced": 0, **each} for each in counts]  # runs kept by earlier versions refused such samples
-        given = [each if "tally" in each else self._tallied(each) for each in complete]
-        return {
-            "tally": united(each["tally"] for each in given),
-            "alarms": [alarm for each in given for alarm in each["alarms"]],
-            "lateness": exact_parts(each["lateness"] for each in given),
-            **{name: sum(each[name] for each in given) for name in ("false_samples", *_LEFT_OUT)},
-        }
+def _united(counts: Collection[Counts]) -> dict[str, Any]:
+    """What samples add, those of `pooled` among them.
 
-    def _tallied(self, sample: Counts) -> dict[str, Any]:
-        if any(sample[name] for name in _ASIDE):
-            return (
-                {"tally": united([]), "alarms": [], "lateness": []}
-                | dict.fromkeys(("false_samples", *_LEFT_OUT), 0)
-                | {name: int(sample[name]) for name in _ASIDE}
-            )
-        alarms: Sequence[Alarm] = sample["alarms"]
-        hit = self.scoring.hit(alarms, self.scoring.errors_at) if sample["positive"] else None
-        return {
-            "tally": alarms_tally(sample, alarms, self.scoring),
-            "alarms": [[alarm["score"], alarm is hit] for alarm in alarms],
-            "lateness": [] if hit is None else [hit["time"]],
-            "false_samples": int(bool(alarms) and not sample["positive"]),
-            **{name: sample[name] for name in ("unjudged", "beyond")},
-            **dict.fromkeys(_ASIDE, 0),
-        }
+    Returns:
+        `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
+        `false_samples`: how many raise an alarm without an accident to come; and of `_LEFT_OUT` each.
+    """
+    complete = [{"unplaced": 0, **each} for each in counts]  # runs kept by earlier versions refused such samples
+    given = [each if "tally" in each else _tallied(each) for each in complete]
+    return {
+        "tally": united(each["tally"] for each in given),
+        "alarms": [alarm for each in given for alarm in each["alarms"]],
+        "lateness": exact_parts(each["lateness"] for each in given),
+        **{name: sum(each[name] for each in given) for name in ("false_samples", *_LEFT_OUT)},
+    }
+
+
+def _tallied(sample: Counts) -> dict[str, Any]:
+    if any(sample[name] for name in _ASIDE):
+        return (
+            {"tally": united([]), "alarms": [], "lateness": []}
+            | dict.fromkeys(("false_samples", *_LEFT_OUT), 0)
+            | {name: int(sample[name]) for name in _ASIDE}
+        )
+    alarms: Sequence[Alarm] = sample["alarms"]
+    hit = hit_of(alarms, ERRORS_AT) if sample["positive"] else None
+    return {
+        "tally": alarms_tally(sample, alarms),
+        "alarms": [[alarm["score"], alarm is hit] for alarm in alarms],
+        "lateness": [] if hit is None else [hit["time"]],
+        "false_samples": int(bool(alarms) and not sample["positive"]),
+        **{name: sample[name] for name in ("unjudged", "beyond")},
+        **dict.fromkeys(_ASIDE, 0),
+    }
 
 
 def _is_judged(accident: Accident, truth: BoxTruth) -> bool:

@@ -1,11 +1,11 @@
-"""`AccidentEvaluator`: how well accidents are foreseen, the interface of a protocol for it, and what it compares."""
+"""`AccidentEvaluator`: how well accidents are foreseen, by one of three protocols, and what it compares."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation.metrics.accident.released import (
 from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentResult
 from deepaccident_devkit.evaluation.metrics.alarms.raised import named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.reading import InstanceAccident, accident_of
-from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, checked_facts
 from deepaccident_devkit.evaluation.metrics.choices import protocol_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import (
@@ -37,24 +37,7 @@ from deepaccident_devkit.evaluation.metrics.trajectories import longest
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-Truth = MotionLabels | BoxTruth | AccidentContext
-"""What an evaluator takes as label: motion labels, or for a protocol without rasters its own truth."""
-
-
-@runtime_checkable
-class AccidentProtocol(Protocol):
-    """A frozen dataclass with one field for each choice; `PROTOCOLS` has those with names."""
-
-    def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
-        """What one sample adds; raises EvaluationError if it cannot be evaluated by this protocol."""
-
-    def result(self, counts: Collection[Counts]) -> AccidentResult:
-        """The metrics of some samples' counts, in any order; of those that `pooled` gives, too."""
-
-    def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """Fewer counts with the same result, to the last bit."""
-
-
+AccidentProtocol = ReleasedAccidents | PaperAccidents | BoxAccidents
 PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
     {"released": ReleasedAccidents(), "paper": PaperAccidents(), "boxes": BoxAccidents()}
 )
@@ -74,24 +57,24 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         """Start without samples.
 
         Args:
-            protocol: of `PROTOCOLS` by name, or your own.
+            protocol: of `PROTOCOLS` by name, or one of them with other fields.
 
         Raises:
             ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
-        self.protocol = protocol_of(protocol, AccidentProtocol, PROTOCOLS)  # type: ignore[type-abstract]  # isinstance
+        self.protocol = protocol_of(protocol, AccidentProtocol, PROTOCOLS)  # type: ignore[arg-type]  # a union is a kind too
 
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol and its choices."""
-        return {"protocol": type(self.protocol).__name__, "choices": asdict(self.protocol)}  # type: ignore[call-overload]
+        return {"protocol": type(self.protocol).__name__, "choices": asdict(self.protocol)}
 
     def update(
         self,
         token: str,
         prediction: Prediction,
-        label: Truth | None = None,
+        label: MotionLabels | None = None,
         context: AccidentContext | None = None,
     ) -> None:
         """Count one sample.
@@ -100,19 +83,16 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
             token: of the sample.
             prediction: what a model says.
             label: the sample's motion labels, each frame in its own frame or all at the present. Those in their own
-                frames are warped to the present with bilinear centres, as the released evaluation does. A protocol that
-                compares with boxes needs none; it takes their truth here (`box_truth` or `accident_context`), or in the
-                context.
-            context: other facts on the sample; None for nothing.
+                frames are warped to the present with bilinear centres, as the released evaluation does. The protocol
+                `boxes` needs none.
+            context: other facts on the sample, from `accident_context`, with the truth of `boxes`; None for nothing.
 
         Raises:
             EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample came before with
                 another outcome.
         """
-        labels, known = _known(label, context)
-        given = checked_prediction(prediction)
-        counts = dict(self.protocol.counts(given, labels, known))
-        self.add(token, counts)
+        checked_facts(label, context)
+        self.add(token, dict(self.protocol.counts(checked_prediction(prediction), label, context or AccidentContext())))
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
@@ -121,28 +101,6 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Fewer counts with the same result."""
         return self.protocol.pooled(counts)
-
-
-def _known(label: Truth | None, context: AccidentContext | None) -> tuple[MotionLabels | None, AccidentContext]:
-    """Motion labels, and the other facts; raises EvaluationError."""
-    if context is not None and not isinstance(context, AccidentContext):
-        raise EvaluationError(
-            f"context: expected an AccidentContext, found {type(context).__name__}; make it with "
-            "accident_context(dataset, sample, horizon)"
-        )
-    known = context or AccidentContext()
-    if label is None or isinstance(label, MotionLabels):
-        return label, known
-    if isinstance(label, AccidentContext) and context is None:
-        return None, label
-    if isinstance(label, BoxTruth) and known.truth is None:
-        return None, replace(known, truth=label)
-    if isinstance(label, AccidentContext | BoxTruth):
-        raise EvaluationError("label, context: both say what is true; give the truth in one of them")
-    raise EvaluationError(
-        f"label: expected MotionLabels, or for protocol='boxes' a BoxTruth or an AccidentContext, found "
-        f"{type(label).__name__}; give what dataset.motion_labels(token) has of the sample"
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,7 +127,7 @@ def compared_accidents(
         prediction: what a model says; of one that `protocol.counts` takes.
         label: the sample's motion labels, where the protocol compares with those.
         context: other facts on the sample.
-        protocol: one of the devkit's; of another one, explicit accidents are as given, and the truth is the context's.
+        protocol: by which accidents are seen.
 
     Raises:
         EvaluationError: the prediction is neither motion nor accidents, or the protocol lacks its truth.
@@ -179,16 +137,15 @@ def compared_accidents(
         return _released(given, label, protocol)
     if isinstance(protocol, PaperAccidents):
         return _paper(given, label, protocol)
-    true = None if context.truth is None else context.truth.accident
-    if not isinstance(protocol, BoxAccidents):
-        return ComparedAccidents(true=true, predicted=() if isinstance(given, MotionOutput) else tuple(given))
     if context.truth is None:
         raise EvaluationError(
             "context: the protocol 'boxes' needs its truth; make it with accident_context(…, horizon)"
         )
     alarms = named_alarms(given, label, context.truth, protocol.reading)
     unplaced = context.truth.unplaced if context.truth.is_unplaced else None
-    return ComparedAccidents(true=true, predicted=tuple(alarm for alarm, _ in alarms), unplaced=unplaced)
+    return ComparedAccidents(
+        true=context.truth.accident, predicted=tuple(alarm for alarm, _ in alarms), unplaced=unplaced
+    )
 
 
 def _released(
@@ -200,19 +157,17 @@ def _released(
     truth, _ = rules.truth_paths(labels_at_present(label), frames)
     points = longest(truth.paths) or len(truth.drawn)
     last = points - 1
-    moments = [last] if rules.last_frame_only else [*range(last + 1)]
-    step = label.config.step * FRAME_PERIOD
+    time = last * (label.config.step * FRAME_PERIOD)
 
     def found(paths: DrawnPaths, gap: float) -> Accident | None:
         padded = padded_paths(paths, points)
-        one = collision(padded, moments, gap, rules.level)
-        if one is None:
+        pair = collision(padded, last, gap)
+        if pair is None:
             return None
-        positions = np.array([padded.paths[name][one.frame] for name in one.pair])
-        return Accident(positions=positions, time=one.frame * step)
+        return Accident(positions=np.array([padded.paths[name][last] for name in pair]), time=time)
 
     predictions = rules.prediction_paths(given, frames)
-    if rules.empty_first_ends and not predictions[0].paths:
+    if not predictions[0].paths:
         predictions = []
     return ComparedAccidents(
         true=found(truth, rules.truth_gap), predicted=_there(found(each, rules.prediction_gap) for each in predictions)

@@ -56,15 +56,12 @@ _ENTRIES: Final = tuple({way_out: way_in for way_in, way_out in exits.items()} f
 _OPPOSITE: Final = (_BOTTOM, _RIGHT, _TOP, _LEFT)
 
 
-def pair_gaps(
-    image: AnyArray, ids: IntArray, *, level: float = LEVEL, below: float = np.inf
-) -> tuple[IntArray, FloatArray]:
+def pair_gaps(image: AnyArray, ids: IntArray, *, below: float = np.inf) -> tuple[IntArray, FloatArray]:
     """The distances between the outlines of pairs of instances.
 
     Args:
         image: (H, W) ids, 0 elsewhere.
         ids: (N,) int64, ascending, whose.
-        level: see `LEVEL`.
         below: cells; pairs that cannot be nearer are left out.
 
     Returns:
@@ -75,11 +72,11 @@ def pair_gaps(
     first, second = np.triu_indices(len(ids), 1)
     near = _box_gaps(places)[first, second] < below
     first, second = first[near], second[near]
-    shapes = _shapes(image, ids, places, np.unique([first, second]), level)
+    shapes = _shapes(image, ids, places, np.unique([first, second]))
     return np.stack([ids[first], ids[second]], axis=1), _distances(shapes[first], shapes[second])
 
 
-def first_outline(image: AnyArray, name: int, place: Place, level: float = LEVEL) -> FloatArray:
+def first_outline(image: AnyArray, name: int, place: Place) -> FloatArray:
     """The outline of an instance that scikit-image would list first: around its part with the highest cell.
 
     Cells that touch at a corner alone are two parts.
@@ -88,7 +85,6 @@ def first_outline(image: AnyArray, name: int, place: Place, level: float = LEVEL
         image: (H, W) ids.
         name: the instance's.
         place: rows and columns that it is in.
-        level: see `LEVEL`.
 
     Returns:
         (P, 2) row and column, as `find_contours` has them: beginning where the last segment in row-major order ends.
@@ -108,7 +104,7 @@ def first_outline(image: AnyArray, name: int, place: Place, level: float = LEVEL
     width = squares.shape[1]
     cells, edges = _follow(squares.tobytes(), width, int(passed[0]))
     row, column = np.divmod(np.array(cells), width)
-    return _points(row + (top - 1), column + (left - 1), np.array(edges), level, name)
+    return _points(row + (top - 1), column + (left - 1), np.array(edges), name)
 
 
 def simplified(outlines: list[FloatArray]) -> list[FloatArray]:
@@ -160,12 +156,12 @@ def _box_gaps(places: Sequence[Place | None]) -> FloatArray:
     return np.where(np.isnan(gaps), NO_OUTLINE, gaps)
 
 
-def _shapes(image: AnyArray, ids: IntArray, places: Sequence[Place | None], wanted: IntArray, level: float) -> AnyArray:
+def _shapes(image: AnyArray, ids: IntArray, places: Sequence[Place | None], wanted: IntArray) -> AnyArray:
     """(N,) shapely's polygons of the instances number `wanted`; None for the others and those without an outline."""
     import shapely
 
     there = [index for index in wanted.tolist() if places[index] is not None]
-    outlines = simplified([first_outline(image, ids.item(index), places[index], level) for index in there])
+    outlines = simplified([first_outline(image, ids.item(index), places[index]) for index in there])
     broad = [(index, points) for index, points in zip(there, outlines, strict=True) if _corners(points) >= 3]
     shapes = np.full(len(ids), None)
     if broad:
@@ -213,9 +209,9 @@ def _follow(squares: bytes, width: int, start: int) -> tuple[list[int], list[int
     return [cell for cell, _ in before[::-1]] + cells, [edge for _, edge in before[::-1]] + edges
 
 
-def _points(row: IntArray, column: IntArray, edge: IntArray, level: float, name: int) -> FloatArray:
+def _points(row: IntArray, column: IntArray, edge: IntArray, name: int) -> FloatArray:
     """(P, 2) where the outline crosses edges of squares, their top left cells at `row` and `column`."""
-    near, far = level / name, (level - name) / -name
+    near, far = LEVEL / name, (LEVEL - name) / -name
     """From a cell beside the instance to one of its own, and the other way."""
     across, down = np.array([near, 0.0, far, 1.0]), np.array([0.0, far, 1.0, near])
     return np.stack([row + down[edge], column + across[edge]], axis=1)

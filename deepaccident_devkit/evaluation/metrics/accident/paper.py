@@ -1,6 +1,6 @@
 """Accident metrics as the paper describes them, or where it is silent, as in the released code (protocol `paper`).
 
-Each choice is a field of `PaperAccidents`, `AccidentReading` or `Scoring`; docs/protocols.md lists them.
+docs/protocols.md says what is which.
 """
 
 from __future__ import annotations
@@ -9,14 +9,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Final, Literal, get_args
 
-import numpy as np
-
 from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.scoring import (
+    ERRORS_AT,
     AccidentResult,
     Alarm,
-    Scoring,
     actor_of,
     alarms_tally,
     foreseen,
@@ -24,11 +22,17 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.metrics.alarms.raised import by_sureness, nearest_two, position_difference
+from deepaccident_devkit.evaluation.metrics.alarms.raised import (
+    MATCH_DISTANCE,
+    by_sureness,
+    nearest_two,
+    position_difference,
+)
 from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     AccidentReading,
     InstanceAccident,
     accident_of,
+    instances_of_heads,
     match_tracks,
 )
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
@@ -49,13 +53,6 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import settle_choices
 
 SampleChoice = Literal["best", "mean_first"]
-PredictedBy = Literal["any", "mean"]
-PositionTime = Literal["own", "truth"]
-_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
-    "predicted_by": get_args(PredictedBy),
-    "sample_choice": get_args(SampleChoice),
-    "position_time": get_args(PositionTime),
-}
 _FORMS: Final[Mapping[str, str]] = {"instance_maps": "instance maps", "explicit": "explicit accidents"}
 """Forms of a prediction that are not heads, as counts and as notes have them."""
 
@@ -64,35 +61,24 @@ _FORMS: Final[Mapping[str, str]] = {"instance_maps": "instance maps", "explicit"
 class PaperAccidents:
     """The accident metrics of the paper's text.
 
+    An accident of any of the K predictions counts as predicted. Its positions are those of its own moment.
+
     Attributes:
         reading: how an accident is read off maps, the truth's and the prediction's alike.
-        predicted_by: whose accident counts as predicted: that of `any` of the K predictions, or the `mean` sample's
-            (the last of the K) alone.
         sample_choice: which of several predictions that have an accident is compared: the `best`, whose positions are
             nearest to the truth (as the released code; the first of equal ones), or `mean_first`: the mean sample's, or
             else the first, which does not use the truth. Both are counted; this one is the result, the other is in
             `beside`.
-        position_time: the moment of the predicted positions: its `own` accident's, or that of the `truth`, where both
-            predicted agents are there then. Explicit accidents have only their own.
-        match_distance: metres: gate of the match of instances that decides whether a prediction names the right ones;
-            also how far off the instances may be that an explicit accident without `ids` names.
-        scoring: when an accident counts as foreseen.
     """
 
     labels: ClassVar[str] = "released"
     """Label protocol of the truth; labels of others are refused."""
     reading: AccidentReading = field(default_factory=AccidentReading)
-    predicted_by: PredictedBy = "any"
     sample_choice: SampleChoice = "best"
-    position_time: PositionTime = "own"
-    match_distance: float = 4.0
-    scoring: Scoring = field(default_factory=Scoring)
 
     def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError or ConfigError."""
-        settle_choices(self, _CHOICES)
-        if not 0 < self.match_distance < np.inf:
-            raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
+        """Check the values; raises ChoiceError."""
+        settle_choices(self, {"sample_choice": get_args(SampleChoice)})
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.
@@ -124,14 +110,12 @@ class PaperAccidents:
         alarms: list[Alarm | None]
         if isinstance(given, MotionOutput):
             read = self.read_predictions(given, frames, rules)
-            alarms = [self._alarm(found, truth, seconds) if found.contact else None for found in read]
+            alarms = [_alarm(found, truth, seconds) if found.contact else None for found in read]
         else:
             alarms = [
-                explicit_alarm(each, truth, actors, seconds=seconds, gate=self.match_distance)
+                explicit_alarm(each, truth, actors, seconds=seconds)
                 for each in surest_within(given, (frames - 0.5) * seconds)
             ]
-        if self.predicted_by == "mean":
-            alarms = alarms[-1:]
         return {
             "positive": truth.contact is not None,
             "named": named(actors, context),
@@ -143,30 +127,15 @@ class PaperAccidents:
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
-        given = self._united(counts)
+        given = _united(counts)
         chosen, other = sorted(get_args(SampleChoice), key=lambda choice: choice != self.sample_choice)
-        result, beside = (tally_result(given[choice], self.scoring.errors_at) for choice in (chosen, other))
+        result, beside = (tally_result(given[choice], ERRORS_AT) for choice in (chosen, other))
         notes = _notes(given, result.samples)
         return replace(result, notes=notes, beside={f"sample_choice={other}": beside})
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """The sums of all counts, which have the same result."""
-        return [{"tallies": self._united(counts)}]
-
-    def _united(self, counts: Collection[Counts]) -> dict[str, Any]:
-        """The tally of each choice of a sample, and how many predictions were given in which form."""
-        given = [each["tallies"] if "tallies" in each else self._tallies(each) for each in counts]
-        return {
-            **{choice: united(each[choice] for each in given) for choice in get_args(SampleChoice)},
-            **{form: sum(each[form] for each in given) for form in _FORMS},
-        }
-
-    def _tallies(self, sample: Counts) -> dict[str, Any]:
-        alarms = {choice: [sample[choice]] if sample[choice] else [] for choice in get_args(SampleChoice)}
-        return {
-            **{choice: alarms_tally(sample, each, self.scoring) for choice, each in alarms.items()},
-            **{form: int(sample[form]) for form in _FORMS},
-        }
+        return [{"tallies": _united(counts)}]
 
     def _checked(
         self, prediction: Prediction, label: MotionLabels | None
@@ -180,31 +149,45 @@ class PaperAccidents:
         """(T, H, W) the instances that a prediction is compared with, of labels at the present; as the labels lie."""
         if not isinstance(given, MotionOutput) or given.heads is None:
             return label.instance[:frames]
-        return self.reading.instances(first_frames(MotionHeads.from_labels(label), frames))
+        return instances_of_heads(first_frames(MotionHeads.from_labels(label), frames))
 
     def read_predictions(self, output: MotionOutput, frames: int, rules: LabelProtocol) -> list[InstanceAccident]:
         """What is read off each of the K predictions, cut to so many frames."""
         if output.heads is not None:
-            maps = [self.reading.instances(first_frames(heads, frames)) for heads in output.heads]
+            maps = [instances_of_heads(first_frames(heads, frames)) for heads in output.heads]
         else:
             maps = [] if output.instances is None else [each[:frames] for each in output.instances]
         return [accident_of(each, output.grid, rules, self.reading) for each in maps]
 
-    def _alarm(self, found: InstanceAccident, truth: InstanceAccident, seconds: float) -> Alarm:
-        """A predicted accident against the true one, if there is one; `seconds` from frame to frame."""
-        if found.contact is None or truth.contact is None:
-            return foreseen()
-        positions = found.positions
-        if self.position_time == "truth":
-            then = found.tracks.at(truth.contact.frame, found.contact.ids)
-            positions = then if np.isfinite(then).all() else positions
-        match = match_tracks(found.tracks, truth.tracks, self.match_distance)
-        same = {match.get(identity) for identity in found.contact.ids} == set(truth.contact.ids)
-        return foreseen(
-            position=position_difference(positions, truth.positions),
-            time=(found.contact.frame - truth.contact.frame) * seconds,
-            id_error=int(not same),
-        )
+
+def _united(counts: Collection[Counts]) -> dict[str, Any]:
+    """The tally of each choice of a sample, and how many predictions were given in which form."""
+    given = [each["tallies"] if "tallies" in each else _tallies(each) for each in counts]
+    return {
+        **{choice: united(each[choice] for each in given) for choice in get_args(SampleChoice)},
+        **{form: sum(each[form] for each in given) for form in _FORMS},
+    }
+
+
+def _tallies(sample: Counts) -> dict[str, Any]:
+    alarms = {choice: [sample[choice]] if sample[choice] else [] for choice in get_args(SampleChoice)}
+    return {
+        **{choice: alarms_tally(sample, each) for choice, each in alarms.items()},
+        **{form: int(sample[form]) for form in _FORMS},
+    }
+
+
+def _alarm(found: InstanceAccident, truth: InstanceAccident, seconds: float) -> Alarm:
+    """A predicted accident against the true one, if there is one; `seconds` from frame to frame."""
+    if found.contact is None or truth.contact is None:
+        return foreseen()
+    match = match_tracks(found.tracks, truth.tracks, MATCH_DISTANCE)
+    same = {match.get(identity) for identity in found.contact.ids} == set(truth.contact.ids)
+    return foreseen(
+        position=position_difference(found.positions, truth.positions),
+        time=(found.contact.frame - truth.contact.frame) * seconds,
+        id_error=int(not same),
+    )
 
 
 def _nearest(alarms: Sequence[Alarm | None]) -> Alarm | None:
@@ -238,7 +221,6 @@ def explicit_alarm(
     actors: Sequence[int | None] | None,
     *,
     seconds: float,
-    gate: float,
 ) -> Alarm:
     """A predicted accident against the true one, if there is one.
 
@@ -247,14 +229,13 @@ def explicit_alarm(
         truth: read off the labels' maps.
         actors: actor ids of the two true instances, None for one that is not known; None without a true accident.
         seconds: from frame to frame of the maps.
-        gate: metres: how far off the instances may be that it names if it has no `ids`: those nearest to its positions.
     """
     if truth.contact is None:
         return foreseen()
     return foreseen(
         position=position_difference(predicted.positions, truth.positions),
         time=predicted.time - truth.contact.frame * seconds,
-        id_error=_id_error(predicted, truth, actors, seconds, gate),
+        id_error=_id_error(predicted, truth, actors, seconds),
     )
 
 
@@ -263,13 +244,15 @@ def _id_error(
     truth: InstanceAccident,
     actors: Sequence[int | None] | None,
     seconds: float,
-    gate: float,
 ) -> int | None:
-    """1 if other actors than the two true ones are named; None if their ids are not known."""
+    """1 if other actors than the two true ones are named; None if their ids are not known.
+
+    Without `ids` it names the instances nearest to its positions, up to `MATCH_DISTANCE` off.
+    """
     if truth.contact is None or actors is None:
         return None
     if predicted.ids is not None:
         return None if None in actors else int(set(predicted.ids) != set(actors))
     frame = min(round(predicted.time / seconds), len(truth.tracks.center) - 1)
-    nearest = nearest_two(predicted.positions, truth.tracks.identity, truth.tracks.center[frame], gate)
+    nearest = nearest_two(predicted.positions, truth.tracks.identity, truth.tracks.center[frame], MATCH_DISTANCE)
     return int(set(nearest) != set(truth.contact.ids))

@@ -1,9 +1,8 @@
 """Accidents as the released code evaluates them, bugs included (protocol `released`; docs/released_code.md, Accidents).
 
-Each bug is a field of `ReleasedAccidents` that can be corrected, or lies in the functions that have it:
-`motion.postprocessing.redrawing` (boxes of 5 m × 2 m at most, rasterised into the wrong frame after a gap, and of the
-first frame's instances alone), `outlines.first_outline` (of an instance in several parts, one counts),
-`trajectories.padded` and `match_trajectories`.
+Bugs of other functions: `motion.postprocessing.redrawing` (boxes of 5 m × 2 m at most, rasterised into the wrong frame
+after a gap, and of the first frame's instances alone), `outlines.first_outline` (of an instance in several parts, one
+counts), `trajectories.padded` and `match_trajectories`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.outlines import pair_gaps
 from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     DISTANCES,
@@ -49,16 +48,13 @@ from deepaccident_devkit.evaluation.metrics.trajectories import (
 )
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
-    POST_PROCESSING,
     MotionHeads,
     MotionLabels,
-    PostProcessing,
     predict_instances,
     trajectories,
 )
 from deepaccident_devkit.motion.orientations import to_orientation
 from deepaccident_devkit.motion.postprocessing.contours import first_hulls, redrawn_cells
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Pair = tuple[int, int]
 _NOTHING_FOUND: Final = {"id": 1.0, "position": 20.0, "time": 1.0}
@@ -67,48 +63,26 @@ _NOTHING_FOUND: Final = {"id": 1.0, "position": 20.0, "time": 1.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleasedAccidents:
-    """The released rules; the defaults keep all quirks.
+    """The released rules with all quirks, without a choice.
 
-    Attributes:
-        truth_gap: cells; the true instances that are nearer collide. With 0.001 they must overlap.
-        prediction_gap: cells; the predicted instances that are nearer collide: 2.5 m. The paper has 1 m for both.
-        level: where the outlines run, see `outlines.LEVEL`: 0.1 makes instances almost a cell larger all around.
-        truth_through_heads: truth is what the post-processing finds in the labels; else the labels' own instances.
-        redraw: distances are those of the boxes rasterised along the paths; else of the instances themselves.
-        last_frame_only: only the last frame counts, as the lists of accidents begin empty at each. So accidents
-            have no time, and its error is always 0. Else the frame with the smallest distance counts, and truth and
-            prediction have each its own.
-        far_is_missed: an accident foreseen elsewhere also leaves the true one missed. The released code counts it once.
-        empty_first_ends: where the first prediction has no instance at all, the others do not count: a true accident
-            is missed, and nothing is a false alarm.
-        mean_alone_alarms: where there is no accident, only one foreseen by the last prediction (the mean) is a false
-            positive; else one by any. (A true accident may be foreseen by any.)
-        errors_at: metres: the distance whose true positives the errors are means over; None for the mean of the errors
-            at all three. The paper says 10.
+    - Truth is what the post-processing finds in the labels, also where instance maps are predicted.
+    - Distances are those of the boxes rasterised along the paths (`outlines.pair_gaps`).
+    - Only the last frame counts, as the lists of accidents begin empty at each. So accidents have no time, and its
+      error is always 0.
+    - An accident foreseen elsewhere is a false positive and does not leave the true one missed.
+    - Where the first prediction has no instance at all, the others do not count: a true accident is missed, and nothing
+      is a false alarm.
+    - Where there is no accident, only one foreseen by the last prediction (the mean) is a false positive. A true
+      accident may be foreseen by any.
+    - The errors are means of those at all three distances; the paper has those within 10 m.
     """
 
     labels: ClassVar[str] = "released"
     """Protocol of the labels that are the truth; others are refused."""
-    truth_gap: float = 0.001
-    prediction_gap: float = 5.0
-    level: float = 0.1
-    truth_through_heads: bool = True
-    redraw: bool = True
-    last_frame_only: bool = True
-    far_is_missed: bool = False
-    empty_first_ends: bool = True
-    mean_alone_alarms: bool = True
-    errors_at: float | None = None
-
-    def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
-        for name, least, most in (("truth_gap", 0, math.inf), ("prediction_gap", 0, math.inf), ("level", 0, 1)):
-            if not least < getattr(self, name) < most:
-                raise ConfigError(
-                    f"{name}: expected a number between {least} and {most}, found {getattr(self, name)!r}"
-                )
-        if self.errors_at is not None and self.errors_at not in DISTANCES:
-            raise ConfigError(f"errors_at: expected one of {', '.join(map(str, DISTANCES))}, found {self.errors_at!r}")
+    truth_gap: ClassVar[float] = 0.001
+    """Cells; the true instances that are nearer collide: they must overlap."""
+    prediction_gap: ClassVar[float] = 5.0
+    """Cells; the predicted instances that are nearer collide: 2.5 m. The paper has 1 m for both."""
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.
@@ -131,8 +105,7 @@ class ReleasedAccidents:
             padded_paths(each, points) for each in (truth, *self.prediction_paths(prediction, frames))
         )
         matches = [match_trajectories(each.paths, truth.paths).pairs for each in predictions]
-        step = label.config.step * FRAME_PERIOD
-        counts, pair = accident_counts(predictions, truth, matches, self, step)
+        counts, pair = accident_counts(predictions, truth, matches)
         actors = None if pair is None else [actor_of(present == name, 0, label, context) for name in pair]
         return counts | {"named": named(actors, context)}
 
@@ -149,39 +122,21 @@ class ReleasedAccidents:
         """The sum of all counts, which has the same result."""
         return [_united(counts)]
 
-    @property
-    def post_processing(self) -> PostProcessing:
-        """How instances are read off heads."""
-        return replace(POST_PROCESSING["accident"], redraw=self.redraw)
-
     def truth_paths(self, label: MotionLabels, frames: int) -> tuple[DrawnPaths, AnyArray]:
         """What predictions are compared with, and (H, W) its ids at the present."""
-        grid = label.config.grid
-        if self.truth_through_heads:
-            return paths_of_heads(first_frames(MotionHeads.from_labels(label), frames), grid, self.post_processing)
-        return paths_of_instances(label.instance[:frames], grid, redraw=self.redraw), label.instance[0]
+        return paths_of_heads(first_frames(MotionHeads.from_labels(label), frames), label.config.grid)
 
     def prediction_paths(self, output: MotionOutput, frames: int) -> list[DrawnPaths]:
         """What is compared of each of the K predictions, cut to so many frames."""
         if output.instances is not None:
-            return [paths_of_instances(maps[:frames], output.grid, redraw=self.redraw) for maps in output.instances]
+            return [paths_of_instances(maps[:frames], output.grid) for maps in output.instances]
         cut = [first_frames(heads, frames) for heads in output.heads or ()]
-        return [paths_of_heads(heads, output.grid, self.post_processing)[0] for heads in cut]
+        return [paths_of_heads(heads, output.grid)[0] for heads in cut]
 
     def _error(self, errors: Sequence[float | None], name: str) -> float:
         """An error over all distances from those at each; where none is foreseen it is that of `_NOTHING_FOUND`."""
-        if self.errors_at is not None:
-            errors = [errors[DISTANCES.index(self.errors_at)]]
         filled = [_NOTHING_FOUND[name] if error is None else error for error in errors]
         return math.fsum(filled) / len(filled)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Collision:
-    """Two instances that collide, and at which frame."""
-
-    pair: Pair
-    frame: int
 
 
 def padded_paths(given: DrawnPaths, length: int) -> DrawnPaths:
@@ -190,11 +145,7 @@ def padded_paths(given: DrawnPaths, length: int) -> DrawnPaths:
 
 
 def accident_counts(
-    predictions: Sequence[DrawnPaths],
-    truth: DrawnPaths,
-    matches: Sequence[Collection[Pair]],
-    rules: ReleasedAccidents,
-    step: float,
+    predictions: Sequence[DrawnPaths], truth: DrawnPaths, matches: Sequence[Collection[Pair]]
 ) -> tuple[dict[str, Any], Pair | None]:
     """What one sample adds, of paths that are padded.
 
@@ -202,71 +153,58 @@ def accident_counts(
         predictions: K of them, the mean last.
         truth: what is true.
         matches: of each prediction: its ids and the matched true ids.
-        rules: the rules.
-        step: seconds from one frame to the next.
 
     Returns:
         The counts: `tp`, `fp`, `fn` and the sums of the errors (`id`, `position`, `time`), each a list by `DISTANCES`,
         and `positive`; and the pair that collides in truth.
     """
     last = (longest(truth.paths) or len(truth.drawn)) - 1
-    frames = [last] if rules.last_frame_only else [*range(last + 1)]
-    true = collision(truth, frames, rules.truth_gap, rules.level)
+    true = collision(truth, last, ReleasedAccidents.truth_gap)
     counts: dict[str, Any] = {name: [0] * len(DISTANCES) for name in ("tp", "fp", "fn", *ERRORS)}
     counts["positive"] = true is not None
-    if not predictions[0].paths and rules.empty_first_ends:
+    if not predictions[0].paths:
         counts["fn"] = [int(true is not None)] * len(DISTANCES)
-        return counts, None if true is None else true.pair
-    found = [collision(each, frames, rules.prediction_gap, rules.level) for each in predictions]
+        return counts, true
+    found = [collision(each, last, ReleasedAccidents.prediction_gap) for each in predictions]
     if true is None:
-        alarms = found[-1:] if rules.mean_alone_alarms else found
-        counts["fp"] = [int(any(alarm is not None for alarm in alarms))] * len(DISTANCES)
+        counts["fp"] = [int(found[-1] is not None)] * len(DISTANCES)
         return counts, None
     foreseen = [
-        (_apart(each, one, truth, true), one, same)
+        (_apart((each, one), (truth, true), last), one, same)
         for each, one, same in zip(predictions, found, matches, strict=True)
         if one is not None
     ]
     if not foreseen:
         counts["fn"] = [1] * len(DISTANCES)
-        return counts, true.pair
+        return counts, true
     position, best, same = min(foreseen, key=lambda each: each[0])
-    errors = {"id": _others_named(best, true, same), "position": position, "time": abs(best.frame - true.frame) * step}
+    errors = {"id": _others_named(best, true, same), "position": position, "time": 0.0}
     for index, distance in enumerate(DISTANCES):
         within = position <= distance
         counts["tp" if within else "fp"][index] = 1
-        counts["fn"][index] = int(not within and rules.far_is_missed)
         for name, error in errors.items():
             counts[name][index] = error if within else 0
-    return counts, true.pair
+    return counts, true
 
 
-def collision(given: DrawnPaths, frames: Sequence[int], gap: float, level: float) -> Collision | None:
-    """The two instances of the smallest distance below `gap` cells; of equal ones the earliest, then the first ids."""
-    ids = np.array([*given.paths], dtype=np.int64)
-    nearest, result = gap, None
-    for frame in frames:
-        pairs, gaps = pair_gaps(given.drawn[frame], ids, level=level, below=nearest)
-        best = gaps.argmin() if len(gaps) else -1
-        if best >= 0 and gaps[best] < nearest:
-            nearest = gaps.item(best)
-            first, second = pairs[best].tolist()
-            result = Collision(pair=(first, second), frame=frame)
-    return result
+def collision(given: DrawnPaths, frame: int, gap: float) -> Pair | None:
+    """The two instances of the smallest distance below `gap` cells at a frame; of equal ones the first ids."""
+    pairs, gaps = pair_gaps(given.drawn[frame], np.array([*given.paths], dtype=np.int64), below=gap)
+    if not len(gaps) or gaps.min() >= gap:
+        return None
+    first, second = pairs[gaps.argmin()].tolist()
+    return first, second
 
 
-def _apart(predicted: DrawnPaths, alarm: Collision, truth: DrawnPaths, true: Collision) -> float:
+def _apart(alarm: tuple[DrawnPaths, Pair], true: tuple[DrawnPaths, Pair], frame: int) -> float:
     """Metres: the sum of the distances of the predicted from the true two, in the order with the smaller sum."""
-    here, there = (
-        np.array([each.paths[name][one.frame] for name in one.pair])
-        for each, one in ((predicted, alarm), (truth, true))
-    )
+    here, there = (np.array([each.paths[name][frame] for name in pair]) for each, pair in (alarm, true))
     return position_difference(here, there)
 
 
-def _others_named(alarm: Collision, true: Collision, same: Collection[Pair]) -> int:
+def _others_named(alarm: Pair, true: Pair, same: Collection[Pair]) -> int:
     """0 if the two predicted ones are the true ones, by the matches of their paths; else 1."""
-    return int(not all(any((name, other) in same for other in true.pair) for name in alarm.pair))
+    return int(not all(any((name, other) in same for other in true) for name in alarm))
 
 
 def _united(counts: Collection[Counts]) -> Counts:
@@ -296,26 +234,25 @@ class DrawnPaths:
     drawn: AnyArray
 
 
-def paths_of_heads(heads: MotionHeads, grid: BevGrid, settings: PostProcessing) -> tuple[DrawnPaths, AnyArray]:
+def paths_of_heads(heads: MotionHeads, grid: BevGrid) -> tuple[DrawnPaths, AnyArray]:
     """Instances found by the accident post-processing, and (H, W) their ids at the present, as the heads lie."""
-    linked = predict_instances(heads, settings)
+    linked = predict_instances(heads, "accident")
     drawn = linked.instance if linked.redrawn is None else linked.redrawn
     drawn = to_orientation(drawn, vectors=False, source=heads.orientation, target="released")
     paths = trajectories(linked, grid, half_cell_shift=False)  # as instance maps' are: only differences count
     return DrawnPaths(paths=paths, drawn=drawn), linked.instance[0]
 
 
-def paths_of_instances(instance: AnyArray, grid: BevGrid, *, redraw: bool) -> DrawnPaths:
-    """Instances given as maps.
+def paths_of_instances(instance: AnyArray, grid: BevGrid) -> DrawnPaths:
+    """Instances given as maps; boxes are rasterised along their paths, as the released post-processing does.
 
     Args:
         instance: (T, H, W) ids from 1 that stay the same over the frames, 0 elsewhere.
         grid: its cells and orientation.
-        redraw: rasterise boxes along the paths, as the released post-processing does; else keep the instances.
     """
     paths = instance_paths(instance, grid)
     lying = to_orientation(instance, vectors=False, source=grid.orientation, target="released")
-    return DrawnPaths(paths=paths, drawn=_redrawn(lying, np.array([*paths], dtype=np.int64)) if redraw else lying)
+    return DrawnPaths(paths=paths, drawn=_redrawn(lying, np.array([*paths], dtype=np.int64)))
 
 
 def _redrawn(instance: AnyArray, ids: IntArray) -> AnyArray:

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, ShortRepr
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE, even
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
@@ -183,28 +182,14 @@ positive) and `id` (0 the same two, 1 others) differences from the truth; None w
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scoring:
-    """When an accident counts as foreseen; the defaults are the protocol `paper`'s.
+ERRORS_AT: Final = 10.0
+"""Metres: of `paper` and `boxes` the errors are means over the true positives within this distance."""
 
-    Attributes:
-        errors_at: metres: the errors are means over the true positives within this distance.
-        far_is_missed: an accident foreseen elsewhere is a false positive and leaves the true one missed; else it is
-            only the former, as in the released code.
-    """
 
-    errors_at: float = 10.0
-    far_is_missed: bool = True
-
-    def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
-        if self.errors_at not in DISTANCES:
-            raise ConfigError(f"errors_at: expected one of {', '.join(map(str, DISTANCES))}, found {self.errors_at!r}")
-
-    def hit(self, alarms: Sequence[Alarm], distance: float) -> Alarm | None:
-        """The first alarm that foresees the true accident nearer than a distance."""
-        near = (each for each in alarms if each["position"] is not None and each["position"] < distance - TIE)
-        return next(near, None)
+def hit_of(alarms: Sequence[Alarm], distance: float) -> Alarm | None:
+    """The first alarm that foresees the true accident nearer than a distance."""
+    near = (each for each in alarms if each["position"] is not None and each["position"] < distance - TIE)
+    return next(near, None)
 
 
 def foreseen(
@@ -230,25 +215,23 @@ def named(pair: Iterable[int | None] | None, context: AccidentContext) -> str:
     return "meta" if context.pair is not None and actors == set(context.pair) else "another"
 
 
-def alarms_tally(sample: Counts, alarms: Sequence[Alarm], scoring: Scoring) -> Tally:
-    """What one sample adds.
+def alarms_tally(sample: Counts, alarms: Sequence[Alarm]) -> Tally:
+    """What one sample adds; an accident foreseen elsewhere is a false positive and leaves the true one missed.
 
     Args:
         sample: its counts, of which `positive` and `named` are read.
         alarms: its, the most important one first.
-        scoring: when they count.
     """
-    return sample_tally(sample, [_cases_within(sample, alarms, each, scoring) for each in DISTANCES])
+    return sample_tally(sample, [_cases_within(sample, alarms, each) for each in DISTANCES])
 
 
-def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float, scoring: Scoring) -> dict[str, Any]:
-    hit = scoring.hit(alarms, distance) if sample["positive"] else None
-    missed = sample["positive"] and hit is None and (scoring.far_is_missed or not alarms)
+def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float) -> dict[str, Any]:
+    hit = hit_of(alarms, distance) if sample["positive"] else None
     errors = {name: None if hit is None else hit[name] for name in ERRORS}
     return {
         "tp": int(hit is not None),
         "fp": len(alarms) - int(hit is not None),
-        "fn": int(missed),
+        "fn": int(sample["positive"] and hit is None),
         **{name: [] if error is None else [abs(error)] for name, error in errors.items()},
     }
 

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import FloatArray, IntArray
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     AccidentReading,
     Contact,
     InstanceAccident,
     InstanceTracks,
     accident_of,
+    instances_of_heads,
     match_tracks,
 )
 from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, BoxTruth
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
-from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelProtocol, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice
@@ -91,48 +88,6 @@ def position_difference(first: FloatArray, second: FloatArray) -> float:
     return float(min(apart[0, 0] + apart[1, 1], apart[0, 1] + apart[1, 0]))
 
 
-def accidents_of(
-    instance: ArrayLike,
-    grid: BevGrid,
-    *,
-    step: float = LABEL_STEP,
-    labels: str | None = "released",
-    reading: AccidentReading | None = None,
-) -> list[Accident]:
-    """The accidents that instance maps show, as the protocol `paper` reads them: at most one of each prediction.
-
-    Args:
-        instance: (T, H, W), or K predictions (K, T, H, W): ids from 1 that stay the same over the frames, 0 or less
-            elsewhere; in the present ego frame, the present first.
-        grid: its cells; its orientation is how the maps lie.
-        step: seconds from one frame to the next.
-        labels: protocol of the labels that the maps are, or were learned from: where it has the half-cell shift, that
-            is undone in positions. None for maps without any.
-        reading: how an accident is read off maps; its foreground, link distance and redrawing are for heads alone. None
-            for the protocol `paper`'s.
-
-    Returns:
-        In the order of the predictions, without those that have no accident. Positions are x forward, y left, metres;
-        `ids` are those of the maps, ascending, and not actors'.
-
-    Raises:
-        GeometryError: the maps' shape is not the grid's, or they are not whole numbers.
-        ChoiceError: no such labels.
-        ConfigError: the step is not above 0.
-    """
-    labels = choice("labels", labels, (None, *LABEL_PROTOCOLS))
-    if not 0 < step < math.inf:
-        raise ConfigError(f"step: expected seconds above 0, found {step!r}")
-    rules = None if labels is None else LABEL_PROTOCOLS[labels]
-    maps = instances_of(instance, grid).instances
-    read = [accident_of(each, grid, rules, reading or AccidentReading()) for each in (() if maps is None else maps)]
-    return [
-        Accident(positions=each.positions, time=each.contact.frame * step, ids=each.contact.ids)
-        for each in read
-        if each.contact is not None
-    ]
-
-
 def _named(alarm: Accident, truth: BoxTruth) -> Pair:
     if alarm.ids is not None:
         return alarm.ids
@@ -141,11 +96,7 @@ def _named(alarm: Accident, truth: BoxTruth) -> Pair:
 
 
 def foreseen_accident(
-    output: MotionOutput,
-    *,
-    step: float = LABEL_STEP,
-    labels: str | None = "released",
-    reading: AccidentReading | None = None,
+    output: MotionOutput, *, step: float = LABEL_STEP, labels: str | None = "released"
 ) -> Accident | None:
     """The accident that K motion predictions of a sample foresee together, as the protocol `boxes` reads them.
 
@@ -155,8 +106,8 @@ def foreseen_accident(
     Args:
         output: the predictions.
         step: seconds from one frame to the next.
-        labels: protocol of the labels that they were learned from, as of `accidents_of`.
-        reading: how an accident is read off maps; None for the protocol `paper`'s.
+        labels: protocol of the labels that they are, or were learned from: where it has the half-cell shift, that is
+            undone in positions. None for predictions without any.
 
     Returns:
         The accident without ids, which maps do not know; None if no prediction has one.
@@ -165,14 +116,14 @@ def foreseen_accident(
         ChoiceError: no such labels.
     """
     labels = choice("labels", labels, (None, *LABEL_PROTOCOLS))
-    read = _read_off(output, None if labels is None else LABEL_PROTOCOLS[labels], reading or AccidentReading())
+    read = _read_off(output, None if labels is None else LABEL_PROTOCOLS[labels], AccidentReading())
     there = _surest_first(read)
     return _joint(there, len(read), step) if there else None
 
 
 def _read_off(output: MotionOutput, rules: LabelProtocol | None, reading: AccidentReading) -> list[InstanceAccident]:
     """What each prediction shows."""
-    maps = output.instances if output.heads is None else [reading.instances(heads) for heads in output.heads]
+    maps = output.instances if output.heads is None else [instances_of_heads(heads) for heads in output.heads]
     return [accident_of(each, output.grid, rules, reading) for each in (() if maps is None else maps)]
 
 

@@ -5,9 +5,8 @@ docs/released_code.md, Paper versus code, has where the released code differs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final
 
 import numpy as np
 
@@ -16,60 +15,36 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.hulls import convex_hulls, hull_distances
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
-from deepaccident_devkit.motion import LabelProtocol, MotionHeads, PostProcessing, predict_instances
+from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
 from deepaccident_devkit.motion.orientations import cells_in
-from deepaccident_devkit.motion.postprocessing.predict import Foreground
-from deepaccident_devkit.text import settle_choices
 
-Outline = Literal["centers", "cells"]
-Moment = Literal["closest", "first", "last"]
 TIE: Final = 1e-9
 """Lengths that differ by less, in metres, are equal: means of cells are inexact in the last bits."""
 _TIE_DECIMALS: Final = 9
-_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"outline": get_args(Outline), "moment": get_args(Moment)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccidentReading:
-    """Which instances collide, and when; the defaults are those of the protocol `paper`.
+    """Which instances collide: those whose cells' centres have convex hulls (points and lines allowed) near each other.
+
+    Of heads the instances are those of the paper's motion metrics; the present frame counts, and the frame of a pair's
+    accident is where it is closest, the earliest if there are several.
 
     Attributes:
-        foreground: of heads: which cells are actors, as `PostProcessing` has it. The released accident evaluation has
-            `sigmoid`; the paper is silent, and `argmax` is what the same paper's motion metrics use.
-        link_distance: of heads: cells, as `PostProcessing` has it. The released accident evaluation has 8.
-        redraw: of heads: take the boxes that the released code rasterises along the paths instead of the instances.
-        outline: what the distance of two instances is between: the convex hulls of their cells' `centers` (points and
-            straight lines allowed), or of their whole `cells`, which are nearer by about a cell.
-        danger_distance: metres; instances that come nearer to each other collide.
-        present: whether the present frame counts.
-        moment: the frame of a pair's accident: where it is `closest` (the earliest if there are several), the `first`
-            with less than the danger distance, or the `last` frame alone, as in the released code.
+        danger_distance: metres; instances that come nearer to each other collide. The paper says 1 m.
     """
 
-    foreground: Foreground = "argmax"
-    link_distance: float = 10.0
-    redraw: bool = False
-    outline: Outline = "centers"
     danger_distance: float = 1.0
-    present: bool = True
-    moment: Moment = "closest"
 
     def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError or ConfigError."""
-        settle_choices(self, _CHOICES)
+        """Check the value; raises ConfigError."""
         if not 0 < self.danger_distance < np.inf:
             raise ConfigError(f"danger_distance: expected metres above 0, found {self.danger_distance!r}")
-        _ = self.post_processing
 
-    @property
-    def post_processing(self) -> PostProcessing:
-        """The post-processing of heads."""
-        return PostProcessing(foreground=self.foreground, link_distance=self.link_distance, redraw=self.redraw)
 
-    def instances(self, heads: MotionHeads) -> AnyArray:
-        """(T, H, W) the instances of heads, in their orientation."""
-        linked = predict_instances(heads, self.post_processing)
-        return linked.instance if linked.redrawn is None else linked.redrawn
+def instances_of_heads(heads: MotionHeads) -> AnyArray:
+    """(T, H, W) the instances of heads, in their orientation, read off as for the motion metrics."""
+    return predict_instances(heads, "motion").instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,19 +109,19 @@ def accident_of(
 ) -> InstanceAccident:
     """Where instances are, and which pair of them collides when, if any does.
 
-    Of several pairs and moments the one with the smallest distance is taken (`moment` may prefer others); of equal ones
-    the earlier, then that with the nearer centres, then that with the lower ids.
+    Of several pairs and moments the one with the smallest distance is taken; of equal ones the earlier, then that with
+    the nearer centres, then that with the lower ids.
 
     Args:
         instance: (T, H, W) ids from 1 that stay the same over the frames, 0 or less elsewhere.
         grid: its cells and orientation.
         rules: of the labels that the maps are, or were learned from: where they have the half-cell shift, it is undone
             in positions. None for maps without any.
-        reading: the choices.
+        reading: how near is a collision.
     """
     shapes = _shapes(instance, grid.orientation)
     size = np.array([grid.x[2], grid.y[2]])
-    contact = _contact(shapes, size, len(instance), reading)
+    contact = _contact(shapes, size, reading.danger_distance)
     identity, which = np.unique(shapes.identity, return_inverse=True)
     center = np.full((len(instance), len(identity), 2), np.nan)
     center[shapes.frame, which] = [grid.x[0], grid.y[0]] + (shapes.center + _within_cell(rules)) * size
@@ -203,17 +178,12 @@ class _Shapes:
     cells: IntArray
     group: IntArray
 
-    def hulls(self, which: IntArray, outline: Outline) -> FloatArray:
+    def hulls(self, which: IntArray) -> FloatArray:
         """(len(which), V, 2) the outlines of some, in cells."""
         number = np.full(len(self.frame), -1)
         number[which] = np.arange(len(which))
         group = number[self.group]
-        cells, group = self.cells[group >= 0], group[group >= 0]
-        if outline == "centers":
-            return convex_hulls(cells, group)
-        corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-        doubled = (2 * cells[:, None] + corners).reshape(-1, 2)  # so that half cells are whole numbers
-        return convex_hulls(doubled, np.repeat(group, 4)) / 2
+        return convex_hulls(self.cells[group >= 0], group[group >= 0])
 
 
 def _shapes(instance: AnyArray, orientation: Orientation) -> _Shapes:
@@ -241,27 +211,21 @@ def _shapes(instance: AnyArray, orientation: Orientation) -> _Shapes:
     )
 
 
-def _contact(shapes: _Shapes, size: FloatArray, frames: int, reading: AccidentReading) -> Contact | None:
-    first, second = _candidates(shapes, size, reading)
-    if not reading.present:
-        first, second = (each[shapes.frame[first] > 0] for each in (first, second))
-    if reading.moment == "last":
-        first, second = (each[shapes.frame[first] == frames - 1] for each in (first, second))
+def _contact(shapes: _Shapes, size: FloatArray, danger_distance: float) -> Contact | None:
+    first, second = _candidates(shapes, size, danger_distance)
     if not len(first):
         return None
     which, place = np.unique(np.concatenate([first, second]), return_inverse=True)
     unit = size.min()  # square cells stay whole numbers
-    hulls = shapes.hulls(which, reading.outline) * (size / unit)
+    hulls = shapes.hulls(which) * (size / unit)
     distance = even(hull_distances(hulls[place[: len(first)]], hulls[place[len(first) :]]) * unit)
-    near = np.flatnonzero(distance < reading.danger_distance)
+    near = np.flatnonzero(distance < danger_distance)
     if not len(near):
         return None
     first, second, distance = first[near], second[near], distance[near]
     between = even(np.linalg.norm((shapes.center[first] - shapes.center[second]) * size, axis=1))
     frame = shapes.frame[first]
-    by_nearness = (shapes.identity[second], shapes.identity[first], between)
-    by_moment = (distance, frame) if reading.moment == "first" else (frame, distance)
-    best = np.lexsort((*by_nearness, *by_moment))[0]
+    best = np.lexsort((shapes.identity[second], shapes.identity[first], between, frame, distance))[0]
     return Contact(
         frame=int(frame[best]),
         ids=(int(shapes.identity[first[best]]), int(shapes.identity[second[best]])),
@@ -269,15 +233,14 @@ def _contact(shapes: _Shapes, size: FloatArray, frames: int, reading: AccidentRe
     )
 
 
-def _candidates(shapes: _Shapes, size: FloatArray, reading: AccidentReading) -> tuple[IntArray, IntArray]:
+def _candidates(shapes: _Shapes, size: FloatArray, danger_distance: float) -> tuple[IntArray, IntArray]:
     """Pairs of rows of one frame whose bounding boxes are nearer than the danger distance."""
     firsts, seconds = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-    slack = 1.0 if reading.outline == "cells" else 0.0
     starts = np.append(np.flatnonzero(np.diff(shapes.frame, prepend=-1)), len(shapes.frame))
     for start, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
         low, high = shapes.low[start:end], shapes.high[start:end]
-        gap = np.maximum(low[:, None] - high, low - high[:, None]) - slack
-        near = np.hypot(*np.moveaxis(np.maximum(gap, 0) * size, -1, 0)) < reading.danger_distance
+        gap = np.maximum(low[:, None] - high, low - high[:, None])
+        near = np.hypot(*np.moveaxis(np.maximum(gap, 0) * size, -1, 0)) < danger_distance
         first, second = np.nonzero(np.triu(near, 1))
         firsts.append(first + start)
         seconds.append(second + start)

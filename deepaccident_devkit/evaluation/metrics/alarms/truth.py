@@ -11,12 +11,13 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import InstanceTracks
 from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.conflicts import time_to_collision
 from deepaccident_devkit.geometry.footprints import gaps
+from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.collisions import labelled_pair
@@ -231,6 +232,16 @@ def _box_truth(
         horizon=horizon,
         unplaced=ahead if impact is None else None,
     )
+
+
+def checked_facts(label: object, context: object) -> None:
+    """Whether a sample's truth is given as labels and context, either of which may be None; raises EvaluationError."""
+    for name, given, kind in (("label", label, MotionLabels), ("context", context, AccidentContext)):
+        if given is not None and not isinstance(given, kind):
+            raise EvaluationError(
+                f"{name}: expected {kind.__name__} or None, found {type(given).__name__}; give what "
+                "dataset.motion_labels(token) has as label, accident_context(dataset, sample, horizon=2.0) as context"
+            )
 
 
 def labelled_sample(dataset: Dataset, sample: RowArgument) -> Any:

@@ -8,11 +8,7 @@ from deepaccident_devkit.evaluation.metrics.detection.protocols import (
     DetectionProtocol,
     detection_protocol,
 )
-from deepaccident_devkit.evaluation.metrics.detection.result import (
-    DetectionResult,
-    NuScenesSummary,
-    nuscenes_summary,
-)
+from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult
 
 __all__ = [
     "DETECTION_PROTOCOLS",
@@ -21,9 +17,7 @@ __all__ = [
     "DetectionMatches",
     "DetectionProtocol",
     "DetectionResult",
-    "NuScenesSummary",
     "detection_matches",
     "detection_protocol",
     "detection_truth",
-    "nuscenes_summary",
 ]

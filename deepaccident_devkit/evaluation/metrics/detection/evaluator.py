@@ -30,7 +30,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
     evaluator = DetectionEvaluator("paper")
     for token in samples(da, "val", "evaluate", "paper"):
         evaluator.update(token, detector(token), detection_truth(da, token, evaluator.protocol))
-    print(evaluator.compute().mean_average_precision, nuscenes_summary(evaluator.compute()))
+    print(evaluator.compute().mean_average_precision, evaluator.compute().mean_errors)
     ```
 
     Attributes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
@@ -13,7 +13,6 @@ from deepaccident_devkit.evaluation.metrics.choices import protocol_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     SegmentationCounts,
-    VpqRules,
     iou,
     mask_counts,
     panoptic_quality,
@@ -31,8 +30,6 @@ from deepaccident_devkit.evaluation.metrics.predictions import (
     labels_at_present,
 )
 from deepaccident_devkit.evaluation.metrics.trajectories import (
-    GATE,
-    TrajectoryRules,
     instance_paths,
     longest,
     match_trajectories,
@@ -45,7 +42,6 @@ from deepaccident_devkit.motion import (
     POST_PROCESSING,
     MotionHeads,
     MotionLabels,
-    PostProcessing,
     predict_instances,
     trajectories,
 )
@@ -63,23 +59,10 @@ class MotionProtocol:
 
     Attributes:
         labels: protocol of the labels that are the truth, by name; others are refused. None for any labels.
-        instances: how instances are read off heads for VPQ.
-        paths: how they are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has
-            these errors from the accident evaluation, which links and cuts out instances by other rules.
-        vpq: which matches count.
-        accelerating_paths: the released quirk of `trajectories.padded`.
-        gate: metres, as of `match_trajectories`.
-        trajectories: what is a miss, and a quirk.
         nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
     """
 
     labels: str | None = "released"
-    instances: PostProcessing = POST_PROCESSING["motion"]
-    paths: PostProcessing = field(default_factory=lambda: replace(POST_PROCESSING["accident"], redraw=False))
-    vpq: VpqRules = field(default_factory=VpqRules)
-    accelerating_paths: bool = True
-    gate: float = GATE
-    trajectories: TrajectoryRules = field(default_factory=TrajectoryRules)
     nothing_is_zero: bool = True
 
     def __post_init__(self) -> None:
@@ -94,11 +77,9 @@ MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
 ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not 0."""
 
 
-def motion_protocol(protocol: str | MotionProtocol) -> MotionProtocol:
-    """A protocol by its name, or as it is given; raises ChoiceError."""
-    return protocol_of(protocol, MotionProtocol, MOTION_PROTOCOLS)
-
-
+_READ_FOR_PATHS: Final = replace(POST_PROCESSING["accident"], redraw=False)
+"""How instances are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has these
+errors from the accident evaluation, which links and cuts out instances by other rules than VPQ's."""
 _PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
 _PATHS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
 _INSTANCE_MAPS: Final = (
@@ -176,7 +157,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
         """Start without samples.
 
         Args:
-            protocol: of `MOTION_PROTOCOLS` by name, or your own.
+            protocol: of `MOTION_PROTOCOLS` by name, or one with other fields.
             trajectories: whether paths are compared too. Of heads that takes many times as long as all the rest, since
                 instances are read off all predictions and the labels for it.
 
@@ -184,7 +165,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
             ChoiceError: no protocol has that name.
         """
         super().__init__()
-        self.protocol = motion_protocol(protocol)
+        self.protocol = protocol_of(protocol, MotionProtocol, MOTION_PROTOCOLS)
         self.trajectories = trajectories
 
     @property
@@ -308,7 +289,7 @@ def motion_counts(
     frames = frames_there(label)
     check_output(prediction, label, frames)
     truth, grid = labels_at_present(label), label.config.grid
-    last = _last_maps(prediction, frames, rules.instances)
+    last = _last_maps(prediction, frames)
     actors, instance = (prediction.grid.reorient(maps, grid.orientation) for maps in last)
     true_actors, true_instance = truth.segmentation[:frames] == 1, truth.instance[:frames]
     cells, vpq = [], []
@@ -316,7 +297,7 @@ def motion_counts(
         within = (slice(None), *cells_within(grid, extent))
         counted = mask_counts(actors[within], true_actors[within])
         cells.append([counted.true_positive, counted.false_positive, counted.false_negative])
-        quality = vpq_counts(instance[within], true_instance[within], rules.vpq)
+        quality = vpq_counts(instance[within], true_instance[within])
         by_name = (quality.iou, quality.true_positive, quality.false_positive, quality.false_negative)
         vpq.append([values[:, 1].tolist() for values in by_name])
     return {
@@ -325,31 +306,31 @@ def motion_counts(
         "instance_maps": int(prediction.instances is not None),
         "cells": cells,
         "vpq": vpq,
-        "paths": _path_counts(prediction, truth, frames, rules) if trajectories else None,
+        "paths": _path_counts(prediction, truth, frames) if trajectories else None,
     }
 
 
-def _last_maps(prediction: MotionOutput, frames: int, settings: PostProcessing) -> tuple[AnyArray, AnyArray]:
+def _last_maps(prediction: MotionOutput, frames: int) -> tuple[AnyArray, AnyArray]:
     """(T, H, W) which cells are actors, and instances, of the last prediction, as it lies."""
     if prediction.instances is not None:
         instances = prediction.instances[-1, :frames]
         return instances > 0, instances
     heads = first_frames((prediction.heads or ())[-1], frames)
-    return heads.segmentation[:, 1] > heads.segmentation[:, 0], predict_instances(heads, settings).instance
+    return heads.segmentation[:, 1] > heads.segmentation[:, 0], predict_instances(heads, "motion").instance
 
 
-def _path_counts(prediction: MotionOutput, truth: MotionLabels, frames: int, rules: MotionProtocol) -> dict[str, float]:
+def _path_counts(prediction: MotionOutput, truth: MotionLabels, frames: int) -> dict[str, float]:
     grid = truth.config.grid
     if prediction.instances is not None:
         maps = [*((each, prediction.grid) for each in prediction.instances), (truth.instance, grid)]
         *predicted, true = (instance_paths(each[:frames], cells) for each, cells in maps)
     else:
         heads = (*(prediction.heads or ()), MotionHeads.from_labels(truth))
-        *predicted, true = (_paths_of(first_frames(each, frames), grid, rules.paths) for each in heads)
+        *predicted, true = (_paths_of(first_frames(each, frames), grid) for each in heads)
     length = longest(true)
-    *sides, true = (padded(each, length, accelerating=rules.accelerating_paths) for each in (*predicted, true))
-    matches = [match_trajectories(paths, true, gate=rules.gate) for paths in sides]
-    errors = trajectory_errors(sides, true, matches, rules.trajectories)
+    *sides, true = (padded(each, length) for each in (*predicted, true))
+    matches = [match_trajectories(paths, true) for paths in sides]
+    errors = trajectory_errors(sides, true, matches)
     last = matches[-1]
     return asdict(errors) | {
         "true_positive": len(last.pairs),
@@ -358,8 +339,8 @@ def _path_counts(prediction: MotionOutput, truth: MotionLabels, frames: int, rul
     }
 
 
-def _paths_of(heads: MotionHeads, grid: BevGrid, settings: PostProcessing) -> dict[int, FloatArray]:
-    return trajectories(predict_instances(heads, settings), grid, half_cell_shift=False)
+def _paths_of(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
+    return trajectories(predict_instances(heads, _READ_FOR_PATHS), grid, half_cell_shift=False)
 
 
 def _path_sums(counts: Collection[Counts]) -> dict[str, float]:

@@ -2,6 +2,8 @@
 
 VPQ: instances found, in the right cells and under the same id in all frames. In each frame a true and a predicted
 instance match if the intersection of their cells is more than half of the union, so that each has at most one partner.
+A true instance that was matched with another predicted id when it last had a match is no true positive but both missed
+and a false alarm. The other way round, a predicted id that jumps to another true instance, is not punished.
 FIERY's measure, of which the released code has a copy; counts are sums over frames (docs/released_code.md, IoU and
 VPQ).
 """
@@ -9,13 +11,13 @@ VPQ).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, checked
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers
 from deepaccident_devkit.errors import GeometryError
 
 
@@ -32,26 +34,6 @@ class SegmentationCounts:
     true_positive: int
     false_positive: int
     false_negative: int
-
-
-def segmentation_counts(prediction: AnyArray, label: AnyArray, classes: int = 2) -> tuple[SegmentationCounts, ...]:
-    """Compare two segmentations cell by cell.
-
-    Args:
-        prediction: any shape, integers: the class of each cell, from 0.
-        label: the same shape.
-        classes: how many are counted; cells of other classes are ignored.
-
-    Returns:
-        The counts of each class.
-
-    Raises:
-        GeometryError: other shapes.
-    """
-    predicted, true = as_numbers("prediction", prediction, dtype=None), as_numbers("label", label, dtype=None)
-    if predicted.shape != true.shape:
-        raise GeometryError(f"prediction: expected the label's shape {true.shape}, found {predicted.shape}")
-    return tuple(mask_counts(predicted == index, true == index) for index in range(classes))
 
 
 def mask_counts(predicted: BoolArray, true: BoolArray) -> SegmentationCounts:
@@ -76,19 +58,6 @@ CLASSES: Final = ("background", "instances")
 """What is counted: cells without any instance, as if they were one, and the instances."""
 _MOST_PAIRS: Final = 4_000_000
 """Entries of a histogram of pairs of ids; ids that would need more are renumbered."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VpqRules:
-    """The choices of VPQ; the defaults are the released ones.
-
-    Attributes:
-        ids_must_stay: a true instance that was matched with another predicted id when it last had a match is no true
-            positive but both missed and a false alarm. The other way round, a predicted id that jumps to another true
-            instance, is not punished. False for panoptic quality frame by frame.
-    """
-
-    ids_must_stay: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,13 +94,12 @@ class PanopticQuality:
     denominator: float
 
 
-def vpq_counts(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules()) -> VpqCounts:
+def vpq_counts(prediction: AnyArray, label: AnyArray) -> VpqCounts:
     """Compare the instances of one sample.
 
     Args:
         prediction: (T, H, W) integers: ids from 1; what is less is background.
         label: the same shape.
-        rules: which matches count.
 
     Raises:
         GeometryError: other shapes.
@@ -139,7 +107,7 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules
     predicted, true = _checked_maps(prediction, label)
     shared = _shared_cells(predicted, true)
     true_size, predicted_size = shared.sum(axis=2), shared.sum(axis=1)
-    frame, true_id, predicted_id = _kept_matches(shared, true_size, predicted_size, rules)
+    frame, true_id, predicted_id = _matches(shared, true_size, predicted_size)
     inside = shared[frame, true_id, predicted_id]
     overlap = inside / (true_size[frame, true_id] + predicted_size[frame, predicted_id] - inside)
     found = np.bincount(frame, minlength=len(true))
@@ -155,7 +123,7 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules
     )
 
 
-def vpq_matches(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules()) -> IntArray:
+def vpq_matches(prediction: AnyArray, label: AnyArray) -> IntArray:
     """The matched instances: the true positives of `vpq_counts`; arguments and errors as there.
 
     Returns:
@@ -168,14 +136,8 @@ def vpq_matches(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRule
         names.append(ids.astype(np.int64))
         ranks.append(rank.reshape(-1)[:-1].reshape(maps.shape))
     shared = _shared_cells(ranks[0], ranks[1])
-    frame, true_id, predicted_id = _kept_matches(shared, shared.sum(axis=2), shared.sum(axis=1), rules)
+    frame, true_id, predicted_id = _matches(shared, shared.sum(axis=2), shared.sum(axis=1))
     return np.stack([frame, names[0][predicted_id], names[1][true_id]], axis=1)
-
-
-def vpq(counts: Iterable[VpqCounts]) -> tuple[PanopticQuality, PanopticQuality]:
-    """The quality over all frames of all samples, of `CLASSES`; 0 where there is nothing to count."""
-    every = list(counts)
-    return _quality_of(every, 0), _quality_of(every, 1)
 
 
 def panoptic_quality(iou: float, true_positive: float, false_positive: float, false_negative: float) -> PanopticQuality:
@@ -195,13 +157,6 @@ def _checked_maps(prediction: AnyArray, label: AnyArray) -> tuple[AnyArray, AnyA
     if predicted.shape != true.shape or true.ndim != 3:
         raise GeometryError(f"prediction: expected (T, H, W) as the label's {true.shape}, found {predicted.shape}")
     return predicted, true
-
-
-def _quality_of(counts: Sequence[VpqCounts], index: int) -> PanopticQuality:
-    names = ("iou", "true_positive", "false_positive", "false_negative")
-    return panoptic_quality(
-        *(math.fsum(value for each in counts for value in getattr(each, name)[:, index].tolist()) for name in names)
-    )
 
 
 def _shared_cells(predicted: AnyArray, true: AnyArray) -> IntArray:
@@ -230,23 +185,13 @@ def _renumbered(ids: IntArray) -> IntArray:
 
 
 def _matches(shared: IntArray, true_size: IntArray, predicted_size: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Frame, true id and predicted id of the pairs that match, by frame."""
+    """Frame, true id and predicted id of the pairs that match, by frame, without those under another id than before."""
     frame, true_id, predicted_id = np.nonzero(shared[:, 1:, 1:])
     true_id, predicted_id = true_id + 1, predicted_id + 1
     inside = shared[frame, true_id, predicted_id]
-    match = 3 * inside > true_size[frame, true_id] + predicted_size[frame, predicted_id]
+    match = np.flatnonzero(3 * inside > true_size[frame, true_id] + predicted_size[frame, predicted_id])
+    match = match[_same_partner(true_id[match], predicted_id[match])]
     return frame[match], true_id[match], predicted_id[match]
-
-
-def _kept_matches(
-    shared: IntArray, true_size: IntArray, predicted_size: IntArray, rules: VpqRules
-) -> tuple[IntArray, IntArray, IntArray]:
-    """The matches that are true positives."""
-    frame, true_id, predicted_id = _matches(shared, true_size, predicted_size)
-    if rules.ids_must_stay:
-        stays = _same_partner(true_id, predicted_id)
-        frame, true_id, predicted_id = frame[stays], true_id[stays], predicted_id[stays]
-    return frame, true_id, predicted_id
 
 
 def _same_partner(true_id: IntArray, predicted_id: IntArray) -> BoolArray:
@@ -262,81 +207,3 @@ def _background_overlap(inside: IntArray, true_size: IntArray, predicted_size: I
     """(T,) intersection over union of the background where it is more than a half, else 0."""
     union = np.maximum(true_size + predicted_size - inside, 1)
     return np.where(2 * inside > union, inside / union, 0.0)
-
-
-Reason = Literal["missing", "merged", "cut", "renamed"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LostInstance:
-    """An instance that does not come back as itself in a frame.
-
-    Attributes:
-        frame: from 0.
-        identity: its id in the labels.
-        reason: `missing`: most of its cells have no id; `merged`: they have another instance's id, of which it is the
-            smaller part; `cut`: they have its own id, but IoU ≤ 0.5; `renamed`: IoU > 0.5, but under another id than
-            when it was last found.
-        other: the id in the labels with which it was merged, or None.
-    """
-
-    frame: int
-    identity: int
-    reason: Reason
-    other: int | None = None
-
-
-def lost_instances(label: AnyArray, found: AnyArray) -> list[LostInstance]:
-    """What VPQ and the accident metrics miss of labels that went through grouping and linking, and why.
-
-    Every instance that has no partner of IoU > 0.5, or has it under a new id, is in the list with one reason: exactly
-    VPQ's false negatives.
-
-    Args:
-        label: (T, H, W) ids from 1 that stay the same over the frames, 0 elsewhere; lying as `found`.
-        found: (T, H, W) ids of the same cells as they were read off heads.
-
-    Returns:
-        By frame and id.
-
-    Raises:
-        GeometryError: the two have other shapes.
-    """
-    label = checked("label", label, (None, None, None), np.int64)
-    found = checked("found", found, label.shape, np.int64)
-    result: list[LostInstance] = []
-    names: dict[int, int] = {}
-    for frame, (here, read) in enumerate(zip(label, found, strict=True)):
-        overlap, ids, read_ids = _common_cells(here, read)
-        for row, identity in enumerate(ids.tolist()):
-            if identity == 0:
-                continue
-            column = int(np.argmax(overlap[row]))
-            name = int(read_ids[column])
-            lost = _reason(overlap, row, column, name, names.get(identity, name))
-            if lost:
-                other = int(ids[np.argmax(overlap[:, column])]) if lost == "merged" else None
-                result.append(LostInstance(frame=frame, identity=identity, reason=lost, other=other))
-            if lost in (None, "renamed"):
-                names[identity] = name
-    return result
-
-
-def _reason(overlap: IntArray, row: int, column: int, name: int, before: int) -> Reason | None:
-    if name == 0:
-        return "missing"
-    shared = overlap[row, column]
-    if overlap[:, column].max() > shared:
-        return "merged"
-    if 2 * shared <= overlap[row].sum() + overlap[:, column].sum() - shared:
-        return "cut"
-    return "renamed" if name != before else None
-
-
-def _common_cells(label: IntArray, found: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """(I, J) cells in common of I labels' ids (I,) and J found ones (J,), 0 among both if it is there."""
-    ids, row = np.unique(label.reshape(-1), return_inverse=True)
-    read_ids, column = np.unique(found.reshape(-1), return_inverse=True)
-    size = len(ids) * len(read_ids)
-    overlap = np.bincount(row * len(read_ids) + column, minlength=size).reshape(len(ids), len(read_ids))
-    return overlap, ids, read_ids

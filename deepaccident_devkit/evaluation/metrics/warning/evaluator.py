@@ -15,7 +15,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, checked_facts
 from deepaccident_devkit.evaluation.metrics.choices import protocol_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
@@ -108,16 +108,8 @@ class WarningEvaluator(Evaluator[Any]):
             EvaluationError: the token is no sample's, the context or something in it is missing, the prediction is
                 neither, or the sample came before with another outcome.
         """
-        if label is not None and not isinstance(label, MotionLabels):
-            raise EvaluationError(
-                f"label: expected MotionLabels or None, found {type(label).__name__}; give what happens as context"
-            )
-        if not isinstance(context, AccidentContext):
-            raise EvaluationError(
-                f"context: expected an AccidentContext, found {type(context).__name__}; make it with "
-                "accident_context(dataset, sample, horizon=2.0)"
-            )
-        self.add(token, sample_counts(token, prediction, label, context))
+        checked_facts(label, context)
+        self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
 
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""

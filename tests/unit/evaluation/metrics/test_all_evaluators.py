@@ -17,7 +17,6 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import (
     AccidentEvaluator,
-    BevSegmentationEvaluator,
     DetectedBoxes,
     DetectionEvaluator,
     Evaluator,
@@ -27,7 +26,6 @@ from deepaccident_devkit.evaluation import (
     breakdown,
     detection_truth,
     instances_of,
-    nuscenes_summary,
     sample_attributes,
 )
 from deepaccident_devkit.evaluation.metrics.accident import accident_context
@@ -35,7 +33,7 @@ from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.evaluation.runs.paired import Swaps, swapped_differences
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.motion import BEV_CLASSES, BevSegmentation, MotionHeads
+from deepaccident_devkit.motion import MotionHeads
 
 Arguments = Callable[[str], Sequence[Any]]
 MOTION: dict[str, Callable[[], Evaluator[Any]]] = {
@@ -47,8 +45,7 @@ DETECTION = {
     **{f"detection {name}": lambda name=name: DetectionEvaluator(name) for name in DETECTION_PROTOCOLS},
     "detection opencood by sample": lambda: DetectionEvaluator("opencood", global_sort=False),
 }
-BEV = {"segmentation from above": BevSegmentationEvaluator}
-ALL = {**MOTION, **ACCIDENT, **DETECTION, **BEV}
+ALL = {**MOTION, **ACCIDENT, **DETECTION}
 of_all = pytest.mark.parametrize("name", ALL)
 
 
@@ -77,9 +74,6 @@ class Samples:
             heads = tuple(MotionHeads.from_labels(each) for each in others)
             return self._motion(name, token, MotionOutput(grid=others[0].config.grid, heads=heads))
         source = np.random.default_rng(list(self.labels).index(token))
-        if name in BEV:
-            truth = self._ground(token)
-            return truth.masks ^ (source.uniform(size=truth.masks.shape) < 0.1), truth
         truth = self._boxes(name, token)
         keep = source.uniform(size=len(truth)) < 0.8
         moved = truth.center[keep] + source.normal(0, 0.5, (keep.sum(), 3))
@@ -91,9 +85,6 @@ class Samples:
         label = self.labels[token]
         if name in MOTION | ACCIDENT:
             return self._motion(name, token, instances_of(np.zeros_like(label.instance), label.config.grid))
-        if name in BEV:
-            truth = self._ground(token)
-            return np.zeros_like(truth.masks), truth
         truth = self._boxes(name, token)
         return _detected(truth, np.zeros(len(truth), dtype=bool), np.zeros(0)), truth
 
@@ -102,9 +93,6 @@ class Samples:
         label = self.labels[token]
         if name in MOTION | ACCIDENT:
             return self._motion(name, token, instances_of(label.instance, label.config.grid))
-        if name in BEV:
-            truth = self._ground(token)
-            return truth, truth
         truth = self._boxes(name, token)
         return _detected(truth, np.ones(len(truth), dtype=bool), np.ones(len(truth))), truth
 
@@ -113,13 +101,6 @@ class Samples:
 
     def _boxes(self, name: str, token: str) -> Boxes:
         return detection_truth(self.dataset, token, DETECTION[name]().protocol)
-
-    def _ground(self, token: str) -> BevSegmentation:
-        """Targets of the right shape; this release has no cameras."""
-        label = self.labels[token]
-        layers = np.stack([label.segmentation[0] == 1, *(label.instance[0] % 5 == rest for rest in range(1, 5))])
-        assert len(layers) == len(BEV_CLASSES)
-        return BevSegmentation(grid=label.config.grid, masks=layers, known=np.ones(layers.shape[1:], dtype=bool))
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +112,7 @@ def samples(da_motion: DeepAccident, tokens: list[str]) -> Samples:
 @of_all
 def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str], name: str, tmp_path: Path) -> None:
     arguments = {token: samples.some(name, token) for token in tokens}
-    whole = ALL[name]()
-    whole.update_batch(tokens, *zip(*arguments.values(), strict=True))
+    whole = evaluated(name, tokens, arguments.__getitem__)
     expected = bits(whole.compute())
     shuffled = np.random.default_rng(1).permutation(tokens).tolist()
     for parts in (1, 3, len(tokens)):
@@ -191,7 +171,7 @@ def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: st
         assert result.apa == 0
         assert all((each.tp, each.fp, each.fn) == (0, 0, result.positives) for each in result.within.values())
     else:
-        assert score(result) == 0
+        assert result.mean_average_precision == 0
     for some in ((), tokens[:1]):
         evaluator.compute(some)  # of nothing at all, too
     ALL[name]().compute()
@@ -204,8 +184,6 @@ def test_results_can_be_copied_and_written(samples: Samples, tokens: list[str], 
     attributes = sample_attributes(samples.dataset, tokens)
     whole, resampling = evaluator.compute(), Resampling(resamples=2)
     results = [whole, ALL[name]().compute(), breakdown(evaluator, attributes, "scenario_type", resampling)]
-    if name == "detection paper":
-        results.append(nuscenes_summary(whole))
     for result in results:
         for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result), replace(result)):
             assert bits(again) == bits(result)
@@ -275,8 +253,8 @@ def test_perfect_predictions(samples: Samples, tokens: list[str], name: str) -> 
         assert result.positives > 0
         assert (result.apa, result.id_error, result.position_error, result.time_error) == (1, 0, 0, 0)
         assert all((each.fp, each.fn) == (0, 0) for each in result.within.values())
-    elif name in BEV or name.startswith("detection opencood"):
-        assert score(result) == pytest.approx(100, abs=1e-9)
+    elif name.startswith("detection opencood"):
+        assert result.mean_average_precision == pytest.approx(100, abs=1e-9)
     elif name in DETECTION:
         # The released curve counts what has no truth as 0, and no recall exceeds the last of its 36 points. So the mean
         # says how many classes a scene has; each class that it has says what is lost.
@@ -288,11 +266,6 @@ def evaluated(name: str, tokens: Sequence[str], arguments: Arguments) -> Evaluat
     for token in tokens:
         evaluator.update(token, *arguments(token))
     return evaluator
-
-
-def score(result: Any) -> float:
-    value: float = result.mean_iou if hasattr(result, "mean_iou") else result.mean_average_precision
-    return value
 
 
 def mappings_of(value: Any) -> list[Any]:

@@ -18,8 +18,7 @@ ALL = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protoc
 class TestSwitches:
     def test_names_of_parts_too(self) -> None:
         names = switch_names(PaperAccidents())
-        assert {"predicted_by", "reading.danger_distance", "scoring.far_is_missed"} <= set(names)
-        assert "reading" not in names
+        assert set(names) == {"reading.danger_distance", "sample_choice"}
 
     def test_each_name_of_every_protocol_can_be_given(self) -> None:
         for task, protocol in ALL:
@@ -31,16 +30,15 @@ class TestSwitches:
                 assert switched(rules, {name: json.loads(json.dumps(value)) if value != np.inf else value}) == rules
 
     def test_a_choice_within_a_part(self) -> None:
-        changed = switched(PaperAccidents(), {"scoring.far_is_missed": False, "match_distance": 2})
-        assert (changed.scoring.far_is_missed, changed.match_distance) == (False, 2)
-        assert changed.reading == PaperAccidents().reading
+        changed = switched(PaperAccidents(), {"reading.danger_distance": 2, "sample_choice": "mean_first"})
+        assert (changed.reading.danger_distance, changed.sample_choice) == (2, "mean_first")
 
     def test_null_only_where_a_choice_takes_it(self) -> None:
         assert (
             switched(DETECTION_PROTOCOLS["released"], {"area": None, "error_threshold": None}).error_threshold is None
         )
-        with pytest.raises(ChoiceError, match=r"switch match_distance: expected a number, such as 4.0, found None"):
-            switched(TASK_PROTOCOLS["accident"]["paper"], {"match_distance": None})
+        with pytest.raises(ChoiceError, match=r"switch min_recall: expected a number, such as 0.1, found None"):
+            switched(DETECTION_PROTOCOLS["paper"], {"min_recall": None})
 
     def test_lists_are_tuples_and_choices_that_go_together_alone_are_made_together(self) -> None:
         rules = DETECTION_PROTOCOLS["paper"]
@@ -50,20 +48,23 @@ class TestSwitches:
         ("switches", "sentence"),
         [
             (
-                {"scoring.far_is_mised": 1},
-                r"PaperAccidents has no switch 'scoring.far_is_mised'; there are scoring.far_i",
+                {"reading.danger_distnce": 1},
+                r"PaperAccidents has no switch 'reading.danger_distnce'; there are reading.danger",
             ),
             ({"reading": {}}, r"PaperAccidents has no switch 'reading'"),
-            ({"scoring.far_is_missed": 1}, r"switch far_is_missed: expected true or false, such as True, found 1"),
-            ({"match_distance": "2"}, r"switch match_distance: expected a number, such as 4.0, found '2'"),
-            ({"match_distance": True}, r"switch match_distance: expected a number, such as 4.0, found True"),
-            ({"predicted_by": 3}, r"switch predicted_by: expected a word, such as 'any', found 3"),
-            ({"predicted_by": "all"}, r"predicted_by: expected one of any, mean, found 'all'"),
+            ({"reading.danger_distance": "2"}, r"switch danger_distance: expected a number, such as 1.0, found '2'"),
+            ({"reading.danger_distance": True}, r"switch danger_distance: expected a number, such as 1.0, found True"),
+            ({"sample_choice": 3}, r"switch sample_choice: expected a word, such as 'best', found 3"),
+            ({"sample_choice": "all"}, r"sample_choice: expected one of best, mean_first, found 'all'"),
         ],
     )
     def test_refused(self, switches: dict[str, Any], sentence: str) -> None:
         with pytest.raises(ChoiceError, match=sentence):
             switched(PaperAccidents(), switches)
+
+    def test_true_or_false(self) -> None:
+        with pytest.raises(ChoiceError, match="switch own_box: expected true or false, such as False, found 1"):
+            switched(DETECTION_PROTOCOLS["paper"], {"own_box": 1})
 
     def test_a_protocol_without_any(self) -> None:
         with pytest.raises(ChoiceError, match="FieldWarnings has no switch 'scores_of'; it has none"):

@@ -155,39 +155,14 @@ def test_a_place_that_cannot_be_written_is_our_error(tmp_path: Path) -> None:
         filled("a").save(tmp_path / "file" / "state.json")
 
 
-class TestBatches:
-    def test_a_batch_is_its_samples(self) -> None:
-        evaluator = Sums()
-        evaluator.update_batch(["a", "b"], [1.0, 2.0], (10.0, 20.0))
-        evaluator.update_batch(["c"], [4.0])
-        evaluator.update_batch([], [])
-        assert dict(evaluator.counts) == {"a": {"value": 11.0}, "b": {"value": 22.0}, "c": {"value": 4.0}}
-
-    @pytest.mark.parametrize("columns", [[[1.0]], [[1.0, 2.0], [3.0]], [[1.0, 2.0, 3.0]]])
-    def test_columns_of_other_lengths(self, columns: list[list[float]]) -> None:
-        evaluator = Sums()
-        with pytest.raises(EvaluationError, match=r"batch: 2 tokens, and column [01] after them has [13] entries"):
-            evaluator.update_batch(["a", "b"], *columns)
-        assert not len(evaluator)
-
-    def test_one_token_is_no_batch(self) -> None:
-        with pytest.raises(EvaluationError, match="expected a sequence of them, found the text 'ab'"):
-            Sums().update_batch("ab", [1.0, 2.0])
-
-    def test_samples_that_a_distributed_sampler_repeats(self) -> None:
-        """Each process gets as many samples: some twice, in one process or in two."""
-        first, second = Sums(), Sums()
-        first.update_batch(["a", "b", "a"], [1.0, 2.0, 1.0])
-        second.update_batch(["c", "b"], [4.0, 2.0])
-        assert first.repeated == {"a"}
-        merged = first.merge(second)
-        assert (merged.compute(), merged.repeated, len(merged)) == (7.0, {"a", "b"}, 3)
-
-    def test_a_repeated_sample_with_another_result(self) -> None:
-        evaluator = Sums()
-        with pytest.raises(EvaluationError, match="a: evaluated twice, with different results"):
-            evaluator.update_batch(["a", "b", "a", "c"], [1.0, 2.0, 3.0, 4.0])
-        assert (evaluator.tokens, evaluator.repeated) == ({"a", "b"}, set())
+def test_samples_that_a_distributed_sampler_repeats() -> None:
+    """Each process gets as many samples: some twice, in one process or in two."""
+    first, second = filled("ab").merge(filled("a")), filled("cb")
+    assert first.repeated == {"a"}
+    merged = first.merge(second)
+    assert (merged.repeated, len(merged)) == ({"a", "b"}, 3)
+    with pytest.raises(EvaluationError, match="a: evaluated twice, with different results"):
+        merged.update("a", 3.0)
 
 
 def test_a_fresh_one_is_of_the_same_settings() -> None:

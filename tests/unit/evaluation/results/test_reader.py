@@ -380,38 +380,6 @@ ARRAYS: dict[str, tuple[str, dict[str, np.ndarray], tuple[str, ...]]] = {
     ),
     "complex ids": ("instances", maps(instance=GOOD["instance"].astype(complex)), ("instance: ", "found complex128")),
     "heads among maps": ("instances", heads(), ("segmentation.npy: belongs to no sample of the shard",)),
-    "paths without ids": ("instances", maps(trajectory_id=np.zeros(0, int)), ("trajectory: expected shape (0, 3, 2)",)),
-    "an id of no instance": (
-        "instances",
-        maps(trajectory_id=np.array([1, 6])),
-        ("trajectory_id: the last prediction's instance maps have no id 6",),
-    ),
-    "a path's id twice": ("instances", maps(trajectory_id=np.array([7, 7])), ("trajectory_id: expected each id once",)),
-    "a path of the ground": (
-        "instances",
-        maps(trajectory_id=np.array([0, 7])),
-        ("trajectory_id: expected ids from 1",),
-    ),
-    "a path of float ids": (
-        "instances",
-        maps(trajectory_id=np.array([1.0, 7.0])),
-        ("trajectory_id: expected", "float64"),
-    ),
-    "a path that ends": (
-        "instances",
-        maps(trajectory=GOOD["trajectory"][:, :2]),
-        ("trajectory: expected shape (2, 3, 2)",),
-    ),
-    "half a point": (
-        "instances",
-        maps(trajectory=with_value(GOOD["trajectory"], np.nan)),
-        ("trajectory: of id 1: expected x and y in metres, or NaN for both",),
-    ),
-    "an infinite path": (
-        "instances",
-        maps(trajectory=with_value(GOOD["trajectory"], np.inf)),
-        ("trajectory: of id 1: expected x and y in metres",),
-    ),
     "NaN in a head": ("heads", heads(centerness=with_value(GOOD_HEADS["centerness"], np.nan)), ("centerness: nan at",)),
     "an infinite flow": ("heads", heads(flow=with_value(GOOD_HEADS["flow"], np.inf)), ("flow: inf at",)),
     "whole logits": (
@@ -452,16 +420,6 @@ def test_heads_that_are_missing(tmp_path: Path, missing: str) -> None:
     plain.write_shard(folder / "shards" / "00000.npz", {FIRST: arrays, SECOND: plain.head_arrays()})
     plain.relist(folder)
     refused(folder, f"shards/00000.npz: {FIRST}: {missing}: is missing; expected the member {FIRST}/{missing}.npy")
-
-
-@pytest.mark.parametrize("missing", ["trajectory", "trajectory_id"])
-def test_half_of_the_paths(tmp_path: Path, missing: str) -> None:
-    folder = plain.write_motion(tmp_path / "motion")
-    arrays = plain.instance_arrays()
-    del arrays[missing]
-    plain.write_shard(folder / "shards" / "00000.npz", {FIRST: arrays, SECOND: plain.instance_arrays()})
-    plain.relist(folder)
-    refused(folder, f"shards/00000.npz: {FIRST}: {missing}: is missing")
 
 
 def npy(array: np.ndarray, version: tuple[int, int] = (1, 0)) -> bytes:

@@ -147,4 +147,3 @@ def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
     output = motion.prediction(token)
     assert isinstance(output, MotionOutput)
     np.testing.assert_array_equal(output.instances, ids)  # type: ignore[arg-type]
-    np.testing.assert_allclose(motion.trajectories(token)[3], [[-2.75, 11.0]] * 5)

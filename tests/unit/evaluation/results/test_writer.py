@@ -12,7 +12,7 @@ import numpy as np
 import plain_results as plain
 import pytest
 
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError, ResultsError, TokenError
+from deepaccident_devkit.errors import ChoiceError, ResultsError, TokenError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, instances_of
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results, reader
 from deepaccident_devkit.geometry import BevGrid
@@ -179,12 +179,8 @@ class TestResults:
         assert OTHER not in results
         assert 3 not in results
         assert repr(results) == f"<{results.task} results: 3 samples in {results.path}>"
-        for call in (results.prediction, results.trajectories):
-            with pytest.raises(TokenError, match=f"has no prediction of '{OTHER}'"):
-                call(OTHER)
-        if results.task != "motion":
-            with pytest.raises(NotAvailableError, match="results have no trajectories; motion results have"):
-                results.trajectories(FIRST)
+        with pytest.raises(TokenError, match=f"has no prediction of '{OTHER}'"):
+            results.prediction(OTHER)
 
     def test_ways_to_name_them(self, results: Results) -> None:
         folder = results.path if results.task == "motion" else results.path.parent

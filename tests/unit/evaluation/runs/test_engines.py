@@ -92,7 +92,7 @@ CALLS: dict[str, Callable[..., Any]] = {
     "evaluate": lambda job, **how: job.whole(**how).summary(),
     "hashes": lambda job, **how: scenario_hashes(job.dataset, map(scenario_of, job.results.tokens), **how),
     "breakdowns": lambda job, **how: job.whole().broken_down(["agent", "all"], FEW, **how).summary(),
-    "sanity": lambda job, **how: check_sanity(job.dataset, job.results, SETUP, job.results.tokens, samples=2, **how),
+    "sanity": lambda job, **how: check_sanity(job.dataset, job.results, SETUP, job.results.tokens, **how),
 }
 
 

@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from memory_results import MemoryResults
-from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
-from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import accident_context
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
-from deepaccident_devkit.evaluation.runs.sanity import MISTAKES, SanityReport, check_sanity
+from deepaccident_devkit.evaluation.runs.sanity import SanityReport, check_sanity
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionHeads
@@ -146,12 +145,9 @@ def in_world(dataset: DeepAccident, token: str, given: list[Accident]) -> list[A
 
 PLANTED: dict[tuple[str, str], Change] = {
     **{("maps", name): turned_maps(matrix) for name, matrix in AXES.items()},
-    ("maps", "actors and background swapped"): of_maps(lambda maps: (maps == 0).astype(np.int32)),
     ("maps", "frames reversed"): of_maps(lambda maps: maps[::-1]),
     ("maps", "one step late"): of_maps(lambda maps: maps[[0, 0, 1, 2, 3]]),
-    ("maps", "two steps late"): of_maps(lambda maps: maps[[0, 0, 0, 1, 2]]),
     ("maps", "all 14 predictions looked at are empty"): of_maps(np.zeros_like),
-    ("heads", "actors and background swapped"): of_segmentation(lambda logits: logits[:, ::-1]),
     ("heads", "all values of the heads' segmentation are between 0 and 1"): of_segmentation(
         lambda logits: 1 / (1 + np.exp(5 - logits))
     ),
@@ -162,12 +158,9 @@ PLANTED: dict[tuple[str, str], Change] = {
     ("accidents", "world frame for ego frame"): in_world,
     ("accidents", "frames reversed"): of_accidents(time=lambda time: 2 - time),
     ("accidents", "one step late"): of_accidents(time=lambda time: time + 0.5),
-    ("accidents", "two steps late"): of_accidents(time=lambda time: time + 1),
-    ("accidents", "half of the accidents are more than 12.5 s ahead"): of_accidents(time=lambda time: 10 * time),
     ("accidents", "all 20 scores are 1"): of_accidents(score=lambda _: 1.0),
     ("accidents", "all 40 predictions looked at are empty"): lambda _, __, ___: [],
     **{("boxes", name): in_ego(matrix) for name, matrix in AXES.items()},
-    ("boxes", "world y mirrored"): of_boxes(center=lambda center: center * (1, -1, 1)),
     ("boxes", "ego frame for world frame"): of_centers(lambda center, ego, _: ego.inverse().apply(center)),
     ("boxes", "LiDAR frame for world frame"): of_centers(lambda center, _, lidar: lidar.inverse().apply(center)),
     ("boxes", "LiDAR frame for ego frame"): of_centers(
@@ -196,12 +189,7 @@ def test_each_mistake_is_named_as_exactly_that(
     report = sanity(da_motion, kind, planted)
     (warning,) = report.warnings
     assert warning.startswith(mistake)
-    assert [each.name for each in report.candidates if each.suspected] == [mistake] * (mistake in MISTAKES)
     assert report.to_text().endswith(f"WARNING: {warning}")
-
-
-def test_every_mistake_is_planted() -> None:
-    assert set(MISTAKES) <= {mistake for _, mistake in PLANTED}
 
 
 @pytest.mark.parametrize("kind", ["maps", "heads", "accidents", "boxes"])
@@ -210,7 +198,6 @@ def test_right_predictions_raise_no_suspicion(
 ) -> None:
     report = sanity(da_motion, kind, right[kind])
     assert report.warnings == ()
-    assert len(report.candidates) > 5
     assert report.to_text().endswith("\nNothing looks wrong with the predictions.")
     assert json.loads(json.dumps(report.as_dict(), allow_nan=False))["warnings"] == []
 
@@ -256,26 +243,19 @@ def test_equal_scores_are_told_only_where_they_count(da_motion: DeepAccident, ri
     assert check_sanity(da_motion, MemoryResults("accident", equal), setup, list(equal)).warnings == ()
 
 
-def test_turned_maps_longer_than_wide_are_not_looked_for(da_motion: DeepAccident, tokens: list[str]) -> None:
+def test_turned_maps_longer_than_wide_are_not_compared(da_motion: DeepAccident, tokens: list[str]) -> None:
     grid = BevGrid((-50, 50, 0.5), (-30, 30, 0.5))
     empty = {token: instances_of(np.zeros((5, *grid.shape), dtype=int), grid) for token in tokens[:2]}
-    report = sanity(da_motion, "maps", empty)
-    assert {each.name for each in report.candidates} & set(AXES) == set(list(AXES)[:3])
+    (warning,) = sanity(da_motion, "maps", empty).warnings
+    assert warning.startswith("all 2 predictions looked at are empty")
 
 
 def test_a_few_samples_are_looked_at_always_the_same(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
-    one = sanity(da_motion, "boxes", right["boxes"], samples=3)
-    assert one.samples == 3
-    assert one == sanity(da_motion, "boxes", dict(reversed(right["boxes"].items())), samples=3, workers=2)
+    one = sanity(da_motion, "boxes", right["boxes"])
+    assert one == sanity(da_motion, "boxes", dict(reversed(right["boxes"].items())), workers=2)
 
 
 def test_nothing_to_look_at(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
     results, setup = MemoryResults("motion", right["maps"]), EvaluationSetup(task="motion")
-    assert_refused(
-        (lambda: check_sanity(da_motion, results, setup, []), EvaluationError, "there is no sample to look at"),
-        (
-            lambda: check_sanity(da_motion, results, setup, list(right["maps"])[:1], samples=0),
-            ConfigError,
-            "samples: expected at least 1, found 0",
-        ),
-    )
+    with pytest.raises(EvaluationError, match="there is no sample to look at"):
+        check_sanity(da_motion, results, setup, [])

@@ -46,11 +46,11 @@ class TestSetup:
         assert pickle.loads(pickle.dumps(setup)) == setup
 
     def test_switches_come_to_the_evaluator_and_cannot_be_changed(self) -> None:
-        given = {"scoring.far_is_missed": False}
+        given = {"reading.danger_distance": 0.5}
         setup = EvaluationSetup(task="accident", protocol="paper", switches=given)
-        given["scoring.far_is_missed"] = True
-        assert setup.evaluator().settings["choices"]["scoring"]["far_is_missed"] is False
-        assert setup.as_dict()["switches"] == {"scoring.far_is_missed": False}
+        given["reading.danger_distance"] = 2.0
+        assert setup.evaluator().settings["choices"]["reading"]["danger_distance"] == 0.5
+        assert setup.as_dict()["switches"] == {"reading.danger_distance": 0.5}
         assert pickle.loads(pickle.dumps(setup)) == setup
         with pytest.raises(TypeError):
             setup.switches["x"] = 1  # type: ignore[index]

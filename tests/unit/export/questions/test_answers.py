@@ -26,7 +26,7 @@ EGOS = ("ego_vehicle", "ego_vehicle_behind")
 @pytest.fixture(scope="module")
 def asked(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Asked:
     """All samples that evaluations have of two agents."""
-    window = WindowRules(observe=1.0, stride=0.5, partial_past=True)
+    window = WindowRules(observe=0, stride=0.5)
     form = Questions(observers="all", window=window, agents=EGOS)
     return ask(da_motion, tmp_path_factory.mktemp("asked"), form)
 

@@ -21,7 +21,7 @@ from deepaccident_devkit.release.meta import write_meta
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.testing.editing import FIELD, ScenarioEditor
 
-FORM = Questions(observers="+behind", window=WindowRules(observe=1.0, rate=5, stride=0.5))
+FORM = Questions(observers="+behind", window=WindowRules(observe=1.0, stride=0.5))
 Edit = Callable[[ScenarioEditor], None]
 
 

@@ -26,7 +26,7 @@ from deepaccident_devkit.release.meta import write_meta
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.cooperation import visible_instances
 
-WINDOW = WindowRules(observe=1.0, rate=2, stride=0.5)
+WINDOW = WindowRules(observe=1.0, stride=0.5)
 SET = ("ego_vehicle", "other_vehicle", "infrastructure")
 FORM = Questions(observers=SET, window=WINDOW, agents=("ego_vehicle", "infrastructure"))
 NAMES = {"ego", "partner_1", "partner_2", "infrastructure"}
@@ -140,7 +140,7 @@ def test_names_go_by_what_was_seen_alone(asked: Asked) -> None:
 @pytest.mark.parametrize(("seen", "fewer"), [("camera", False), ("annotated", True)])
 def test_other_rules_of_seeing(da_motion: DeepAccident, tmp_path: Path, seen: str, fewer: bool) -> None:
     one, other = (
-        ask(da_motion, tmp_path, Questions(seen=each, window=replace(WINDOW, most=1)))  # type: ignore[arg-type]
+        ask(da_motion, tmp_path, Questions(seen=each, window=WINDOW))  # type: ignore[arg-type]
         for each in (seen, "annotated")
     )
     sample = next(iter({*one.lines} & {*other.lines}))
@@ -183,7 +183,7 @@ def test_the_truth_of_an_accident(da_motion: DeepAccident, asked: Asked) -> None
 
 
 def test_when_the_colliders_were_last_seen(da_motion: DeepAccident, tmp_path: Path) -> None:
-    found = ask(da_motion, tmp_path, Questions(window=replace(WINDOW, partial_past=True), agents=AGENTS))
+    found = ask(da_motion, tmp_path, Questions(window=replace(WINDOW, observe=0), agents=AGENTS))
     told = set()
     for sample, truth in found.truth.items():
         shown = {each["name"]: each["time"][-1] for each in found.question(sample)["actors"]}

@@ -123,7 +123,6 @@ def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path) 
             ["validate", "--files", "--workers", "1"],
             ["validate", "--workers", "1"],
             ["export", "opencood", "--out", str(tmp_path / "opencood"), "--workers", "1"],
-            ["info", "--index"],
         )
     ):
         at = 2 if verb[0] == "export" else 1

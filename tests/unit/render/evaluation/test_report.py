@@ -130,17 +130,12 @@ def test_a_partial_run_says_so_everywhere(da_motion: DeepAccident, tokens: list[
 
 def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
     meta: Mapping[str, Any] = {"method": EVIL, EVIL: [{EVIL: EVIL}]}
-    sanity = {
-        "samples": 20,
-        "candidates": [{"name": EVIL, "description": EVIL, "score": 0.5, "given": 0.1, "suspected": True}],
-        "warnings": [EVIL],
-    }
-    run = evaluation_run(da_motion, SETUPS[1], tokens, meta=meta, sanity=sanity)
+    run = evaluation_run(da_motion, SETUPS[1], tokens, meta=meta, sanity={"samples": 20, "warnings": [EVIL]})
     path = save_report(run, tmp_path)
     page = page_of(path)
     assert not page.all("script")
     assert all(str(image["src"]).startswith("data:") for image in page.all("img"))
-    assert page.text.count(EVIL) >= 4
+    assert page.text.count(EVIL) >= 3
     assert "http" not in re.sub(
         r"http-equiv", "", path.read_text().replace("<wbr>", "").replace("http://x.example/y.png", "")
     )

@@ -7,7 +7,7 @@ import pytest
 from drawing import new_axes, rendered, title_of
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, box_truth
+from deepaccident_devkit.evaluation import Accident, AccidentContext, AccidentEvaluator, box_truth
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import ComparedAccidents
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.outcomes import draw_accident_outcome
@@ -30,7 +30,7 @@ def test_accidents_without_truth(da_motion: DeepAccident) -> None:
 def test_the_verdict_names_several_of_a_kind(da_motion: DeepAccident, sample: str) -> None:
     evaluator = AccidentEvaluator("boxes")
     far = Accident(positions=np.array([[40.0, 40.0], [42.0, 40.0]]), time=1.0)
-    evaluator.update(sample, [far, replace(far, score=0.5)], box_truth(da_motion, sample))
+    evaluator.update(sample, [far, replace(far, score=0.5)], None, AccidentContext(truth=box_truth(da_motion, sample)))
     assert verdict_words(evaluator.compute()) == "5 m: 2 FP + FN, 10 m: 2 FP + FN, 15 m: 2 FP + FN"
 
 

@@ -227,7 +227,7 @@ def test_places_of_accidents_are_on_the_ground(da: DeepAccident, approach: str, 
 
     def grounded(pixels: Any) -> Any:
         """Where rays through pixels meet the ground, in the ego frame."""
-        rays = ego_from_camera.apply(lens.unproject(pixels, np.ones(len(pixels)))) - ego_from_camera.translation
+        rays = ego_from_camera.rotate(np.insert(pixels, 2, 1, axis=1) @ np.linalg.inv(lens.intrinsic).T)
         share = (ground - ego_from_camera.translation[2]) / rays[:, 2]
         return (ego_from_camera.translation + share[:, None] * rays)[:, :2]
 

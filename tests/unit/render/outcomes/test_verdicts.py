@@ -67,7 +67,7 @@ def test_explicit_accidents_are_judged_by_boxes(da_motion: DeepAccident, sample:
     assert context.truth.accident is not None
     near = Accident(positions=context.truth.accident.positions + 1.5, time=context.truth.accident.time)
     counted = AccidentEvaluator("boxes")
-    counted.update(sample, [near], context.truth)
+    counted.update(sample, [near], None, context)
     verdict = sample_verdict(da_motion, sample, [near])
     assert isinstance(verdict, AccidentVerdict)
     assert verdict.words == f"accident: {verdict_words(counted.compute())}"

@@ -32,7 +32,7 @@ def quarter_turned(codes):
 
 
 def test_a_four_way_map_is_its_own_quarter_turn_or_half_turn_where_one_road_gives_way():
-    for spec in (RoadSpec(), RoadSpec(lanes=2, parking=False)):
+    for spec in (RoadSpec(), RoadSpec(lanes=2)):
         codes = Junction(spec).ground_map().codes
         np.testing.assert_array_equal(quarter_turned(codes), codes)
     codes = Junction(RoadSpec(signalized=False)).ground_map().codes
@@ -63,20 +63,17 @@ def test_from_the_middle_line_outward(junction):
         assert away == {ROAD}
 
 
-def test_crosswalks_are_striped_from_kerb_to_kerb_or_not_at_all():
-    for marked in (True, False):
-        junction = Junction(RoadSpec(crosswalks=marked, parking=False))
-        codes = junction.ground_map().at(junction.crosswalk("west").xy)
-        stripes = np.flatnonzero(np.diff((codes == WHITE).astype(int)) == 1)
-        assert len(stripes) == (7 if marked else 0)
+def test_crosswalks_are_striped_from_kerb_to_kerb():
+    junction = Junction(RoadSpec())
+    codes = junction.ground_map().at(junction.crosswalk("west").xy)
+    assert len(np.flatnonzero(np.diff((codes == WHITE).astype(int)) == 1)) == 11
 
 
 def test_corners_are_round():
-    spec = RoadSpec(parking=False, kerb_radius=6.0)
-    ground = Junction(spec).ground_map()
-    centre = spec.road_edge + spec.kerb_radius
+    ground = Junction(RoadSpec()).ground_map()
+    centre = RoadSpec().road_edge + 5.0
     for angle in np.deg2rad([190, 225, 260]):
-        for radius, expected in ((5.8, SIDEWALK), (6.2, ROAD)):
+        for radius, expected in ((4.8, SIDEWALK), (5.2, ROAD)):
             point = centre + radius * np.array([np.cos(angle), np.sin(angle)])
             for signs in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
                 assert ground.at((point * signs)[None])[0] == expected

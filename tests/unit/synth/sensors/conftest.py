@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.synth import solids
-from deepaccident_devkit.synth.actors import MEDIAN_SIZES, Actor, Actors, Uniform
+from deepaccident_devkit.synth.actors import MEDIAN_SIZES, Actor, Actors, Motion
 from deepaccident_devkit.synth.roads import Hump, Junction, RoadSpec
 from deepaccident_devkit.synth.sensors.rig import make_rig
 from deepaccident_devkit.synth.shapes import shape_of
@@ -19,6 +19,13 @@ AGENT_PLACES = {
     "other_vehicle": (1.75, -40.0, np.pi / 2),
     "other_vehicle_behind": (1.75, -52.0, np.pi / 2),
 }
+
+
+def straight_on(x, y, yaw, speed):
+    """A motion straight on for 100 s before and after time 0."""
+    velocity = speed * np.array([np.cos(yaw), np.sin(yaw)])
+    samples = np.array([[*((x, y) + seconds * velocity), yaw] for seconds in (-100.0, 100.0)])
+    return Motion(start=-100.0, period=200.0, samples=samples, sample_velocities=np.stack([velocity, velocity]))
 
 
 @pytest.fixture(scope="session")
@@ -46,7 +53,7 @@ def actor():
             category=category,
             size=size,
             shape=shape_of(category, size, color, BLUE),
-            motion=Uniform(x, y, yaw, speed),
+            motion=straight_on(x, y, yaw, speed),
         )
 
     return make

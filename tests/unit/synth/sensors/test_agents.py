@@ -51,7 +51,7 @@ def test_a_vehicle_s_cameras_are_at_the_faces_of_its_box(rig):
 def test_the_pole_s_cameras_are_in_no_house_and_above_all_trucks(rig, kind, view):
     places = np.array([camera.lidar_from_camera.translation for camera in rig.agents[4].cameras])
     for seed in range(8):
-        junction = Junction(RoadSpec(kind=kind, lanes=1 + seed % 2, kerb_radius=3.0 + seed % 8))
+        junction = Junction(RoadSpec(kind=kind, lanes=1 + seed % 2))
         town = random_world(np.random.default_rng(seed), junction, view, between=("west", "south"))
         cameras = town.lidar_pole.apply(places)
         assert cameras[:, 2].min() > 1.04 * MEDIAN_SIZES["truck"][2]

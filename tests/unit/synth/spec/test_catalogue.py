@@ -1,32 +1,31 @@
 """The twelve designs are the paper's: the accident that each means is of its type (docs/format.md, Accident types)."""
 
-import dataclasses
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scripts import loaded_script
 
 from deepaccident_devkit.synth.roads import Hump, RoadSpec
 from deepaccident_devkit.synth.spec import (
     DESIGN_NUMBERS,
-    DESIGNS,
     ActorSpec,
     BackgroundSpec,
-    EndSpec,
     MeetSpec,
     ScenarioSpec,
+    design_text,
     draw,
-    field_tables,
     parse_spec,
+    read_design,
     read_spec,
 )
+from deepaccident_devkit.synth.spec.model import key_of
+from deepaccident_devkit.synth.spec.reading import field_types
 
 
 @pytest.mark.parametrize("number", DESIGN_NUMBERS)
 def test_one_of_the_two_who_meet_breaks_a_rule(number):
-    spec = draw(DESIGNS[number], np.random.default_rng(0))
+    spec = draw(read_design(number), np.random.default_rng(0))
     rules = [set(spec.actor(role).ignores) for role in spec.meet.actors]
     assert set(spec.meet.actors) == {"ego", "other"}
     assert sorted(map(bool, rules)) == [False, True]
@@ -34,7 +33,7 @@ def test_one_of_the_two_who_meet_breaks_a_rule(number):
 
 
 def test_both_parts_fall_to_ego_and_all_weathers_come():
-    made = [draw(DESIGNS[3], np.random.default_rng(seed)) for seed in range(100)]
+    made = [draw(read_design(3), np.random.default_rng(seed)) for seed in range(100)]
     assert {spec.actor("ego").turn for spec in made} == {"left", "straight"}
     assert len({spec.weather for spec in made}) == 7
     assert len({spec.time_of_day for spec in made}) == 3
@@ -49,22 +48,29 @@ PARTS = {
     "actors[]": ActorSpec,
     "meet": MeetSpec,
     "background": BackgroundSpec,
-    "end": EndSpec,
 }
 
 
-def test_every_field_has_a_line_with_values_and_meaning():
-    tables = field_tables()
-    assert list(tables) == list(PARTS)
-    for path, kind in PARTS.items():
-        keys = [entry.key.replace("from", "from_arm") for entry in tables[path]]
-        assert keys == [field.name for field in dataclasses.fields(kind)]
-        assert all(len(entry.meaning) > 8 and entry.values for entry in tables[path])
+def test_the_page_has_every_field_with_its_values():
+    page = (DOCS / "scenarios.md").read_text(encoding="utf-8")
+    _, *sections = page.partition("## All fields")[2].split("\n### ")
+    for section, (path, kind) in zip(sections, PARTS.items(), strict=True):
+        assert section.startswith(f"`{path}`\n" if path else "The file\n")
+        rows = dict(re.findall(r"^\| `(\w+)` \| (.*)", section, re.MULTILINE))
+        types = field_types(kind)
+        assert list(rows) == [key_of(name) for name in types]
+        for row, wanted in zip(rows.values(), types.values(), strict=True):
+            words = wanted.words or (wanted.items.words if wanted.items else ())
+            assert row.partition(" | ")[0].endswith((", ".join(words), "; or null"))
+            assert str(wanted.bounds or "") in row
 
 
-def test_the_page_is_what_the_fields_make():
-    module = loaded_script("docs/make_scenarios_page.py")
-    assert module.PAGE.read_text(encoding="utf-8") == module.page(), "run: python docs/make_scenarios_page.py"
+def test_the_page_has_every_design():
+    page = (DOCS / "scenarios.md").read_text(encoding="utf-8")
+    assert re.findall(r"^ +(\d+)  (.*?)  +\w+-way, ", page, re.MULTILINE) == [
+        (str(number), read_design(number).name) for number in DESIGN_NUMBERS
+    ]
+    assert f"```yaml\n{design_text(3)}```" in page
 
 
 def test_the_page_s_examples_can_be_read_and_its_code_runs(tmp_path, monkeypatch, capsys):

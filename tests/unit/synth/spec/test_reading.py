@@ -6,7 +6,7 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.spec import parse_spec, read_spec
 
-FIELDS = "name, design, road, view, exchange, actors, meet, background, weather, time_of_day, end"
+FIELDS = "name, design, road, view, exchange, actors, meet, background, weather, time_of_day"
 
 
 @pytest.mark.parametrize(
@@ -29,22 +29,18 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
         ("max_speed: [1, 2, 3]", r"expected a number, .*, or \[low, high\], found \[1, 2, 3\]"),
         ("max_speed: [5, 40]", r"max_speed\[1\]: expected a number, 0.5 to 20 m/s, found 40"),
         ("max_speed: [9, 3]", r"expected \[low, high\], found \[9, 3\]; exchange the two"),
-        ("max_speed: '8'", "expected a number, 0.5 to 20 m/s, found '8'; write 8, without quotes"),
-        ("max_speed: 30", "expected a number, 0.5 to 20 m/s, found 30; 30 km/h are 8.3 m/s$"),
-        ("max_speed: [5, 50]", r"max_speed\[1\]: .*, found 50; 50 km/h are 13.9 m/s$"),
+        ("max_speed: '8'", "expected a number, 0.5 to 20 m/s, found '8'; write a decimal number, without quotes and"),
         ("max_speed: 100", "found 100$"),
         ("start_distance: 130", "expected a number, 0 to 120 m, found 130$"),
-        ("max_speed: 1e1", r"found '1e1'; YAML reads it as a text: write 10, or 1.0e\+1$"),
-        ("max_speed: 125E-2", r"found '125E-2'; YAML reads it as a text: write 1.25, or 125.0e-2$"),
-        ("max_speed: '1e1'", "found '1e1'; write 10, without quotes$"),
+        ("max_speed: 1e1", "found '1e1'; write a decimal number, without quotes and without e$"),
         (f"max_speed: {'9' * 400}", "expected a number, 0.5 to 20 m/s, found 9{79}…$"),
         (f"turn: {'x' * 5000}", "found 'x{78}…$"),
-        ("delay: null", r"delay: expected a number, 0 to 10 s, found nothing"),
+        ("lane: null", r"lane: expected a whole number, 0 to 1, found nothing"),
         ("lane: 0.5", "lane: expected a whole number, 0 to 1, found 0.5"),
         ("ignores: signal", r"ignores: expected a list, as \[signal, priority\], found 'signal'"),
         (
             "ignores: [signals]",
-            r"ignores\[0\]: expected one of signal, priority, crosswalk, found 'signals'; did you mean 'signal'\?$",
+            r"ignores\[0\]: expected one of signal, priority, found 'signals'; did you mean 'signal'\?$",
         ),
         ("turn: []", r"turn: expected one of straight, left, right, found \[\]"),
         ("turn: [left, [right]]", r"turn\[1\]: expected one of .*, found \['right'\]"),
@@ -63,7 +59,7 @@ def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sente
         ("design: 13", "design: expected a whole number, 1 to 12, found 13"),
         ("exchange: [true, false]", "exchange: expected true or false, one value and not several"),
         ("background: none", "f.yaml:7: background: expected keys and values, found 'none'"),
-        (f"road: {{kerb_radius: {'9' * 400}}}", "road.kerb_radius: expected a number, found 9"),
+        (f"road: {{hump: {{height: {'9' * 400}}}}}", "road.hump.height: expected a number, found 9"),
         ("exchange: 'true'", "exchange: expected true or false, found 'true'; leave the quotes out"),
         ("view: 3", "view: expected one of open, hidden, found 3"),
         ("road: {signalized: 1}", "road.signalized: expected true or false, found 1"),

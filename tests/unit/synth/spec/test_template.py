@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepaccident_devkit.synth.roads import ARMS
-from deepaccident_devkit.synth.spec import DESIGNS, ActorSpec, ScenarioSpec, draw, parse_spec
+from deepaccident_devkit.synth.spec import ActorSpec, ScenarioSpec, draw, parse_spec
 
 EXCHANGING = """
 exchange: true
@@ -90,24 +90,3 @@ def test_spawn_sides_are_seen_from_ego(ego, other):
     left = float(heading[0] * places[other][1] - heading[1] * places[other][0])
     wanted = {(1, 0): "opposite", (0, 1): "left", (0, -1): "right", (-1, 0): "same"}[ahead, left]
     assert spec.spawn_side == wanted
-
-
-@pytest.mark.parametrize(
-    ("more", "alike"),
-    [
-        ("", True),
-        ("weather: [Clear, Wet]", True),
-        ("background: {parked: [3, 5]}", True),
-        ("exchange: true", False),
-        ("road: {lanes: [1, 2]}", False),
-        ("view: [open, hidden]", False),
-    ],
-)
-def test_whether_draws_differ_in_more_than_numbers(small, more, alike):
-    assert parse_spec(f"{small}{more}").draws_alike is alike
-
-
-def test_a_list_of_an_actor_makes_draws_differ(with_other):
-    assert parse_spec(with_other("max_speed: [8, 9], ignores: [signal, priority]")).draws_alike
-    assert not parse_spec(with_other("turn: [left, straight]")).draws_alike
-    assert not any(template.draws_alike for template in DESIGNS.values())

@@ -13,7 +13,7 @@ def middle(prop):
 
 
 @pytest.mark.parametrize("make", [traffic_light, yield_sign])
-@pytest.mark.parametrize("spec", [RoadSpec(), RoadSpec(kind="three-way", lanes=2, crosswalks=False)])
+@pytest.mark.parametrize("spec", [RoadSpec(), RoadSpec(kind="three-way", lanes=2)])
 def test_it_stands_on_the_sidewalk_at_the_right_of_the_line(make, spec):
     junction = Junction(spec)
     for arm in junction.arms:

@@ -86,10 +86,10 @@ def test_those_who_meet_may_notice_each_other_at_the_last_moment_and_nobody_else
 
 
 def test_a_start_that_is_given_is_kept_where_nobody_is_to_meet():
-    actors = (replace(SPEC.actors[0], start_distance=33.0, delay=2.0), *SPEC.actors[1:])
+    actors = (replace(SPEC.actors[0], start_distance=33.0), *SPEC.actors[1:])
     ego = cast(replace(SPEC, actors=actors, meet=None)).users[0]
     assert middle_of(ego.route) - ego.start == 33.0
-    assert (ego.delay, ego.start_speed) == (2.0, 0.0)
+    assert ego.start_speed == ego.max_speed
 
 
 def test_paths_that_never_cross_have_no_pair():

@@ -8,10 +8,10 @@ import pytest
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction
-from deepaccident_devkit.synth.spec import DESIGNS
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS
 from deepaccident_devkit.synth.stage import random_world
 from deepaccident_devkit.synth.traffic.casting import WARM_UP, unplanned
-from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
+from deepaccident_devkit.synth.traffic.drama import Performance, perform_twin, set_stage, try_accident
 from deepaccident_devkit.synth.traffic.driving import HARDEST_BRAKING, MAX_STEER, PERIOD
 from deepaccident_devkit.synth.traffic.impact import touching_pairs
 from deepaccident_devkit.synth.traffic.rights import GREEN, RED
@@ -22,7 +22,7 @@ CORNERS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
 MAPPED = 143.0
 """Metres from the middle within which the ground is known under a whole truck."""
 SCENES = [
-    *((design, "designed") for design in DESIGNS),
+    *((design, "designed") for design in DESIGN_NUMBERS),
     (1, "hidden"),
     (7, "hidden"),
     (3, "unplanned"),
@@ -68,8 +68,8 @@ def runs(design, kind):
         junction = Junction(spec.road)
         spec = unplanned(rng, spec, junction) if kind == "unplanned" else spec
         stage = set_stage(rng, spec, junction, 7.5)
-        accident = perform_accident(stage)
-        if accident is not None:
+        accident = try_accident(stage)
+        if isinstance(accident, Performance):
             twin = perform_twin(stage, stage.cast.begin + WARM_UP + 10.0)
             return Run(stage, accident, accident=True), Run(stage, twin, accident=False)
     raise AssertionError("nobody met in five draws")

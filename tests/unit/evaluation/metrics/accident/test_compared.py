@@ -4,7 +4,6 @@ import pytest
 from accident_scenes import as_heads, as_maps, scene, standing
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation import AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS, AccidentContext, compared_accidents
 
 
@@ -33,14 +32,3 @@ def test_the_released_protocol_compares_each_prediction_that_foresees_one() -> N
     assert (made.true.time, [each.time for each in made.predicted]) == (2.0, [2.0])
     ended = compared_accidents(as_heads(nobody, hit), hit, AccidentContext(), PROTOCOLS["released"])
     assert (ended.true.time, ended.predicted) == (2.0, ())
-
-
-def test_a_protocol_of_ones_own_has_its_accidents_as_given() -> None:
-    class Own:
-        """Not one of the devkit's."""
-
-        counts = result = pooled = lambda *_: {}
-
-    assert AccidentEvaluator(Own()).protocol is not None
-    compared = compared_accidents([], None, AccidentContext(), Own())
-    assert (compared.true, compared.predicted) == (None, ())

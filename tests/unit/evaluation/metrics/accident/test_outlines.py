@@ -122,8 +122,8 @@ def test_instances_are_nearer_than_they_are_drawn(boxes) -> None:
     assert list(gaps) == [(1, 2), (1, 3), (2, 3)]
     assert gaps[1, 2] == pytest.approx(8 - 0.9 - 0.95)
     assert gaps[2, 3] == 0
-    outline = first_outline(boxes, 2, find_objects(boxes)[1], level=0.5)
-    assert outline[:, 1].min() == 20 - 0.75
+    outline = first_outline(boxes, 2, find_objects(boxes)[1])
+    assert outline[:, 1].min() == 20 - 0.95
 
 
 def test_pairs_that_cannot_be_near_are_left_out(boxes) -> None:

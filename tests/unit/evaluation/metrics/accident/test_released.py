@@ -1,14 +1,13 @@
 """The protocol `released`: each quirk on a scene that shows it; tests/parity/test_accident.py has the golden file."""
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS, AccidentContext, AccidentEvaluator
 from deepaccident_devkit.evaluation.metrics.accident.released import (
     DrawnPaths,
@@ -22,7 +21,7 @@ from deepaccident_devkit.evaluation.metrics.accident.released import (
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
-from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads
+from deepaccident_devkit.motion import MotionHeads
 
 RELEASED, UNKNOWN = ReleasedAccidents(), AccidentContext()
 
@@ -43,15 +42,15 @@ def moved(cars, y: float):
     return {actor: [(at[0], at[1] + y) for at in path] for actor, path in cars.items()}
 
 
-def counts(prediction, label, rules=RELEASED, context=UNKNOWN):
-    return rules.counts(prediction, label, context)
+def counts(prediction, label, context=UNKNOWN):
+    return RELEASED.counts(prediction, label, context)
 
 
 def tallies(found) -> list[tuple[int, int, int]]:
     return list(zip(found["tp"], found["fp"], found["fn"], strict=True))
 
 
-TRUE, FALSE, MISSED, BOTH, NEITHER = (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 1, 1), (0, 0, 0)
+TRUE, FALSE, MISSED, NEITHER = (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)
 
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
@@ -65,9 +64,8 @@ def test_a_perfect_prediction(orientation) -> None:
 
 def test_instance_maps_are_drawn_like_heads() -> None:
     label = scene(HIT)
-    settings = POST_PROCESSING["accident"]
-    from_heads, present = paths_of_heads(MotionHeads.from_labels(label), label.config.grid, settings)
-    from_maps = paths_of_instances(np.where(label.instance > 0, label.instance * 7, 0), label.config.grid, redraw=True)
+    from_heads, present = paths_of_heads(MotionHeads.from_labels(label), label.config.grid)
+    from_maps = paths_of_instances(np.where(label.instance > 0, label.instance * 7, 0), label.config.grid)
     assert sorted(from_maps.paths) == [7, 14, 21]
     assert (from_maps.drawn > 0).sum() == (from_heads.drawn > 0).sum()
     np.testing.assert_array_equal(from_maps.drawn > 0, from_heads.drawn > 0)
@@ -89,21 +87,12 @@ def test_the_true_ones_must_overlap_and_the_predicted_ones_be_near() -> None:
     near = scene(NEAR)
     assert tallies(counts(as_heads(near), near)) == [FALSE] * 3
     assert tallies(counts(as_heads(near), scene(HIT))) == [TRUE] * 3
-    assert tallies(counts(as_heads(near), near, replace(RELEASED, truth_gap=5.0))) == [TRUE] * 3
-    assert tallies(counts(as_heads(near), scene(HIT), replace(RELEASED, prediction_gap=0.001))) == [MISSED] * 3
 
 
 def test_only_the_last_frame_counts() -> None:
     passing = {**HIT, 2: approaching(4, 12, 17, 10, 4)}
     label = scene(passing)
     assert tallies(counts(as_heads(label), label)) == [NEITHER] * 3
-    whole = replace(RELEASED, last_frame_only=False)
-    assert tallies(counts(as_heads(label), label, whole)) == [TRUE] * 3
-    early = scene({**HIT, 2: approaching(4, 17, 10, 4, 4)})
-    found = counts(as_heads(early), label, whole)
-    assert found["tp"] == [1, 1, 1]
-    assert found["time"] == [0.5] * 3
-    assert counts(as_heads(early), label)["time"] == [0] * 3
 
 
 def test_the_last_frame_is_the_last_that_is_recorded() -> None:
@@ -124,7 +113,6 @@ def test_an_accident_elsewhere_is_false_and_nothing_is_missed() -> None:
     found = counts(as_heads(elsewhere), label)
     assert tallies(found) == [FALSE, TRUE, TRUE]
     assert found["position"] == [0, 7, 7]
-    assert tallies(counts(as_heads(elsewhere), label, replace(RELEASED, far_is_missed=True))) == [BOTH, TRUE, TRUE]
 
 
 def test_exactly_as_far_as_allowed_is_within() -> None:
@@ -137,9 +125,6 @@ def test_an_empty_first_prediction_ends_it() -> None:
     told = [nobody, label, label]
     assert tallies(counts(as_heads(*told), label)) == [MISSED] * 3
     assert tallies(counts(as_heads(*told), calm)) == [NEITHER] * 3
-    mended = replace(RELEASED, empty_first_ends=False)
-    assert tallies(counts(as_heads(*told), label, mended)) == [TRUE] * 3
-    assert tallies(counts(as_heads(*told), calm, mended)) == [FALSE] * 3
 
 
 def test_any_prediction_may_foresee_but_only_the_mean_gives_a_false_alarm() -> None:
@@ -147,7 +132,6 @@ def test_any_prediction_may_foresee_but_only_the_mean_gives_a_false_alarm() -> N
     third = [calm, calm, label, calm, calm, calm]
     assert tallies(counts(as_heads(*third), label)) == [TRUE] * 3
     assert tallies(counts(as_heads(*third), calm)) == [NEITHER] * 3
-    assert tallies(counts(as_heads(*third), calm, replace(RELEASED, mean_alone_alarms=False))) == [FALSE] * 3
     assert tallies(counts(as_heads(calm, label), calm)) == [FALSE] * 3
 
 
@@ -168,12 +152,12 @@ def test_others_in_the_accident_are_an_id_error() -> None:
 def test_paths_go_on_faster_and_faster() -> None:
     """A path that ends in frame 2 of 5 with a step of 3 m goes 3 + 6 m further, not 3 + 3 m."""
     heads = MotionHeads.from_labels(scene({1: [(4, 10), (7, 10), (10, 10), None, None]}))
-    ending, _ = paths_of_heads(heads, BevGrid(), POST_PROCESSING["accident"])
+    ending, _ = paths_of_heads(heads, BevGrid())
     x, y = ending.paths[1][-1]
     other = np.tile([0.0, 0.0], (FRAMES, 1))
     truth = DrawnPaths(paths={1: np.tile([x + 6, y], (FRAMES, 1)), 2: other}, drawn=touching())
     predicted = padded_paths(DrawnPaths(paths={1: ending.paths[1], 2: other}, drawn=touching()), FRAMES)
-    found, pair = accident_counts([predicted], truth, [[(1, 1), (2, 2)]], RELEASED, 0.5)
+    found, pair = accident_counts([predicted], truth, [[(1, 1), (2, 2)]])
     assert pair == (1, 2)
     assert found["position"] == pytest.approx([3] * 3)
 
@@ -188,42 +172,20 @@ def test_of_several_overlapping_pairs_the_first_ids_count() -> None:
     drawn = touching()
     drawn[:, 14:18, 10:26] = 3
     paths = {name: np.zeros((FRAMES, 2)) for name in (1, 2, 3)}
-    assert collision(DrawnPaths(paths=paths, drawn=drawn), [4], 5.0, 0.1).pair == (1, 2)
-    assert collision(DrawnPaths(paths={2: paths[2], 3: paths[3]}, drawn=drawn), [4], 5.0, 0.1).pair == (2, 3)
-    assert collision(DrawnPaths(paths={}, drawn=drawn), [4], 5.0, 0.1) is None
-
-
-def test_a_lower_level_draws_outlines_farther_out() -> None:
-    """An empty column lies between: 0.2 cells at level 0.1, one cell at 0.5."""
-    apart = DrawnPaths(paths={name: np.zeros((FRAMES, 2)) for name in (1, 2)}, drawn=touching())
-    apart.drawn[:, :, 18] = 0
-    assert collision(apart, [4], 0.5, 0.1).pair == (1, 2)
-    assert collision(apart, [4], 0.5, 0.5) is None
+    assert collision(DrawnPaths(paths=paths, drawn=drawn), 4, 5.0) == (1, 2)
+    assert collision(DrawnPaths(paths={2: paths[2], 3: paths[3]}, drawn=drawn), 4, 5.0) == (2, 3)
+    assert collision(DrawnPaths(paths={}, drawn=drawn), 4, 5.0) is None
 
 
 def test_an_instance_of_which_one_cell_is_left_is_drawn_as_long_as_at_first() -> None:
     maps = np.zeros((FRAMES, 200, 200), dtype=np.int32)
     maps[0, 100:104, 100:108], maps[1:, 102, 104] = 5, 5
-    drawn = paths_of_instances(maps, BevGrid(), redraw=True).drawn == 5
+    drawn = paths_of_instances(maps, BevGrid()).drawn == 5
     assert (drawn.sum(axis=(1, 2)) > 20).all()
 
 
-def test_of_equally_near_frames_the_earliest_counts() -> None:
-    paths = {name: np.zeros((FRAMES, 2)) for name in (1, 2)}
-    assert collision(DrawnPaths(paths=paths, drawn=touching()), range(1, FRAMES), 5.0, 0.1).frame == 1
-
-
-def test_boxes_are_cut_down_to_five_metres_by_two() -> None:
-    """Drawn as they are, cars of 4 m × 2 m reach as far; a shorter box is not lengthened."""
-    label = scene(HIT)
-    assert tallies(counts(as_heads(label), label, replace(RELEASED, redraw=False))) == [TRUE] * 3
-    assert (
-        tallies(counts(as_maps(label), label, replace(RELEASED, redraw=False, truth_through_heads=False))) == [TRUE] * 3
-    )
-
-
 def test_whom_the_truth_names() -> None:
-    label, own = scene(HIT), AccidentContext(pair=(2, 1), known=True)
+    label = scene(HIT)
     predicted = as_heads(label)
 
     def name(of=label, **known) -> str:
@@ -234,7 +196,6 @@ def test_whom_the_truth_names() -> None:
     assert name(known=True) == "another"
     assert name() == "unknown"
     assert name(scene(CALM), pair=(2, 1), known=True) == "none"
-    assert counts(predicted, label, replace(RELEASED, truth_through_heads=False), own)["named"] == "meta"
     assert name(replace(label, id_map={}), pair=(2, 1), known=True) == "unknown"
     ego = replace(label, id_map={-101: label.id_map[1], 2: label.id_map[2]})
     assert name(ego, pair=(2, 77), known=True, own_actor_id=77) == "meta"
@@ -245,10 +206,8 @@ def test_the_truth_names_who_is_there_at_the_present() -> None:
     """A frame later a third car is where one of the two was."""
     there, passing = (4, 13), (4, 10.5)
     label = scene({**HIT, 3: [there, passing, there, there, there]})
-    meta = AccidentContext(pair=(1, 2), known=True)
-    for rules in (RELEASED, replace(RELEASED, truth_through_heads=False)):
-        found = counts(as_heads(label), label, rules, meta)
-        assert (found["positive"], found["named"]) == (True, "meta")
+    found = counts(as_heads(label), label, AccidentContext(pair=(1, 2), known=True))
+    assert (found["positive"], found["named"]) == (True, "meta")
 
 
 def evaluated(evaluator: AccidentEvaluator | None = None, tokens: str = "abcd") -> AccidentEvaluator:
@@ -274,24 +233,10 @@ def test_rates_and_errors() -> None:
     assert json.loads(json.dumps(result.as_dict()))["within"]["10"]["tp"] == 2
 
 
-def test_errors_at_one_distance() -> None:
-    result = evaluated(AccidentEvaluator(replace(RELEASED, errors_at=5.0))).compute()
-    assert result.position_error == 0
-
-
 def test_nothing_foreseen_has_the_released_errors() -> None:
     result = evaluated(tokens="c").compute()
     assert result.apa == 0
     assert (result.id_error, result.position_error, result.time_error) == (1, 20, 1)
-
-
-def test_choices_that_change_a_sum() -> None:
-    missed, at_ten = (
-        evaluated(AccidentEvaluator(replace(RELEASED, **change))).compute()
-        for change in ({"far_is_missed": True}, {"errors_at": 10.0})
-    )
-    assert [each.fn for each in missed.within.values()] == [2, 1, 1]
-    assert at_ten.position_error == 3.5
 
 
 def test_what_cannot_be_evaluated() -> None:
@@ -313,8 +258,6 @@ def test_what_cannot_be_evaluated() -> None:
             "grid",
             lambda: counts(MotionOutput(grid=BevGrid((-51, 49, 0.5)), instances=label.instance[None]), label),
         ),
-        (ConfigError, "errors_at: expected one of", lambda: replace(RELEASED, errors_at=7.0)),
-        (ConfigError, "prediction_gap", lambda: replace(RELEASED, prediction_gap=math.nan)),
         (ChoiceError, "released, paper, boxes", lambda: AccidentEvaluator("official")),
     ):
         with pytest.raises(error, match=words):

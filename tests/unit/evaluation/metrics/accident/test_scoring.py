@@ -95,9 +95,9 @@ def test_alarms_exactly_at_the_distance_miss_and_their_order_counts_nothing() ->
         results = []
         for alarms in ([off, *right], [*right[::-1], off]):
             evaluator = AccidentEvaluator(protocol="boxes")
-            evaluator.update("one", alarms, truth)
+            evaluator.update("one", alarms, None, AccidentContext(truth=truth))
             results.append(evaluator.compute())
         assert results[0] == results[1]
         alone = AccidentEvaluator(protocol="boxes")
-        alone.update("one", [off], truth)
+        alone.update("one", [off], None, AccidentContext(truth=truth))
         assert [each.tp for each in alone.compute().within.values()] == [0, 1, 1]

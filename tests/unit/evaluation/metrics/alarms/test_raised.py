@@ -4,36 +4,10 @@ import numpy as np
 import pytest
 from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
-from deepaccident_devkit.evaluation.metrics.accident import AccidentReading, accidents_of
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.metrics.accident import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.raised import foreseen_accident, named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.truth import BoxTruth
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
-
-
-@pytest.mark.parametrize("orientation", ORIENTATIONS)
-def test_accidents_of_instance_maps(orientation) -> None:
-    label = scene({5: standing(20, 10), 9: [(15.5 - gap, 10) for gap in (4, 3, 2, 0, 1)]}, orientation=orientation)
-    grid = label.config.grid
-    ids = tuple(sorted(label.id_map.values()))
-    (found,) = accidents_of(label.instance, grid)
-    np.testing.assert_allclose(found.positions, [[20, 10], [15.5, 10]])
-    assert (found.time, found.ids) == (1.5, ids)
-    calm = np.where(label.instance == ids[0], ids[0], -1)  # below 0 is background, too
-    assert [each.time for each in accidents_of(np.stack([label.instance, calm]), grid, step=0.1)] == [
-        pytest.approx(0.3)
-    ]
-    assert accidents_of(label.instance, grid, reading=AccidentReading(danger_distance=0.25)) == []
-    (raw,) = accidents_of(label.instance, grid, labels=None)
-    np.testing.assert_allclose(np.abs(raw.positions - found.positions), 0.25)
-    for error, words, refused in (
-        (ChoiceError, "labels", lambda: accidents_of(label.instance, grid, labels="none")),
-        (ConfigError, "step", lambda: accidents_of(label.instance, grid, step=0)),
-        (GeometryError, "instances", lambda: accidents_of(label.instance[..., :9], grid)),
-    ):
-        with pytest.raises(error, match=words):
-            refused()
-
 
 NOBODY = BoxTruth(
     time=np.arange(0, 2.1, 0.1), actor_id=np.zeros(0, np.int64), footprint=np.zeros((21, 0, 5)), accident=None
@@ -73,9 +47,8 @@ def test_a_foreseen_accident_is_the_alarm_of_the_protocol_boxes(cars, score, fra
     assert foreseen_accident(output, labels=settings.protocol, step=0.1).time == pytest.approx(0.1 * frame)
 
 
-def test_a_foreseen_accident_follows_the_reading_and_the_labels() -> None:
+def test_a_foreseen_accident_follows_the_labels() -> None:
     output = as_maps(scene(LATE))
-    assert foreseen_accident(output, reading=AccidentReading(danger_distance=0.25)) is None
     apart = foreseen_accident(output, labels=None).positions - foreseen_accident(output).positions
     np.testing.assert_allclose(np.abs(apart), 0.25)
     with pytest.raises(ChoiceError, match="labels"):

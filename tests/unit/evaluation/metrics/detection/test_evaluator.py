@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 
-from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
     DetectionEvaluator,
-    nuscenes_summary,
 )
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
@@ -60,7 +59,6 @@ def test_perfect_predictions_score_100(protocol: str) -> None:
     assert result.class_average_precision[result.classes[0]] == 100
     assert result.mean_average_precision == 100
     if protocol == "paper":
-        assert nuscenes_summary(result).score_without_attributes == 100
         assert list(result.mean_errors.values()) == [0, 0, 0, 0]
 
 
@@ -163,10 +161,7 @@ def test_velocities_that_a_detector_does_not_give() -> None:
     evaluator = evaluated("paper", (prediction, truth))
     result = evaluator.compute()
     assert math.isnan(result.mean_errors["AVE"])
-    summary = nuscenes_summary(result)
-    assert summary.score_without_attributes == pytest.approx(100 * 8 / 9)
-    assert summary.as_dict()["mAVE"] is None
-    assert "–" in summary.to_text()
+    assert result.as_dict()["mAVE"] is None
     evaluator.update("s/ego_vehicle/000", prediction, truth)  # the same once more: unknown equals unknown
     assert evaluator.repeated == {"s/ego_vehicle/000"}
 
@@ -234,11 +229,6 @@ def test_classes_that_are_nowhere() -> None:
     assert math.isnan(left_out.class_average_precision["van"])
     counted = evaluated("paper", (prediction, truth), absent_class_is_zero=True).compute()
     assert counted.mean_average_precision == pytest.approx(left_out.mean_average_precision / 6)
-
-
-def test_a_summary_is_of_one_range() -> None:
-    with pytest.raises(ChoiceError, match="of one range"):
-        nuscenes_summary(two_samples("released_iou").compute())
 
 
 def test_boxes_of_another_frame_are_refused() -> None:

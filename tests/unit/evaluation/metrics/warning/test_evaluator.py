@@ -121,7 +121,7 @@ def test_other_protocols_are_refused() -> None:
         (41, [], None, context(41), "token: expected a sample's"),
         ("t/s/ego_vehicle/041", RIGHT, None, context(41), "wrap a single Accident in a list"),
         ("t/s/ego_vehicle/041", [], context(41), None, "label: expected MotionLabels or None, found AccidentContext"),
-        ("t/s/ego_vehicle/041", [], None, None, "context: expected an AccidentContext, found NoneType"),
+        ("t/s/ego_vehicle/041", [], None, None, "context: warnings need to know what happens"),
         ("t/s/ego_vehicle/041", [], None, AccidentContext(), "give accident_context.dataset, sample, horizon=2.0."),
     ],
 )
