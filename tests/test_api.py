@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from workers import num_boxes
 
 import deepaccident_devkit
@@ -26,14 +27,20 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 
 def test_dataroots_that_are_none(tmp_path: Path, release_root: Path) -> None:
-    with pytest.raises(DatarootError, match=r"nowhere: does not exist; give the folder"):
-        DeepAccident(dataroot=tmp_path / "nowhere")
-    with pytest.raises(DatarootError, match="no scenario found; expected <scenario_type>/<agent>/calib"):
-        DeepAccident(dataroot=tmp_path)
-    with pytest.raises(DatarootError, match="is a file"):
-        DeepAccident(dataroot=release_root / "train.txt")
-    with pytest.raises(VersionError, match="unknown version 'v2'; known are v1, v1-mini"):
-        DeepAccident("v2", release_root)
+    assert_refused(
+        (
+            lambda: DeepAccident(dataroot=tmp_path / "nowhere"),
+            DatarootError,
+            r"nowhere: does not exist; give the folder",
+        ),
+        (
+            lambda: DeepAccident(dataroot=tmp_path),
+            DatarootError,
+            "no scenario found; expected <scenario_type>/<agent>/calib",
+        ),
+        (lambda: DeepAccident(dataroot=release_root / "train.txt"), DatarootError, "is a file"),
+        (lambda: DeepAccident("v2", release_root), VersionError, "unknown version 'v2'; known are v1, v1-mini"),
+    )
     for path, written in ((str(release_root), str(release_root)), (Path("a/b"), "a/b"), ("~", "~"), ("./x", "./x")):
         remedy = f"; to open the folder, write DeepAccident(dataroot='{written}')"
         with pytest.raises(VersionError, match=f"{re.escape(remedy)}$"):
@@ -41,12 +48,15 @@ def test_dataroots_that_are_none(tmp_path: Path, release_root: Path) -> None:
     for nuscenes, ours in (("v1.0-mini", "v1-mini"), ("v1.0-trainval", "v1")):
         with pytest.raises(VersionError, match=rf"known are v1, v1-mini; did you mean '{ours}'\?$"):
             DeepAccident(nuscenes, release_root)
-    with pytest.raises(VersionError, match=r"known are v1, v1-mini$"):
-        DeepAccident("v2", release_root)
-    with pytest.raises(VersionError, match="holds no mini release"):
-        DeepAccident("v1-mini", release_root)
-    with pytest.raises(ChoiceError, match="on_error: expected one of raise, skip, found 'ignore'"):
-        DeepAccident(dataroot=release_root, on_error="ignore")  # type: ignore[arg-type]
+    assert_refused(
+        (lambda: DeepAccident("v2", release_root), VersionError, r"known are v1, v1-mini$"),
+        (lambda: DeepAccident("v1-mini", release_root), VersionError, "holds no mini release"),
+        (
+            lambda: DeepAccident(dataroot=release_root, on_error="ignore"),
+            ChoiceError,
+            "on_error: expected one of raise, skip, found 'ignore'",
+        ),
+    )
 
 
 @pytest.mark.slow
@@ -82,10 +92,18 @@ def test_unknown_sample_tokens(da: DeepAccident, token: str, why: str) -> None:
 def test_a_sensor_file_and_a_sample_are_not_taken_for_each_other(da: DeepAccident) -> None:
     sample, cloud = da.sample[0], da.get("sample_data", f"{da.sample[0]['token']}/lidar01")
     front = f"{sample['token']}/Camera_Front"
-    with pytest.raises(TokenError, match=r"it names a sensor file: leave out '/lidar01'$"):
-        da.map_pointcloud_to_image(front, cloud)
-    with pytest.raises(TokenError, match=r"it names a sample: add a channel, such as '/Camera_Front'$"):
-        da.map_pointcloud_to_image(sample, front)
+    assert_refused(
+        (
+            lambda: da.map_pointcloud_to_image(front, cloud),
+            TokenError,
+            r"it names a sensor file: leave out '/lidar01'$",
+        ),
+        (
+            lambda: da.map_pointcloud_to_image(sample, front),
+            TokenError,
+            r"it names a sample: add a channel, such as '/Camera_Front'$",
+        ),
+    )
     for token in (f"{sample['token']}/7", f"{front}/lidar01"):
         with pytest.raises(TokenError, match=r"expected the form <scenario>/<agent>/<NNN>$"):
             da.get("sample", token)
@@ -119,22 +137,20 @@ def test_unknown_tokens_of_other_tables(da: DeepAccident, table: str) -> None:
 
 def test_unknown_tables_fields_channels_and_frames(da: DeepAccident) -> None:
     sample = da.sample[0]["token"]
-    with pytest.raises(TableError, match="no table 'scene'; there are scenario, agent"):
-        da.get("scene", "x")
-    with pytest.raises(FieldError, match="table 'scenario' has no field 'rain'; it has token, name"):
-        da.field2token("scenario", "rain", 1)
-    with pytest.raises(TokenError, match="the channels are Camera_Front, "):
-        da.load_image(f"{sample}/Camera_Side")
-    with pytest.raises(ChoiceError, match="lidar01 holds no images"):
-        da.load_image(f"{sample}/lidar01")
-    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, Camera_Front"):
-        da.boxes(sample, "camera")
-    with pytest.raises(ChoiceError, match="visible: expected one of camera, released, or None"):
-        da.boxes(sample, visible="lidar")  # type: ignore[arg-type]
-    with pytest.raises(ChoiceError, match="velocity: expected one of decoded, derived, label"):
-        da.boxes(sample, velocity="mine")  # type: ignore[arg-type]
-    with pytest.raises(ChoiceError, match="split: expected one of train, val, test"):
-        da.split_scenarios("training")
+    assert_refused(
+        (lambda: da.get("scene", "x"), TableError, "no table 'scene'; there are scenario, agent"),
+        (
+            lambda: da.field2token("scenario", "rain", 1),
+            FieldError,
+            "table 'scenario' has no field 'rain'; it has token, name",
+        ),
+        (lambda: da.load_image(f"{sample}/Camera_Side"), TokenError, "the channels are Camera_Front, "),
+        (lambda: da.load_image(f"{sample}/lidar01"), ChoiceError, "lidar01 holds no images"),
+        (lambda: da.boxes(sample, "camera"), ChoiceError, "frame: expected one of world, ego, lidar, Camera_Front"),
+        (lambda: da.boxes(sample, visible="lidar"), ChoiceError, "visible: expected one of camera, released, or None"),
+        (lambda: da.boxes(sample, velocity="mine"), ChoiceError, "velocity: expected one of decoded, derived, label"),
+        (lambda: da.split_scenarios("training"), ChoiceError, "split: expected one of train, val, test"),
+    )
     other = da.get("frame", da.scenario[1]["first_frame_token"])
     with pytest.raises(ChoiceError, match="expected two samples of one scenario"):
         da.transform(sample, da.samples_of(other)[0])
@@ -159,10 +175,14 @@ def test_missing_and_broken_sensor_files_are_named(own_release: Path) -> None:
     release = DeepAccident(dataroot=own_release, verbose=False)
     sample = release.sample[0]["token"]
     path = release.get_sample_data_path(f"{sample}/Camera_Front")
-    with pytest.raises(MissingFileError, match=rf"{path.name}: no such file; unpack the archive"):
-        release.load_image(f"{sample}/Camera_Front")
-    with pytest.raises(MissingFileError, match="no such file"):
-        release.load_bev(sample)
+    assert_refused(
+        (
+            lambda: release.load_image(f"{sample}/Camera_Front"),
+            MissingFileError,
+            rf"{path.name}: no such file; unpack the archive",
+        ),
+        (lambda: release.load_bev(sample), MissingFileError, "no such file"),
+    )
     cloud = release.get_sample_data_path(f"{sample}/lidar01")
     cloud.parent.mkdir(parents=True)
     cloud.write_bytes(b"")
@@ -178,17 +198,21 @@ def test_arguments_of_a_wrong_kind_are_our_errors(da: DeepAccident) -> None:
         with pytest.raises(TokenError, match="frame: expected a number from 1, found"):
             da.get_sample(da.scenario[0], "ego_vehicle", odd)  # type: ignore[arg-type]
     assert da.get_sample(da.scenario[0], "ego_vehicle", np.int64(2))["token"].endswith("/ego_vehicle/002")
-    with pytest.raises(TableError, match="table 'sample' counts its rows: expected a number, found 'token'"):
-        da.sample["token"]  # type: ignore[call-overload]
-    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, found 'Camera_Front'"):
-        da.load_point_cloud(da.sample[0], "Camera_Front")  # type: ignore[arg-type]
+    assert_refused(
+        (lambda: da.sample["token"], TableError, "table 'sample' counts its rows: expected a number, found 'token'"),
+        (
+            lambda: da.load_point_cloud(da.sample[0], "Camera_Front"),
+            ChoiceError,
+            "frame: expected one of world, ego, lidar, found 'Camera_Front'",
+        ),
+    )
 
 
 def test_every_error_is_ours_and_also_the_built_in_kind(da: DeepAccident) -> None:
-    with pytest.raises(KeyError, match="table 'sample' has no token"):
-        da.get("sample", "x")
-    with pytest.raises(DeepAccidentError, match="table 'sample' has no token"):
-        da.get("sample", "x")
+    assert_refused(
+        (lambda: da.get("sample", "x"), KeyError, "table 'sample' has no token"),
+        (lambda: da.get("sample", "x"), DeepAccidentError, "table 'sample' has no token"),
+    )
 
 
 def test_records_are_the_callers(da: DeepAccident) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 TOP = Path(__file__).parents[1]
 EXCEPTIONS = {
-    "no_such_page.md": "this module's own example of a page that is not there",
     "questions/README.md": "the page that `export questions` writes beside its questions",
 }
 """Names that are cited and not there, each with the reason."""
@@ -92,31 +91,3 @@ def test_the_exceptions_are_needed(files: list[str], citing: dict[str, str]) -> 
     cited = {(page, name) for name, text in citing.items() for page in cited_pages(text)}
     needed = {page for page, name in cited if not ships(page, name, there)}
     assert EXCEPTIONS.keys() - needed == set()
-
-
-@pytest.mark.parametrize(
-    ("text", "pages"),
-    [
-        ("see docs/protocols.md, Warnings.", {"docs/protocols.md"}),
-        ("[link](../schema/README.md#tables) and `README.md`", {"../schema/README.md", "README.md"}),
-        ("docs/*.md, <name>.md and a_{part}.md are patterns", set()),
-        ("the ending .md alone", set()),
-    ],
-)
-def test_pages_are_found(text: str, pages: set[str]) -> None:
-    assert cited_pages(text) == pages
-
-
-@pytest.mark.parametrize(
-    ("page", "citing", "is_there"),
-    [
-        ("motion_labels.md", "docs/protocols.md", True),
-        ("../schema/README.md", "docs/index.md", True),
-        ("README.md", "tests/unit/test_splits.py", True),
-        ("protocols.md", "tests/test_docs.py", True),
-        ("golden/README.md", "tests/parity/test_accident.py", True),
-        ("no_such_page.md", "docs/protocols.md", False),
-    ],
-)
-def test_what_ships(files: list[str], page: str, citing: str, is_there: bool) -> None:
-    assert ships(page, citing, {*files}) is is_there

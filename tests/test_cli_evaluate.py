@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from refusals import assert_refused
 from report_page import page_of
 
 from deepaccident_devkit import DeepAccident, taxonomy
@@ -387,10 +388,18 @@ def test_an_operating_point_from_another_split(
     out, samples = folder / "chooses", ("--samples", "evaluate", "--scope", "accident")
     words = ("warning", da_motion.dataroot, "--results", accidents, *LIST, *samples)
     evaluate(*words, "--out", out)
-    with pytest.raises(EvaluationError, match=r"or its twin, too; a threshold that is chosen on the recordings it is"):
-        evaluate(*words, "--threshold-from", out)
-    with pytest.raises(EvaluationError, match="is an evaluation of accident boxes; expected one of warning, protocol"):
-        evaluate(*words, "--threshold-from", bundle)
+    assert_refused(
+        (
+            lambda: evaluate(*words, "--threshold-from", out),
+            EvaluationError,
+            r"or its twin, too; a threshold that is chosen on the recordings it is",
+        ),
+        (
+            lambda: evaluate(*words, "--threshold-from", bundle),
+            EvaluationError,
+            "is an evaluation of accident boxes; expected one of warning, protocol",
+        ),
+    )
     scenarios = json.loads((out / "scenarios.json").read_text())
     others = {name.replace("_type001_", "_type009_"): each for name, each in scenarios["scenarios"].items()}
     (out / "scenarios.json").write_text(json.dumps(scenarios | {"scenarios": others}))

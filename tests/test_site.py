@@ -62,37 +62,31 @@ def test_every_page_is_listed(folder: Path) -> None:
     assert {path.stem for path in folder.glob("*.md")} - listed == {"index"}
 
 
-def docstring_lines(text: str) -> str:
+SECTION = "Sums.\n\nArgs:\n    first: one.\n\n    second: two."
+
+
+@pytest.mark.parametrize(
+    ("text", "restructured"),
+    [
+        ("Reads `token`s of |x| metres.", r"Reads \ ``token``\ s of \|x\| metres."),
+        ("As `a\nb` is.", "As \\ ``a\nb``\\  is."),
+        ("Counts.\n\n>>> len(`a`)\n0\n\nAnd `b`.", "Counts.\n\n>>> len(`a`)\n0\n\nAnd \\ ``b``\\ ."),
+        (
+            "So:\n\n```python\nf(`x`)\n\ng()\n```\n\nEnd.",
+            "So:\n\n\n.. code-block:: python\n\n    f(`x`)\n    \n    g()\n\n\nEnd.",
+        ),
+        ("So:\n\n    f(*a)\n\nEnd.", "So:\n\n\n.. code-block:: python\n\n    f(*a)\n\n\nEnd."),
+        (SECTION, SECTION),
+        (
+            "| field | values |\n|---|---|\n| `town` | any |",
+            (
+                "\n.. list-table::\n    :header-rows: 1\n\n    * - field\n      - values\n"
+                "    * - ``town``\\ \n      - any\n"
+            ),
+        ),
+    ],
+    ids=["code", "code over a line", "doctest", "fence", "indented code", "section", "table"],
+)
+def test_docstrings_become_the_sites_markup(text: str, restructured: str) -> None:
     module = loaded_script("docs/markdown_docstrings.py")
-    return "\n".join(module.restructured(text.split("\n")))
-
-
-def test_code_in_docstrings_becomes_literal() -> None:
-    assert docstring_lines("Reads `token`s of |x| metres.") == r"Reads \ ``token``\ s of \|x\| metres."
-
-
-def test_code_that_runs_over_a_line_stays_one() -> None:
-    assert docstring_lines("As `a\nb` is.") == "As \\ ``a\nb``\\  is."
-
-
-def test_doctests_stay() -> None:
-    text = "Counts.\n\n>>> len(`a`)\n0\n\nAnd `b`."
-    assert docstring_lines(text) == "Counts.\n\n>>> len(`a`)\n0\n\nAnd \\ ``b``\\ ."
-
-
-def test_a_fence_becomes_a_block() -> None:
-    assert docstring_lines("So:\n\n```python\nf(`x`)\n\ng()\n```\n\nEnd.") == (
-        "So:\n\n\n.. code-block:: python\n\n    f(`x`)\n    \n    g()\n\n\nEnd."
-    )
-
-
-def test_indented_code_becomes_a_block_but_not_what_a_section_holds() -> None:
-    assert docstring_lines("So:\n\n    f(*a)\n\nEnd.") == ("So:\n\n\n.. code-block:: python\n\n    f(*a)\n\n\nEnd.")
-    section = "Sums.\n\nArgs:\n    first: one.\n\n    second: two."
-    assert docstring_lines(section) == section
-
-
-def test_a_table_becomes_a_list_table() -> None:
-    assert docstring_lines("| field | values |\n|---|---|\n| `town` | any |") == (
-        "\n.. list-table::\n    :header-rows: 1\n\n    * - field\n      - values\n    * - ``town``\\ \n      - any\n"
-    )
+    assert "\n".join(module.restructured(text.split("\n"))) == restructured

@@ -44,17 +44,3 @@ def test_a_report_opens_without_a_complaint(
         assert browser.script("return document.documentElement.scrollWidth") <= width
         assert browser.complaints() == []
         assert browser.requests() == [page.as_uri()]
-
-
-def test_what_is_wrong_with_a_page_is_noticed(browser: Browser, tmp_path: Path) -> None:
-    page = tmp_path / "page.html"
-    page.write_text(
-        "<!DOCTYPE html><p style='width: 900px'>wide</p><img src='there_is_none.png'>"
-        "<script>console.warn('a warning')</script>"
-    )
-    browser.open(page, 400)
-    assert "wide" in browser.overflowing()[0]
-    assert browser.requests() == [page.as_uri(), (tmp_path / "there_is_none.png").as_uri()]
-    assert any("a warning" in each for each in browser.complaints())
-    assert browser.script("return document.images[0].naturalWidth") == 0
-    assert browser.screenshot(tmp_path / "page.png").stat().st_size > 1000

@@ -133,17 +133,6 @@ def test_it_plays_to_the_impact(opened: Browser) -> None:
     assert opened.complaints() == []
 
 
-def test_scrubbing_moves_everybody(opened: Browser) -> None:
-    before = drawn(opened)
-    scrub(opened, 17)
-    assert text(opened, "time") == "1.7 s, frame 18 / 35"
-    assert text(opened, "countdown") == "1.7 s to impact"
-    middle = drawn(opened)
-    assert middle != before
-    scrub(opened, 0)
-    assert drawn(opened) == before
-
-
 @pytest.mark.parametrize("at", [0, 20])
 def test_boxes_are_drawn_where_the_labels_say(at: int, opened: Browser, da_motion: DeepAccident, scenario: str) -> None:
     """Points of each box near its corners are of its colour, a metre beyond its sides nothing is."""
@@ -356,15 +345,6 @@ def test_boxes_are_where_the_camera_has_them(browser: Browser, da: DeepAccident,
     assert cut > 0
     click(browser, "boxes")
     assert browser.script("return document.querySelectorAll('.boxes g').length") == 0
-
-
-def test_the_road_lies_beneath(browser: Browser, recorded: Path) -> None:
-    browser.open(recorded, 1280)
-    wait_until(lambda: browser.script("return ground.road.complete"))
-    click(browser, "whole")
-    with_it = drawn(browser)
-    click(browser, "layer-road")
-    assert drawn(browser) != with_it
 
 
 @pytest.fixture(scope="module")

@@ -53,15 +53,6 @@ def test_a_click_sorts(page: Path, browser: Browser) -> None:
     assert browser.complaints() == []
 
 
-def test_unknown_values_are_last(page: Path, browser: Browser) -> None:
-    browser.open(page, 1280)
-    browser.script("document.querySelector('.sortable tbody').rows[0].cells[5].dataset.key = ''")
-    unknown = browser.script("return document.querySelector('.sortable tbody').rows[0].cells[0].textContent")
-    for _ in range(2):
-        browser.script(CLICK % "closing")
-        assert browser.script(COLUMN % "scenario")[-1] == unknown
-
-
 def test_a_link_leads_to_a_replay(page: Path, browser: Browser) -> None:
     browser.open(page, 1280)
     browser.script("document.querySelector('.sortable a').click()")

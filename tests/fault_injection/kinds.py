@@ -1,8 +1,8 @@
 """What a mutation is."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,6 +19,7 @@ class Mutation:
     Attributes:
         name: its name in the table.
         group: what kind of file it damages.
+        title: what it does, in a phrase.
         apply: damages a scenario; returns what was done.
         deep: whether only the sensors' files show it.
         harmless: why it cannot be found, or need not be; None for a fault.
@@ -28,16 +29,12 @@ class Mutation:
 
     name: str
     group: str
+    title: str
     apply: Apply
     deep: bool = False
     harmless: str | None = None
     beyond: str | None = None
     only: Only | None = None
-
-    @property
-    def title(self) -> str:
-        """What it does, in a phrase."""
-        return " ".join((self.apply.__doc__ or "").split()).rstrip(".")
 
 
 @dataclass(slots=True)
@@ -48,28 +45,19 @@ class Group:
     deep: bool = False
     mutations: list[Mutation] = field(default_factory=list)
 
-    def kind(
-        self,
-        *,
-        deep: bool | None = None,
-        harmless: str | None = None,
-        beyond: str | None = None,
-        only: Only | None = None,
-    ) -> Callable[[Apply], Apply]:
-        """Enter the decorated function under its own name."""
+    def add(self, rows: Mapping[str, tuple[str, Apply]], **how: Any) -> None:
+        """Enter a mutation a row: name → what it does, and the function; all have the same further fields."""
+        for name, (says, apply) in rows.items():
+            title = " ".join(says.split()).rstrip(".")
+            self.mutations.append(
+                Mutation(name=name, group=self.name, title=title, apply=apply, **{"deep": self.deep, **how})
+            )
+
+    def kind(self, **how: Any) -> Callable[[Apply], Apply]:
+        """Enter the decorated function under its own name; its docstring says what it does."""
 
         def enter(apply: Apply) -> Apply:
-            self.mutations.append(
-                Mutation(
-                    name=apply.__name__,
-                    group=self.name,
-                    apply=apply,
-                    deep=self.deep if deep is None else deep,
-                    harmless=harmless,
-                    beyond=beyond,
-                    only=only,
-                )
-            )
+            self.add({apply.__name__: (apply.__doc__ or "", apply)}, **how)
             return apply
 
         return enter

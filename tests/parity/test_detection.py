@@ -31,7 +31,7 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 TOLERANCE, SCALE_TOLERANCE = 1e-9, 1e-4
-RELEASED, RELEASED_IOU = DETECTION_PROTOCOLS["released"], DETECTION_PROTOCOLS["released_iou"]
+RELEASED = DETECTION_PROTOCOLS["released"]
 SHOWN_THRESHOLD, SHOWN_SCORE = RELEASED.thresholds.index(2.0), 0.3
 """What the golden's frame_checks are at."""
 

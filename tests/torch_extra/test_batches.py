@@ -13,6 +13,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 from torch.utils.data import DataLoader
 
 from deepaccident_devkit import DeepAccident
@@ -168,12 +169,19 @@ def test_items_that_make_no_batch(da: DeepAccident, tokens: list[str], collated:
             {"past": 2},
         )
     )
-    with pytest.raises(ConfigError, match=r"only some of the items have 'ego_from_camera'; .* of one V2XConfig"):
-        collated([plain, small])
-    with pytest.raises(ConfigError, match=r"images: items of shapes .*9, 16\) and .*18, 32\) make no batch; .*resize="):
-        collated([large, small])
-    with pytest.raises(ConfigError, match=r"agent_valid: items of shapes .* make no batch"):
-        collated([plain, longer])
+    assert_refused(
+        (
+            lambda: collated([plain, small]),
+            ConfigError,
+            r"only some of the items have 'ego_from_camera'; .* of one V2XConfig",
+        ),
+        (
+            lambda: collated([large, small]),
+            ConfigError,
+            r"images: items of shapes .*9, 16\) and .*18, 32\) make no batch; .*resize=",
+        ),
+        (lambda: collated([plain, longer]), ConfigError, r"agent_valid: items of shapes .* make no batch"),
+    )
 
 
 def test_opencoods_own_formula_gives_the_same_matrices(da: DeepAccident, sample: str) -> None:

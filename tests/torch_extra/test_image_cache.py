@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 from torch.utils.data import DataLoader
 
 from deepaccident_devkit import DeepAccident
@@ -103,10 +104,18 @@ def test_samples_and_agents_that_are_not_in_it_are_refused(da: DeepAccident, sam
     alone = cached(da, tmp_path / "out", agents=("ego_vehicle",))
     config = replace(CONFIG, agents="single", images_cache=alone)
     assert len(V2XDataset(da, [sample], config)) == 1
-    with pytest.raises(ConfigError, match=r"has no images of .*/other_vehicle; choose other samples or agents"):
-        V2XDataset(da, [sample, sample.replace("ego_vehicle", "other_vehicle")], config)
-    with pytest.raises(ConfigError, match=r"has no images of .*/infrastructure; choose other samples or agents"):
-        V2XDataset(da, [sample], replace(config, agents="+infrastructure"))
+    assert_refused(
+        (
+            lambda: V2XDataset(da, [sample, sample.replace("ego_vehicle", "other_vehicle")], config),
+            ConfigError,
+            r"has no images of .*/other_vehicle; choose other samples or agents",
+        ),
+        (
+            lambda: V2XDataset(da, [sample], replace(config, agents="+infrastructure")),
+            ConfigError,
+            r"has no images of .*/infrastructure; choose other samples or agents",
+        ),
+    )
 
 
 def test_images_that_the_release_lacked_are_skipped_or_refused(

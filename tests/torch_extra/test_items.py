@@ -7,6 +7,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import (
@@ -191,10 +192,10 @@ def test_items_are_counted_as_a_sequences(da: DeepAccident, tokens: list[str]) -
 
 
 def test_samples_that_cannot_be(da: DeepAccident, tokens: list[str]) -> None:
-    with pytest.raises(TokenError, match="nowhere"):
-        V2XDataset(da, ["nowhere"])
-    with pytest.raises(ChoiceError, match="agents: expected one of"):
-        V2XDataset(da, tokens, V2XConfig(agents="everybody"))
+    assert_refused(
+        (lambda: V2XDataset(da, ["nowhere"]), TokenError, "nowhere"),
+        (lambda: V2XDataset(da, tokens, V2XConfig(agents="everybody")), ChoiceError, "agents: expected one of"),
+    )
     for one in (tokens[0], da.sample[0]):
         with pytest.raises(ConfigError, match="tokens: expected a list of samples, found one alone"):
             V2XDataset(da, one)
@@ -205,12 +206,19 @@ def test_samples_that_cannot_be(da: DeepAccident, tokens: list[str]) -> None:
 
 def test_a_missing_file_is_named(da_b: DeepAccident) -> None:
     token = da_b.sample[0]["token"]
-    with pytest.raises(MissingFileError, match=r"lidar01.*no such file"):
-        V2XDataset(da_b, [token])[0]
-    with pytest.raises(MissingFileError, match=r"Camera_Front.*no such file"):
-        V2XDataset(da_b, [token], V2XConfig(points=False, images=ImageConfig()))[0]
-    with pytest.raises(MissingFileError, match=r"BEV_instance_camera.*no such file"):
-        V2XDataset(da_b, [token], V2XConfig(points=False, bev_segmentation=BevGrid()))[0]
+    assert_refused(
+        (lambda: V2XDataset(da_b, [token])[0], MissingFileError, r"lidar01.*no such file"),
+        (
+            lambda: V2XDataset(da_b, [token], V2XConfig(points=False, images=ImageConfig()))[0],
+            MissingFileError,
+            r"Camera_Front.*no such file",
+        ),
+        (
+            lambda: V2XDataset(da_b, [token], V2XConfig(points=False, bev_segmentation=BevGrid()))[0],
+            MissingFileError,
+            r"BEV_instance_camera.*no such file",
+        ),
+    )
 
 
 def test_a_broken_file_is_named(da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

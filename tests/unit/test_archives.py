@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_array, read_member
 
@@ -144,10 +145,18 @@ def test_an_end_that_leads_to_a_larger_directory_is_refused() -> None:
     end = content.rindex(b"PK\x05\x06")
     large = b"PK\x06\x06" + struct.pack("<QHHLLQQQQ", 44, 45, 45, 0, 0, 1, 1, 1 << 32, 0)
     locator = b"PK\x06\x07" + struct.pack("<LQL", 0, end, 1)
-    with pytest.raises(OSError, match="directory has 4,294,967,296 bytes"):
-        open_zip(content[:end] + large + locator + content[end:])
-    with pytest.raises(zipfile.BadZipFile, match="its end is damaged"):
-        open_zip(content[:end] + large[:-1] + locator + content[end:])
+    assert_refused(
+        (
+            lambda: open_zip(content[:end] + large + locator + content[end:]),
+            OSError,
+            "directory has 4,294,967,296 bytes",
+        ),
+        (
+            lambda: open_zip(content[:end] + large[:-1] + locator + content[end:]),
+            zipfile.BadZipFile,
+            "its end is damaged",
+        ),
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -6,6 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import FrozenArrays, as_floats, as_numbers, checked, checked_number, checked_whole
@@ -17,10 +18,14 @@ from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 @pytest.mark.parametrize("values", ["abc", ["1", "2"], None, [None, 1.0], [[1], [1, 2]], [1j, 2], object()])
 def test_what_is_no_numbers_is_refused(values: object) -> None:
-    with pytest.raises(GeometryError, match=r"weights: expected an array of shape \(N\), found"):
-        checked("weights", values, (None,))
-    with pytest.raises(GeometryError, match=r"weights: expected numbers, found"):
-        as_numbers("weights", values)
+    assert_refused(
+        (
+            lambda: checked("weights", values, (None,)),
+            GeometryError,
+            r"weights: expected an array of shape \(N\), found",
+        ),
+        (lambda: as_numbers("weights", values), GeometryError, r"weights: expected numbers, found"),
+    )
     if values not in (["1", "2"], None, [None, 1.0]):  # what numpy itself reads as numbers or NaN
         with pytest.raises(GeometryError, match="expected numbers, found"):
             as_floats(values)
@@ -109,10 +114,14 @@ def test_arrays_of_other_frameworks_are_read(kind: type[Foreign]) -> None:
 def test_arrays_that_cannot_be_read_say_what_to_do(kind: type[Foreign], error: type[Exception]) -> None:
     given = kind([1.0], error("it is on another device"))
     remedy = r"another device\); pass a torch tensor as tensor\.detach\(\)\.cpu\(\)\.float\(\), another framework's"
-    with pytest.raises(GeometryError, match=rf"x: expected an array of shape \(1\), found {kind.__name__} .*{remedy}"):
-        checked("x", given, (1,))
-    with pytest.raises(GeometryError, match=rf"^expected numbers, found {kind.__name__} .*{remedy}"):
-        as_floats(given)
+    assert_refused(
+        (
+            lambda: checked("x", given, (1,)),
+            GeometryError,
+            rf"x: expected an array of shape \(1\), found {kind.__name__} .*{remedy}",
+        ),
+        (lambda: as_floats(given), GeometryError, rf"^expected numbers, found {kind.__name__} .*{remedy}"),
+    )
 
 
 def test_masked_numbers_are_nobodys_to_unmask() -> None:

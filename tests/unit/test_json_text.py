@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import msgspec
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.json_text import MOST_LEVELS, parsed_json, parsed_record
 
@@ -31,10 +32,10 @@ def test_levels_are_counted(far: int) -> None:
     blanks = b" " * far
     deepest = b"[" + blanks + b"[" * (MOST_LEVELS - 1) + b"]" * MOST_LEVELS
     assert parsed_json(deepest)
-    with pytest.raises(ValueError, match="nested more than"):
-        parsed_json(b"[" + deepest + b"]")
-    with pytest.raises(ValueError, match="nested more than"):
-        parsed_json(b'{"a":' * 1_000_000)
+    assert_refused(
+        (lambda: parsed_json(b"[" + deepest + b"]"), ValueError, "nested more than"),
+        (lambda: parsed_json(b'{"a":' * 1_000_000), ValueError, "nested more than"),
+    )
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, DatarootError, DeepAccidentError
@@ -30,10 +31,14 @@ class Named:
     [None, b"/data", 3, 3.5, True, [], "", "a\0b", "\ud800", "~nobody-of-this-name/x", Path("a\0b"), Named(b"a")],
 )
 def test_what_is_no_path_is_refused(given: Any, da: DeepAccident) -> None:
-    with pytest.raises(ConfigError, match=r"^expected a path, found "):
-        path_of(given)
-    with pytest.raises(DatarootError, match=r"^dataroot: expected a path or a URL, found "):
-        DeepAccident("v1", given, verbose=False)
+    assert_refused(
+        (lambda: path_of(given), ConfigError, r"^expected a path, found "),
+        (
+            lambda: DeepAccident("v1", given, verbose=False),
+            DatarootError,
+            r"^dataroot: expected a path or a URL, found ",
+        ),
+    )
     for refused in (
         lambda: DeepAccident("v1", da.dataroot, index_dir=given if given is not None else "", verbose=False),
         lambda: read_results(given),

@@ -20,7 +20,6 @@ from report_page import Page
 
 import deepaccident_devkit
 import deepaccident_devkit.render.notebook
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.evaluation import (
     Accident,
@@ -187,14 +186,6 @@ def test_texts() -> None:
     assert repr(alarm) == "Accident(positions=(2, 2) float64, time=1.5, score=1, ids=(3, 7))"
 
 
-def test_interactions_print_the_most_critical_pair() -> None:
-    token = interactions().scenario
-    critical = "1 pair, 3 rows; least TTC of moving pairs 2.16 s: actors 1 and 2 at frame 3"
-    assert repr(interactions()) == f"Interactions({token}: {critical})"
-    standing = interactions_of_tracks(token, tracks_of({1: straight(3, 0, 0, 0)}), 3, InteractionConfig())
-    assert repr(standing) == f"Interactions({token}: 0 pairs, 0 rows)"
-
-
 def test_results_print_their_first_headlines() -> None:
     result = replace(AccidentEvaluator().compute(), samples=1234, apa=0.5, id_error=0.25)
     assert repr(result) == ("AccidentResult(1,234 samples: apa 0.500, accuracy@5 –, accuracy@10 –, accuracy@15 –, …)")
@@ -232,9 +223,3 @@ def test_evaluators_say_how_many_samples_they_have() -> None:
     assert repr(evaluator) == "AccidentEvaluator(0 samples)"
     evaluator.add("a/b/ego_vehicle/001", {})
     assert repr(evaluator) == "AccidentEvaluator(1 sample)"
-
-
-@pytest.mark.parametrize("frame", ["lidar", "Camera_Back"])
-def test_boxes_of_a_release(da: DeepAccident, frame: str) -> None:
-    text = repr(da.boxes(da.sample[0], frame))
-    assert text.startswith(f"Boxes({da.sample[0]['num_annotations']} in {frame}: ")

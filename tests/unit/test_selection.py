@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from tiny import META, NAME, TYPE, label_lines, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
@@ -205,38 +206,39 @@ def test_texts_that_are_no_filter(text: str) -> None:
 
 
 def test_what_is_impossible_is_named_with_what_is_possible(da: DeepAccident) -> None:
-    with pytest.raises(FieldError, match=r"cannot be found by 'wether'; the fields are weather, "):
-        da.find(wether="Clear")
-    with pytest.raises(FieldError, match="cannot be found by 'frame'"):
-        da.find("frame=1")
-    with pytest.raises(ChoiceError, match=r"weather: found 'heavyrain'; possible are HardRain, .*WetCloudy"):
-        da.find(weather="heavyrain")
-    with pytest.raises(ChoiceError, match="town: found '='; possible are Town01"):
-        da.find("town==")
-    with pytest.raises(ChoiceError, match=r"scenario_type: found 'normal'; possible are .*type1_subtype2_normal"):
-        da.find(type="normal")
-    with pytest.raises(
-        ChoiceError, match="accident_visibility: found 'seen'; possible are visible, partial, invisible"
-    ):
-        da.find(accident_visibility="seen")
-    with pytest.raises(ChoiceError, match="collision: expected true, false or unknown, found 'maybe'"):
-        da.find("collision=maybe")
-    with pytest.raises(ChoiceError, match="signalized: expected true, false or unknown, found 1"):
-        da.find(signalized=1)
-    with pytest.raises(ChoiceError, match=r"num_frames: expected a number, a range such as 40..60 .*, found 'long'"):
-        da.find(length="long")
-    with pytest.raises(ChoiceError, match=r"num_frames: expected a number.*, found True"):
-        da.find(length=True)
-    with pytest.raises(ChoiceError, match=r"num_frames: expected a number.*, found 4.5"):
-        da.find(length=4.5)  # type: ignore[arg-type]
-    with pytest.raises(ChoiceError, match=r"accident_type: found 13; possible are 1, 2, .*12"):
-        da.find(accident_type=13)
-    with pytest.raises(ChoiceError, match=r"num_frames: '60..40': 60 is more than 40"):
-        da.find("length=60..40")
-    with pytest.raises(ChoiceError, match="town: '>=3' is a range, which only numbers have"):
-        da.find("town>=3")
-    with pytest.raises(ChoiceError, match="'length>3,4': > takes one number, found 2"):
-        da.find("length>3,4")
+    assert_refused(
+        (lambda: da.find(wether="Clear"), FieldError, r"cannot be found by 'wether'; the fields are weather, "),
+        (lambda: da.find("frame=1"), FieldError, "cannot be found by 'frame'"),
+        (
+            lambda: da.find(weather="heavyrain"),
+            ChoiceError,
+            r"weather: found 'heavyrain'; possible are HardRain, .*WetCloudy",
+        ),
+        (lambda: da.find("town=="), ChoiceError, "town: found '='; possible are Town01"),
+        (
+            lambda: da.find(type="normal"),
+            ChoiceError,
+            r"scenario_type: found 'normal'; possible are .*type1_subtype2_normal",
+        ),
+        (
+            lambda: da.find(accident_visibility="seen"),
+            ChoiceError,
+            "accident_visibility: found 'seen'; possible are visible, partial, invisible",
+        ),
+        (lambda: da.find("collision=maybe"), ChoiceError, "collision: expected true, false or unknown, found 'maybe'"),
+        (lambda: da.find(signalized=1), ChoiceError, "signalized: expected true, false or unknown, found 1"),
+        (
+            lambda: da.find(length="long"),
+            ChoiceError,
+            r"num_frames: expected a number, a range such as 40..60 .*, found 'long'",
+        ),
+        (lambda: da.find(length=True), ChoiceError, r"num_frames: expected a number.*, found True"),
+        (lambda: da.find(length=4.5), ChoiceError, r"num_frames: expected a number.*, found 4.5"),
+        (lambda: da.find(accident_type=13), ChoiceError, r"accident_type: found 13; possible are 1, 2, .*12"),
+        (lambda: da.find("length=60..40"), ChoiceError, r"num_frames: '60..40': 60 is more than 40"),
+        (lambda: da.find("town>=3"), ChoiceError, "town: '>=3' is a range, which only numbers have"),
+        (lambda: da.find("length>3,4"), ChoiceError, "'length>3,4': > takes one number, found 2"),
+    )
 
 
 @pytest.mark.parametrize(

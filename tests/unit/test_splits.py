@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import assert_refused
 from tiny import write_tiny_release
 
 from deepaccident_devkit import DeepAccident
@@ -307,10 +308,10 @@ def test_a_selection_saved_is_a_split(da_b: DeepAccident, tmp_path: Path) -> Non
         save_selection(chosen, path)
     save_selection([], path, overwrite=True)
     assert da_b.split_scenarios(path) == set()
-    with pytest.raises(ConfigError, match=r"name ends in \.txt"):
-        save_selection(chosen, tmp_path / "mine")
-    with pytest.raises(TokenError, match="expected a scenario's token"):
-        save_selection(["Town03"], tmp_path / "other.txt")
+    assert_refused(
+        (lambda: save_selection(chosen, tmp_path / "mine"), ConfigError, r"name ends in \.txt"),
+        (lambda: save_selection(["Town03"], tmp_path / "other.txt"), TokenError, "expected a scenario's token"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -351,8 +352,12 @@ def test_split_files_of_ones_own(da_b: DeepAccident, tmp_path: Path) -> None:
     with pytest.raises(NotAvailableError, match=message):
         da_b.split_scenarios(path)
     assert da_b.split_scenarios(path, missing="skip") == {tokens[2]}
-    with pytest.raises(MissingFileError, match="no such file"):
-        da_b.split_scenarios(tmp_path / "absent.txt")
-    with pytest.raises(ChoiceError, match="missing: expected one of raise, skip, found 'ignore'"):
-        da_b.split_scenarios("train", missing="ignore")  # type: ignore[arg-type]
+    assert_refused(
+        (lambda: da_b.split_scenarios(tmp_path / "absent.txt"), MissingFileError, "no such file"),
+        (
+            lambda: da_b.split_scenarios("train", missing="ignore"),
+            ChoiceError,
+            "missing: expected one of raise, skip, found 'ignore'",
+        ),
+    )
     assert da_b.split_scenarios("train") == da_b.split_scenarios(da_b.dataroot / "train.txt")

@@ -51,13 +51,13 @@ class _Killed(OpenCood):
         raise KeyboardInterrupt
 
 
-def make_healthy(folder: Path, *, weights: bool = HAS_TORCH) -> Path:
+def make_healthy(folder: Path) -> Path:
     """Make one of everything in a new folder; a few seconds. Those in `kept` stay as they are."""
     for name, frames, agents, channels in (
         ("small", 2, AGENTS, ()),
         ("sensors", 1, AGENTS[:1], CHANNELS),
         ("release", 6, AGENTS, ()),
-        *((("cameras", 4, AGENTS, CAMERAS),) if weights else ()),
+        *((("cameras", 4, AGENTS, CAMERAS),) if HAS_TORCH else ()),
     ):
         wanted = SmallRelease(splits=("train",), frames=frames, agents=agents, channels=channels)
         write_small_release(folder / name, wanted)
@@ -84,7 +84,7 @@ def make_healthy(folder: Path, *, weights: bool = HAS_TORCH) -> Path:
         "workers": {},
     }
     (folder / "schedulers" / "scheduler.json").write_text(json.dumps(told), encoding="utf-8")
-    if weights:
+    if HAS_TORCH:
         from campaign.healthy_weights import write_run, write_weight_files
 
         write_weight_files(folder / "weights")

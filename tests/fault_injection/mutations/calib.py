@@ -53,22 +53,19 @@ def _edit_key(place: Place, rng: np.random.Generator, edit: Callable[[np.ndarray
     return f"{agent} {frame}: {key}"
 
 
-@GROUP.kind()
-def calib_cut(place: Place, rng: np.random.Generator) -> str:
-    """A calib file ends at a random byte."""
-    return _replace_file(place, rng, lambda content: cut(content, rng))
-
-
-@GROUP.kind()
-def calib_emptied(place: Place, rng: np.random.Generator) -> str:
-    """A calib file is empty."""
-    return _replace_file(place, rng, lambda _: b"")
-
-
-@GROUP.kind()
-def calib_garbage(place: Place, rng: np.random.Generator) -> str:
-    """A calib file holds random bytes."""
-    return _replace_file(place, rng, lambda content: garbage(rng, len(content)))
+GROUP.add(
+    {
+        "calib_cut": (
+            "A calib file ends at a random byte.",
+            lambda place, rng: _replace_file(place, rng, lambda content: cut(content, rng)),
+        ),
+        "calib_emptied": ("A calib file is empty.", lambda place, rng: _replace_file(place, rng, lambda _: b"")),
+        "calib_garbage": (
+            "A calib file holds random bytes.",
+            lambda place, rng: _replace_file(place, rng, lambda content: garbage(rng, len(content))),
+        ),
+    },
+)
 
 
 @GROUP.kind()

@@ -23,16 +23,18 @@ def _exchange(place: Place, agent: str, frames: list[int], rng: np.random.Genera
     return f"{agent} {frames[0]}..{frames[-1]}: {one} and {other}"
 
 
-@GROUP.kind()
-def extrinsics_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """Two cameras' extrinsics are exchanged in an agent."""
-    return _exchange(place, place.any_agent(rng), place.frames, rng)
-
-
-@GROUP.kind()
-def extrinsics_exchanged_in_a_frame(place: Place, rng: np.random.Generator) -> str:
-    """Two cameras' extrinsics are exchanged in an agent at one frame."""
-    return _exchange(place, place.any_agent(rng), [place.any_frame(rng)], rng)
+GROUP.add(
+    {
+        "extrinsics_exchanged": (
+            "Two cameras' extrinsics are exchanged in an agent.",
+            lambda place, rng: _exchange(place, place.any_agent(rng), place.frames, rng),
+        ),
+        "extrinsics_exchanged_in_a_frame": (
+            "Two cameras' extrinsics are exchanged in an agent at one frame.",
+            lambda place, rng: _exchange(place, place.any_agent(rng), [place.any_frame(rng)], rng),
+        ),
+    },
+)
 
 
 @GROUP.kind()

@@ -21,52 +21,44 @@ def _remove_file(place: Place, agent: str, kind: str, frame: int) -> str:
     return f"{agent} {kind} {frame}"
 
 
-@GROUP.kind()
-def last_frame_removed(place: Place, rng: np.random.Generator) -> str:
-    """The last frame of all agents is missing."""
-    return _remove_frame(place, place.agents, place.frames[-1])
-
-
-@GROUP.kind()
-def first_frame_removed(place: Place, rng: np.random.Generator) -> str:
-    """The first frame of all agents is missing."""
-    return _remove_frame(place, place.agents, place.frames[0])
-
-
-@GROUP.kind()
-def middle_frame_removed(place: Place, rng: np.random.Generator) -> str:
-    """A frame in the middle of the scenario is missing in all agents."""
-    return _remove_frame(place, place.agents, place.middle_frame(rng))
-
-
-@GROUP.kind()
-def middle_frame_of_agent_removed(place: Place, rng: np.random.Generator) -> str:
-    """A frame in the middle of the scenario is missing in one agent."""
-    return _remove_frame(place, (place.any_agent(rng),), place.middle_frame(rng))
-
-
-@GROUP.kind()
-def last_frame_of_agent_removed(place: Place, rng: np.random.Generator) -> str:
-    """The last frame of one agent is missing."""
-    return _remove_frame(place, (place.any_agent(rng),), place.frames[-1])
-
-
-@GROUP.kind()
-def label_removed(place: Place, rng: np.random.Generator) -> str:
-    """A label file is missing."""
-    return _remove_file(place, place.any_agent(rng), "label", place.any_frame(rng))
-
-
-@GROUP.kind()
-def calib_removed(place: Place, rng: np.random.Generator) -> str:
-    """A calib file is missing."""
-    return _remove_file(place, place.any_agent(rng), "calib", place.any_frame(rng))
-
-
-@GROUP.kind()
-def sensor_file_removed(place: Place, rng: np.random.Generator) -> str:
-    """A file of one sensor is missing."""
-    return _remove_file(place, place.any_agent(rng), str(rng.choice(CHANNELS)), place.any_frame(rng))
+GROUP.add(
+    {
+        "last_frame_removed": (
+            "The last frame of all agents is missing.",
+            lambda place, _: _remove_frame(place, place.agents, place.frames[-1]),
+        ),
+        "first_frame_removed": (
+            "The first frame of all agents is missing.",
+            lambda place, _: _remove_frame(place, place.agents, place.frames[0]),
+        ),
+        "middle_frame_removed": (
+            "A frame in the middle of the scenario is missing in all agents.",
+            lambda place, rng: _remove_frame(place, place.agents, place.middle_frame(rng)),
+        ),
+        "middle_frame_of_agent_removed": (
+            "A frame in the middle of the scenario is missing in one agent.",
+            lambda place, rng: _remove_frame(place, (place.any_agent(rng),), place.middle_frame(rng)),
+        ),
+        "last_frame_of_agent_removed": (
+            "The last frame of one agent is missing.",
+            lambda place, rng: _remove_frame(place, (place.any_agent(rng),), place.frames[-1]),
+        ),
+        "label_removed": (
+            "A label file is missing.",
+            lambda place, rng: _remove_file(place, place.any_agent(rng), "label", place.any_frame(rng)),
+        ),
+        "calib_removed": (
+            "A calib file is missing.",
+            lambda place, rng: _remove_file(place, place.any_agent(rng), "calib", place.any_frame(rng)),
+        ),
+        "sensor_file_removed": (
+            "A file of one sensor is missing.",
+            lambda place, rng: _remove_file(
+                place, place.any_agent(rng), str(rng.choice(CHANNELS)), place.any_frame(rng)
+            ),
+        ),
+    },
+)
 
 
 @GROUP.kind()

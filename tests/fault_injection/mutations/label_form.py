@@ -28,22 +28,22 @@ def _replace_file(place: Place, rng: np.random.Generator, change: Callable[[byte
     return f"{agent} {frame}: {len(content)} to {path.stat().st_size} bytes"
 
 
-@GROUP.kind()
-def label_cut(place: Place, rng: np.random.Generator) -> str:
-    """A label file ends at a random byte."""
-    return _replace_file(place, rng, lambda content: cut(content, rng))
-
-
-@GROUP.kind()
-def label_cut_between_lines(place: Place, rng: np.random.Generator) -> str:
-    """A label file ends after one of the box lines; the remaining lines are sound."""
-    return _cut_after(place, rng, letters=0)
-
-
-@GROUP.kind()
-def label_cut_in_a_class(place: Place, rng: np.random.Generator) -> str:
-    """A label file ends within a line's first word; readers skip lines of one word."""
-    return _cut_after(place, rng, letters=2)
+GROUP.add(
+    {
+        "label_cut": (
+            "A label file ends at a random byte.",
+            lambda place, rng: _replace_file(place, rng, lambda content: cut(content, rng)),
+        ),
+        "label_cut_between_lines": (
+            "A label file ends after one of the box lines; the remaining lines are sound.",
+            lambda place, rng: _cut_after(place, rng, letters=0),
+        ),
+        "label_cut_in_a_class": (
+            "A label file ends within a line's first word; readers skip lines of one word.",
+            lambda place, rng: _cut_after(place, rng, letters=2),
+        ),
+    },
+)
 
 
 def _cut_after(place: Place, rng: np.random.Generator, *, letters: int) -> str:
@@ -55,42 +55,35 @@ def _cut_after(place: Place, rng: np.random.Generator, *, letters: int) -> str:
     return _replace_file(place, rng, change)
 
 
-@GROUP.kind()
-def label_emptied(place: Place, rng: np.random.Generator) -> str:
-    """A label file is empty."""
-    return _replace_file(place, rng, lambda _: b"")
-
-
-@GROUP.kind()
-def label_garbage(place: Place, rng: np.random.Generator) -> str:
-    """A label file holds random bytes."""
-    return _replace_file(place, rng, lambda content: garbage(rng, len(content)))
-
-
-@GROUP.kind()
-def label_zeros(place: Place, rng: np.random.Generator) -> str:
-    """A label file's second half is zero bytes, as after a write to a full disk."""
-    return _replace_file(
-        place, rng, lambda content: content[: len(content) // 2] + bytes(len(content) - len(content) // 2)
-    )
-
-
-@GROUP.kind()
-def label_field_dropped(place: Place, rng: np.random.Generator) -> str:
-    """A line lacks a field."""
-    return _edit_a_line(place, rng, lambda row: row.pop(int(rng.integers(len(row)))) and None)
-
-
-@GROUP.kind()
-def label_field_added(place: Place, rng: np.random.Generator) -> str:
-    """A line has one field too many."""
-    return _edit_a_line(place, rng, lambda row: row.insert(int(rng.integers(1, len(row))), "0.5"))
-
-
-@GROUP.kind()
-def label_nan(place: Place, rng: np.random.Generator) -> str:
-    """A position, size or yaw is NaN."""
-    return _edit_a_line(place, rng, lambda row: row.__setitem__(FIELD[str(rng.choice(_NUMBERS))], "nan"))
+GROUP.add(
+    {
+        "label_emptied": ("A label file is empty.", lambda place, rng: _replace_file(place, rng, lambda _: b"")),
+        "label_garbage": (
+            "A label file holds random bytes.",
+            lambda place, rng: _replace_file(place, rng, lambda content: garbage(rng, len(content))),
+        ),
+        "label_zeros": (
+            "A label file's second half is zero bytes, as after a write to a full disk.",
+            lambda place, rng: _replace_file(
+                place, rng, lambda content: content[: len(content) // 2] + bytes(len(content) - len(content) // 2)
+            ),
+        ),
+        "label_field_dropped": (
+            "A line lacks a field.",
+            lambda place, rng: _edit_a_line(place, rng, lambda row: row.pop(int(rng.integers(len(row)))) and None),
+        ),
+        "label_field_added": (
+            "A line has one field too many.",
+            lambda place, rng: _edit_a_line(place, rng, lambda row: row.insert(int(rng.integers(1, len(row))), "0.5")),
+        ),
+        "label_nan": (
+            "A position, size or yaw is NaN.",
+            lambda place, rng: _edit_a_line(
+                place, rng, lambda row: row.__setitem__(FIELD[str(rng.choice(_NUMBERS))], "nan")
+            ),
+        ),
+    },
+)
 
 
 @GROUP.kind()
@@ -111,13 +104,17 @@ def label_number_garbled(place: Place, rng: np.random.Generator) -> str:
     return _edit_a_line(place, rng, garble)
 
 
-@GROUP.kind()
-def label_class_unknown(place: Place, rng: np.random.Generator) -> str:
-    """A line names a class that does not exist."""
-    return _edit_a_line(place, rng, lambda row: row.__setitem__(0, str(rng.choice(["bus", "Car", "0"]))))
-
-
-@GROUP.kind()
-def label_header_removed(place: Place, rng: np.random.Generator) -> str:
-    """A label file lacks its first line."""
-    return _replace_file(place, rng, lambda content: content.split(b"\n", 1)[1])
+GROUP.add(
+    {
+        "label_class_unknown": (
+            "A line names a class that does not exist.",
+            lambda place, rng: _edit_a_line(
+                place, rng, lambda row: row.__setitem__(0, str(rng.choice(["bus", "Car", "0"])))
+            ),
+        ),
+        "label_header_removed": (
+            "A label file lacks its first line.",
+            lambda place, rng: _replace_file(place, rng, lambda content: content.split(b"\n", 1)[1]),
+        ),
+    },
+)

@@ -49,7 +49,9 @@ def _of_actor(place: Place, rng: np.random.Generator, edit: Edit, *, moving: boo
 
 def _of_agent(place: Place, rng: np.random.Generator, edit: Edit) -> str:
     """Edit all boxes of one agent."""
-    return _of_agent(place, rng, edit)
+    agent = place.any_agent(rng)
+    place.edit_rows(agent, place.frames, edit)
+    return agent
 
 
 def _of_all(place: Place, edit: Edit) -> str:
@@ -82,40 +84,31 @@ def y_flipped_in_a_frame(place: Place, rng: np.random.Generator) -> str:
     return f"{agent} {frame}"
 
 
-@GROUP.kind()
-def y_flipped(place: Place, rng: np.random.Generator) -> str:
-    """All y of an agent have the other sign."""
-    return _of_agent(place, rng, _scale("y"))
-
-
-@GROUP.kind()
-def yaw_flipped(place: Place, rng: np.random.Generator) -> str:
-    """All yaws of an agent have the other sign."""
-    return _of_agent(place, rng, _scale("yaw"))
-
-
-@GROUP.kind()
-def labels_right_handed(place: Place, rng: np.random.Generator) -> str:
-    """An agent's labels are right-handed: y, yaw and vy have the other sign."""
-    return _of_agent(place, rng, _scale("y", "yaw", "vy"))
-
-
-@GROUP.kind()
-def all_labels_right_handed(place: Place, rng: np.random.Generator) -> str:
-    """All agents' labels are right-handed, but the poses are not."""
-    return _of_all(place, _scale("y", "yaw", "vy"))
-
-
-@GROUP.kind()
-def yaw_in_degrees(place: Place, rng: np.random.Generator) -> str:
-    """An agent's yaws are degrees."""
-    return _of_agent(place, rng, _scale("yaw", by=180 / np.pi))
-
-
-@GROUP.kind()
-def yaw_turned(place: Place, rng: np.random.Generator) -> str:
-    """A box is turned by 90° at one frame."""
-    return _of_box(place, rng, _add(["yaw"], [np.pi / 2]))
+GROUP.add(
+    {
+        "y_flipped": ("All y of an agent have the other sign.", lambda place, rng: _of_agent(place, rng, _scale("y"))),
+        "yaw_flipped": (
+            "All yaws of an agent have the other sign.",
+            lambda place, rng: _of_agent(place, rng, _scale("yaw")),
+        ),
+        "labels_right_handed": (
+            "An agent's labels are right-handed: y, yaw and vy have the other sign.",
+            lambda place, rng: _of_agent(place, rng, _scale("y", "yaw", "vy")),
+        ),
+        "all_labels_right_handed": (
+            "All agents' labels are right-handed, but the poses are not.",
+            lambda place, _: _of_all(place, _scale("y", "yaw", "vy")),
+        ),
+        "yaw_in_degrees": (
+            "An agent's yaws are degrees.",
+            lambda place, rng: _of_agent(place, rng, _scale("yaw", by=180 / np.pi)),
+        ),
+        "yaw_turned": (
+            "A box is turned by 90° at one frame.",
+            lambda place, rng: _of_box(place, rng, _add(["yaw"], [np.pi / 2])),
+        ),
+    },
+)
 
 
 @GROUP.kind()
@@ -153,16 +146,18 @@ def _shared_vehicle(place: Place, rng: np.random.Generator) -> tuple[str, int]:
             return agent, actor
 
 
-@GROUP.kind()
-def size_scaled(place: Place, rng: np.random.Generator) -> str:
-    """An actor is a quarter larger in one agent."""
-    return _of_actor(place, rng, _scale("l", "w", "h", by=1.25))
-
-
-@GROUP.kind()
-def size_halved_in_a_frame(place: Place, rng: np.random.Generator) -> str:
-    """A box has half its size (as if the file had half lengths) at one frame."""
-    return _of_box(place, rng, _scale("l", "w", "h", by=0.5))
+GROUP.add(
+    {
+        "size_scaled": (
+            "An actor is a quarter larger in one agent.",
+            lambda place, rng: _of_actor(place, rng, _scale("l", "w", "h", by=1.25)),
+        ),
+        "size_halved_in_a_frame": (
+            "A box has half its size (as if the file had half lengths) at one frame.",
+            lambda place, rng: _of_box(place, rng, _scale("l", "w", "h", by=0.5)),
+        ),
+    },
+)
 
 
 @GROUP.kind(deep=True)

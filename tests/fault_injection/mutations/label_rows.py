@@ -74,16 +74,18 @@ def boxes_removed(place: Place, rng: np.random.Generator) -> str:
     return f"{agent} {frame}"
 
 
-@GROUP.kind()
-def ids_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """Two moving actors' ids are exchanged in one agent, at all frames."""
-    return _exchange_ids(place, rng, place.frames)
-
-
-@GROUP.kind()
-def ids_exchanged_in_a_frame(place: Place, rng: np.random.Generator) -> str:
-    """Two moving actors' ids are exchanged in one agent, at one frame."""
-    return _exchange_ids(place, rng, [place.any_frame(rng)])
+GROUP.add(
+    {
+        "ids_exchanged": (
+            "Two moving actors' ids are exchanged in one agent, at all frames.",
+            lambda place, rng: _exchange_ids(place, rng, place.frames),
+        ),
+        "ids_exchanged_in_a_frame": (
+            "Two moving actors' ids are exchanged in one agent, at one frame.",
+            lambda place, rng: _exchange_ids(place, rng, [place.any_frame(rng)]),
+        ),
+    },
+)
 
 
 def _exchange_ids(place: Place, rng: np.random.Generator, frames: list[int]) -> str:
@@ -145,16 +147,18 @@ def id_lost(place: Place, rng: np.random.Generator) -> str:
     return f"{agent} {frame}: {actor} is -1"
 
 
-@GROUP.kind()
-def ids_lost(place: Place, rng: np.random.Generator) -> str:
-    """All other actors are untracked (−1) in one agent's labels."""
-    return _lose_ids(place, place.any_agent(rng), list(place.frames))
-
-
-@GROUP.kind()
-def ids_lost_at_one_frame(place: Place, rng: np.random.Generator) -> str:
-    """All other actors are untracked (−1) in one label."""
-    return _lose_ids(place, place.any_agent(rng), [place.middle_frame(rng)])
+GROUP.add(
+    {
+        "ids_lost": (
+            "All other actors are untracked (−1) in one agent's labels.",
+            lambda place, rng: _lose_ids(place, place.any_agent(rng), list(place.frames)),
+        ),
+        "ids_lost_at_one_frame": (
+            "All other actors are untracked (−1) in one label.",
+            lambda place, rng: _lose_ids(place, place.any_agent(rng), [place.middle_frame(rng)]),
+        ),
+    },
+)
 
 
 def _lose_ids(place: Place, agent: str, frames: list[int]) -> str:

@@ -113,16 +113,16 @@ def meta_class_changed(place: Place, rng: np.random.Generator) -> str:
     return _set_word(place, number, str(rng.choice(sorted(others))))
 
 
-@GROUP.kind(only="accident")
-def meta_class_unknown(place: Place, rng: np.random.Generator) -> str:
-    """A colliding actor's class does not exist."""
-    return _set_word(place, int(rng.choice([2, 4])), "bus")
-
-
-@GROUP.kind(only="accident")
-def meta_impact_nan(place: Place, rng: np.random.Generator) -> str:
-    """The impact is NaN."""
-    return _set_word(place, 5, "nan")
+GROUP.add(
+    {
+        "meta_class_unknown": (
+            "A colliding actor's class does not exist.",
+            lambda place, rng: _set_word(place, int(rng.choice([2, 4])), "bus"),
+        ),
+        "meta_impact_nan": ("The impact is NaN.", lambda place, _: _set_word(place, 5, "nan")),
+    },
+    only="accident",
+)
 
 
 @GROUP.kind(only="accident", harmless="a scenario in an accident folder can have no collision (docs/format.md, Meta)")
@@ -160,16 +160,20 @@ def meta_agent_id_changed(place: Place, rng: np.random.Generator) -> str:
     return _set_entry(place, "agents id", " ".join(map(str, ids)))
 
 
-@GROUP.kind()
-def meta_road_type(place: Place, rng: np.random.Generator) -> str:
-    """The road type does not exist."""
-    return _set_entry(place, "road_type", str(rng.choice(["five-way junction", "unknown", "four-way"])))
-
-
-@GROUP.kind()
-def meta_weather(place: Place, rng: np.random.Generator) -> str:
-    """The weather and time of day do not exist."""
-    return _set_word(place, 0, str(rng.choice(["SnowNoon", "Rainy", "ClearMidnight", "wetnoon"])))
+GROUP.add(
+    {
+        "meta_road_type": (
+            "The road type does not exist.",
+            lambda place, rng: _set_entry(
+                place, "road_type", str(rng.choice(["five-way junction", "unknown", "four-way"]))
+            ),
+        ),
+        "meta_weather": (
+            "The weather and time of day do not exist.",
+            lambda place, rng: _set_word(place, 0, str(rng.choice(["SnowNoon", "Rainy", "ClearMidnight", "wetnoon"]))),
+        ),
+    },
+)
 
 
 @GROUP.kind()

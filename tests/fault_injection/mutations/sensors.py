@@ -121,16 +121,20 @@ def image_zeros(place: Place, rng: np.random.Generator) -> str:
     return _replace_file(place, rng, _camera(rng), change)
 
 
-@IMAGES.kind()
-def image_garbage(place: Place, rng: np.random.Generator) -> str:
-    """An image file holds random bytes."""
-    return _replace_file(place, rng, _camera(rng), lambda content: garbage(rng, len(content)))
-
-
-@IMAGES.kind()
-def image_size(place: Place, rng: np.random.Generator) -> str:
-    """An image has half the size of the others."""
-    return _replace_file(place, rng, _camera(rng), lambda content: _jpeg(_pixels(content)[::2, ::2]))
+IMAGES.add(
+    {
+        "image_garbage": (
+            "An image file holds random bytes.",
+            lambda place, rng: _replace_file(place, rng, _camera(rng), lambda content: garbage(rng, len(content))),
+        ),
+        "image_size": (
+            "An image has half the size of the others.",
+            lambda place, rng: _replace_file(
+                place, rng, _camera(rng), lambda content: _jpeg(_pixels(content)[::2, ::2])
+            ),
+        ),
+    },
+)
 
 
 @IMAGES.kind(beyond=_WALL)
@@ -148,16 +152,18 @@ def image_of_camera(place: Place, rng: np.random.Generator) -> str:
     return f"{agent} {frame}: {one} is {other}"
 
 
-@IMAGES.kind()
-def image_of_agent(place: Place, rng: np.random.Generator) -> str:
-    """An image is another agent's of the same camera and frame."""
-    return _of_agent(place, rng, _camera(rng))
-
-
-@IMAGES.kind()
-def image_of_frame(place: Place, rng: np.random.Generator) -> str:
-    """An image is that of another frame of the same, moving, camera."""
-    return _of_frame(place, rng, _camera(rng))
+IMAGES.add(
+    {
+        "image_of_agent": (
+            "An image is another agent's of the same camera and frame.",
+            lambda place, rng: _of_agent(place, rng, _camera(rng)),
+        ),
+        "image_of_frame": (
+            "An image is that of another frame of the same, moving, camera.",
+            lambda place, rng: _of_frame(place, rng, _camera(rng)),
+        ),
+    },
+)
 
 
 @IMAGES.kind(beyond=_LOOK)
@@ -192,34 +198,39 @@ def images_of_two_cameras_exchanged(place: Place, rng: np.random.Generator) -> s
     return f"{agent}: {one} and {other}"
 
 
-@IMAGES.kind(beyond=_LOOK)
-def images_of_two_agents_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """All images of one camera of two agents are exchanged."""
-    return _exchange_agents(place, rng, _camera(rng))
+IMAGES.add(
+    {
+        "images_of_two_agents_exchanged": (
+            "All images of one camera of two agents are exchanged.",
+            lambda place, rng: _exchange_agents(place, rng, _camera(rng)),
+        ),
+        "image_mirrored": (
+            "An image is mirrored.",
+            lambda place, rng: _replace_file(
+                place, rng, _camera(rng), lambda content: _jpeg(_pixels(content)[:, ::-1])
+            ),
+        ),
+    },
+    beyond=_LOOK,
+)
 
 
-@IMAGES.kind(beyond=_LOOK)
-def image_mirrored(place: Place, rng: np.random.Generator) -> str:
-    """An image is mirrored."""
-    return _replace_file(place, rng, _camera(rng), lambda content: _jpeg(_pixels(content)[:, ::-1]))
-
-
-@LIDARS.kind()
-def lidar_cut(place: Place, rng: np.random.Generator) -> str:
-    """A point cloud's file ends at a random byte."""
-    return _replace_file(place, rng, LIDAR, lambda content: cut(content, rng))
-
-
-@LIDARS.kind()
-def lidar_with_more_bytes(place: Place, rng: np.random.Generator) -> str:
-    """Bytes follow the end of a point cloud's file."""
-    return _replace_file(place, rng, LIDAR, lambda content: content + garbage(rng, 100))
-
-
-@LIDARS.kind()
-def lidar_emptied(place: Place, rng: np.random.Generator) -> str:
-    """A point cloud's file is empty."""
-    return _replace_file(place, rng, LIDAR, lambda _: b"")
+LIDARS.add(
+    {
+        "lidar_cut": (
+            "A point cloud's file ends at a random byte.",
+            lambda place, rng: _replace_file(place, rng, LIDAR, lambda content: cut(content, rng)),
+        ),
+        "lidar_with_more_bytes": (
+            "Bytes follow the end of a point cloud's file.",
+            lambda place, rng: _replace_file(place, rng, LIDAR, lambda content: content + garbage(rng, 100)),
+        ),
+        "lidar_emptied": (
+            "A point cloud's file is empty.",
+            lambda place, rng: _replace_file(place, rng, LIDAR, lambda _: b""),
+        ),
+    },
+)
 
 
 @LIDARS.kind()
@@ -251,28 +262,26 @@ def lidar_nan(place: Place, rng: np.random.Generator) -> str:
     return _replace_array(place, rng, LIDAR, change)
 
 
-@LIDARS.kind()
-def lidar_without_points(place: Place, rng: np.random.Generator) -> str:
-    """A cloud has no points."""
-    return _replace_array(place, rng, LIDAR, lambda points: points[:0])
-
-
-@LIDARS.kind()
-def lidar_halved(place: Place, rng: np.random.Generator) -> str:
-    """Half of a cloud's points are missing."""
-    return _replace_array(place, rng, LIDAR, lambda points: points[: len(points) // 2])
-
-
-@LIDARS.kind()
-def lidar_of_agent(place: Place, rng: np.random.Generator) -> str:
-    """A point cloud is another agent's of the same frame."""
-    return _of_agent(place, rng, LIDAR)
-
-
-@LIDARS.kind()
-def lidar_of_frame(place: Place, rng: np.random.Generator) -> str:
-    """A moving agent's point cloud is that of another frame."""
-    return _of_frame(place, rng, LIDAR)
+LIDARS.add(
+    {
+        "lidar_without_points": (
+            "A cloud has no points.",
+            lambda place, rng: _replace_array(place, rng, LIDAR, lambda points: points[:0]),
+        ),
+        "lidar_halved": (
+            "Half of a cloud's points are missing.",
+            lambda place, rng: _replace_array(place, rng, LIDAR, lambda points: points[: len(points) // 2]),
+        ),
+        "lidar_of_agent": (
+            "A point cloud is another agent's of the same frame.",
+            lambda place, rng: _of_agent(place, rng, LIDAR),
+        ),
+        "lidar_of_frame": (
+            "A moving agent's point cloud is that of another frame.",
+            lambda place, rng: _of_frame(place, rng, LIDAR),
+        ),
+    },
+)
 
 
 @LIDARS.kind()
@@ -284,58 +293,56 @@ def lidars_shifted(place: Place, rng: np.random.Generator) -> str:
     return agent
 
 
-@LIDARS.kind()
-def lidars_of_two_frames_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """Two point clouds of a moving agent are exchanged."""
-    return _exchange_frames(place, rng, LIDAR)
+LIDARS.add(
+    {
+        "lidars_of_two_frames_exchanged": (
+            "Two point clouds of a moving agent are exchanged.",
+            lambda place, rng: _exchange_frames(place, rng, LIDAR),
+        ),
+        "lidars_of_two_agents_exchanged": (
+            "All point clouds of two agents are exchanged.",
+            lambda place, rng: _exchange_agents(place, rng, LIDAR),
+        ),
+        "lidar_y_flipped": (
+            "A cloud's y has the other sign.",
+            lambda place, rng: _replace_array(place, rng, LIDAR, lambda points: points * np.float32([1, -1, 1, 1])),
+        ),
+        "lidar_scaled": (
+            "A cloud is 10 % too large.",
+            lambda place, rng: _replace_array(
+                place, rng, LIDAR, lambda points: points * np.float32([1.1, 1.1, 1.1, 1])
+            ),
+        ),
+        "lidar_turned": (
+            "A cloud is turned by 90°.",
+            lambda place, rng: _replace_array(
+                place, rng, LIDAR, lambda points: points[:, [1, 0, 2, 3]] * np.float32([-1, 1, 1, 1])
+            ),
+        ),
+    },
+)
 
 
-@LIDARS.kind()
-def lidars_of_two_agents_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """All point clouds of two agents are exchanged."""
-    return _exchange_agents(place, rng, LIDAR)
-
-
-@LIDARS.kind()
-def lidar_y_flipped(place: Place, rng: np.random.Generator) -> str:
-    """A cloud's y has the other sign."""
-    return _replace_array(place, rng, LIDAR, lambda points: points * np.float32([1, -1, 1, 1]))
-
-
-@LIDARS.kind()
-def lidar_scaled(place: Place, rng: np.random.Generator) -> str:
-    """A cloud is 10 % too large."""
-    return _replace_array(place, rng, LIDAR, lambda points: points * np.float32([1.1, 1.1, 1.1, 1]))
-
-
-@LIDARS.kind()
-def lidar_turned(place: Place, rng: np.random.Generator) -> str:
-    """A cloud is turned by 90°."""
-    return _replace_array(place, rng, LIDAR, lambda points: points[:, [1, 0, 2, 3]] * np.float32([-1, 1, 1, 1]))
-
-
-@BEVS.kind()
-def bev_cut(place: Place, rng: np.random.Generator) -> str:
-    """A BEV file ends at a random byte."""
-    return _replace_file(place, rng, BEV_CAMERA, lambda content: cut(content, rng))
-
-
-@BEVS.kind()
-def bev_wrong_shape(place: Place, rng: np.random.Generator) -> str:
-    """A BEV array has half the rows."""
-    return _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[::2])
-
-
-@BEVS.kind()
-def bev_channels_reversed(place: Place, rng: np.random.Generator) -> str:
-    """A BEV array's channels are in the reverse order."""
-    return _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[..., ::-1])
-
-
-@BEVS.kind()
-def bev_flipped(place: Place, rng: np.random.Generator) -> str:
-    """A BEV array is flipped left to right."""
-    return _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[:, ::-1])
+BEVS.add(
+    {
+        "bev_cut": (
+            "A BEV file ends at a random byte.",
+            lambda place, rng: _replace_file(place, rng, BEV_CAMERA, lambda content: cut(content, rng)),
+        ),
+        "bev_wrong_shape": (
+            "A BEV array has half the rows.",
+            lambda place, rng: _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[::2]),
+        ),
+        "bev_channels_reversed": (
+            "A BEV array's channels are in the reverse order.",
+            lambda place, rng: _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[..., ::-1]),
+        ),
+        "bev_flipped": (
+            "A BEV array is flipped left to right.",
+            lambda place, rng: _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[:, ::-1]),
+        ),
+    },
+)
 
 
 @BEVS.kind()
@@ -354,27 +361,25 @@ def bevs_flipped(place: Place, rng: np.random.Generator) -> str:
     return agent
 
 
-@BEVS.kind()
-def bev_zoomed(place: Place, rng: np.random.Generator) -> str:
-    """A BEV array shows 30 m instead of 60 m to each side."""
-    return _replace_array(
-        place, rng, BEV_CAMERA, lambda picture: picture[300:900, 300:900].repeat(2, axis=0).repeat(2, axis=1)
-    )
-
-
-@BEVS.kind()
-def bev_of_agent(place: Place, rng: np.random.Generator) -> str:
-    """A BEV array is another agent's of the same frame."""
-    return _of_agent(place, rng, BEV_CAMERA)
-
-
-@BEVS.kind()
-def bev_of_frame(place: Place, rng: np.random.Generator) -> str:
-    """A moving agent's BEV array is that of another frame."""
-    return _of_frame(place, rng, BEV_CAMERA)
-
-
-@BEVS.kind()
-def bevs_of_two_agents_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """All BEV arrays of two agents are exchanged."""
-    return _exchange_agents(place, rng, BEV_CAMERA)
+BEVS.add(
+    {
+        "bev_zoomed": (
+            "A BEV array shows 30 m instead of 60 m to each side.",
+            lambda place, rng: _replace_array(
+                place, rng, BEV_CAMERA, lambda picture: picture[300:900, 300:900].repeat(2, axis=0).repeat(2, axis=1)
+            ),
+        ),
+        "bev_of_agent": (
+            "A BEV array is another agent's of the same frame.",
+            lambda place, rng: _of_agent(place, rng, BEV_CAMERA),
+        ),
+        "bev_of_frame": (
+            "A moving agent's BEV array is that of another frame.",
+            lambda place, rng: _of_frame(place, rng, BEV_CAMERA),
+        ),
+        "bevs_of_two_agents_exchanged": (
+            "All BEV arrays of two agents are exchanged.",
+            lambda place, rng: _exchange_agents(place, rng, BEV_CAMERA),
+        ),
+    },
+)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
@@ -52,10 +53,18 @@ def test_half_precision_features_are_sampled_at_the_same_places() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(GeometryError, match=r"features: expected \(N, C, 30, 18\), found \(1, 1, 18, 30\)"):
-        crop(torch.zeros(1, 1, 18, 30), SOURCE, BevGrid())
-    with pytest.raises(GeometryError, match=r"source's orientation, 'devkit', found 'released'"):
-        crop(torch.zeros(1, 1, 30, 18), SOURCE, BevGrid(orientation="released"))
+    assert_refused(
+        (
+            lambda: crop(torch.zeros(1, 1, 18, 30), SOURCE, BevGrid()),
+            GeometryError,
+            r"features: expected \(N, C, 30, 18\), found \(1, 1, 18, 30\)",
+        ),
+        (
+            lambda: crop(torch.zeros(1, 1, 30, 18), SOURCE, BevGrid(orientation="released")),
+            GeometryError,
+            r"source's orientation, 'devkit', found 'released'",
+        ),
+    )
 
 
 @pytest.mark.parametrize(("encoder", "shape"), ENCODERS)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import assert_refused
 from strategies import ANGLES, arrays, rotation_matrix
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
@@ -230,7 +231,11 @@ def test_a_wrong_configuration_is_named(change, message):
 
 def test_features_of_another_shape_are_named():
     lift = lift_of(CONFIG)
-    with pytest.raises(GeometryError, match=r"features: expected \(…, 3, 5\)"):
-        lift(noise(2, 2, 3, 5, 5, 3), rig())
-    with pytest.raises(GeometryError, match=r"cameras: expected cells \(2, 2, 3, 8, 3, 5\)"):
-        lift(noise(2, 2, 3, 5, 3, 5), rig(shape=(2, 2, 2)))
+    assert_refused(
+        (lambda: lift(noise(2, 2, 3, 5, 5, 3), rig()), GeometryError, r"features: expected \(…, 3, 5\)"),
+        (
+            lambda: lift(noise(2, 2, 3, 5, 3, 5), rig(shape=(2, 2, 2))),
+            GeometryError,
+            r"cameras: expected cells \(2, 2, 3, 8, 3, 5\)",
+        ),
+    )

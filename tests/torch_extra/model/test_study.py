@@ -4,7 +4,6 @@ import importlib
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -96,60 +95,11 @@ def test_hidden_actors_are_those_that_a_partner_alone_sees(numbers: ModuleType, 
     assert seen
 
 
-def number(value: float | None = 1.5, low: float | None = None, high: float | None = None) -> dict[str, Any]:
-    return {"value": value, "low": low, "high": high}
-
-
 @pytest.fixture
-def summary(scripts: dict[str, ModuleType]) -> dict[str, Any]:
-    """A summary of the real protocol with numbers made up."""
-    protocol, paths = scripts["model_study_protocol"], scripts["model_study_numbers"].PATHS
-    some = {name: number() for name in paths}
-    rows = {
-        row.name: {
-            "says": row.says,
-            "numbers": some,
-            "seeds": dict.fromkeys(("1",) if row.first_seed_alone else ("1", "2", "3"), some) if row.arm else {},
-            "designs": {"seen": some, "held out": some},
-        }
-        for row in protocol.rows_of(protocol.PROTOCOL)
-    }
-    differences = [
-        {"first": one, "second": other, "numbers": dict(some), "seeds": dict.fromkeys(("1", "2", "3"), some)}
-        for one, other in protocol.COMPARED
-    ]
-    scores = {"iou": 0.1, "vpq": 0.1, "map": 0.0, "score": 0.1, "loss": 9.0}
-    return {
-        "protocol": asdict(protocol.PROTOCOL),
-        "smoke": False,
-        "samples": 144,
-        "pairs": 18,
-        "positives": 72,
-        "actors": {"hidden": 400, "seen": 1500},
-        "headline_number": "iou_100",
-        "rows": rows,
-        "differences": differences,
-        "releases": {name: {"scenarios": 2, "fingerprint": "abc"} for name in ("training", "tuning", "test")},
-        "tuning": {"rounds": [{"0.001": scores, "0.002": scores}], "learning_rate": 0.002},
-        "training": {},
-        "costs": {"mean": 1.5, "cobevt": 6.0},
-        "weights": {
-            "agents": "all",
-            "synth": {"scenarios": 2, "seed": 104},
-            "scores": {"iou": 0.1, "vpq": 0.1, "map": 0.0, "score": 0.1},
-            "bytes": 1_000_000,
-        },
-        "seconds": {"releases": 600.0, "training": 6000.0},
-        "machine": {
-            "processor": "a processor",
-            "cores": 2,
-            "processes": 2,
-            "gpu": None,
-            "python": "3.11",
-            "torch": "2.3",
-            "devkit": "0.1",
-        },
-    }
+def summary(page: ModuleType) -> dict[str, Any]:
+    """That of the experiment, a copy."""
+    told: dict[str, Any] = json.loads(page.SUMMARY.read_text(encoding="utf-8"))
+    return told
 
 
 @pytest.mark.parametrize(
@@ -168,37 +118,19 @@ def summary(scripts: dict[str, ModuleType]) -> dict[str, Any]:
 def test_the_headline_follows_from_the_interval(
     page: ModuleType, summary: dict[str, Any], ends: tuple[Any, Any], verdict: str, told: str
 ) -> None:
-    found = number(-1.5 if verdict == "less" else 1.5, *ends)
+    found = {"value": -1.5 if verdict == "less" else 1.5, "low": ends[0], "high": ends[1]}
     summary["differences"][0]["numbers"]["iou_100"] = found
     assert page.verdict(found) == verdict
     assert told in page.headline_text(summary)
     assert told.partition(":")[0] in page.page(summary).replace("\n", " ")
 
 
-def test_the_page_has_all_rows_and_no_gap(page: ModuleType, summary: dict[str, Any], tmp_path: Path) -> None:
-    text = page.page(summary)
-    for row in summary["rows"]:
-        assert f"`{row}`" in text
-    for gap in ("None", "nan", "{", "READING_TIME"):
-        assert gap not in text
-    assert max(len(line) for line in text.splitlines() if not line.startswith("|")) <= 120
-    text = text.replace("\n", " ")
-    assert "clean, 1 m" in text
-    assert "nothing was measured on one" in text
-    summary["machine"]["gpu"] = "NVIDIA X"
-    assert "The models ran on NVIDIA X." in page.page(summary).replace("\n", " ")
-
-
-def test_what_is_committed_agrees(page: ModuleType, scripts: dict[str, ModuleType]) -> None:
-    """The page, the summary and the counts, once the experiment was run; before, there is no page."""
-    if not page.SUMMARY.exists():
-        assert not page.PAGE.exists()
-        return
-    told = json.loads(page.SUMMARY.read_text(encoding="utf-8"))
-    assert page.PAGE.read_text(encoding="utf-8") == page.page(told)
+def test_what_is_committed_agrees(page: ModuleType, summary: dict[str, Any], scripts: dict[str, ModuleType]) -> None:
+    """The page, the summary and the counts."""
+    assert page.PAGE.read_text(encoding="utf-8") == page.page(summary)
     study = scripts["model_study"]
     again = study.summarised(scripts["model_study_rows"].read_counts(DOCS / study.COUNTS), study.PROTOCOL)
-    same_numbers(again["rows"], told["rows"])
+    same_numbers(again["rows"], summary["rows"])
 
 
 def same_numbers(again: dict[str, Any], told: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
@@ -105,16 +106,16 @@ def test_blocks_fill_up_to_the_first_invalid_frame_only() -> None:
     assert not torch.allclose(model(features, egomotion, valid), result)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_autocast_changes_digits_only(kind: str) -> None:
-    model = model_of(kind)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        rounded = model(*batch())
-    torch.testing.assert_close(rounded.float(), model(*batch()), atol=0.1, rtol=0.1)
-
-
 def test_wrong_configs_say_so() -> None:
-    with pytest.raises(ConfigError, match="at least 1 channel and 1 frame, found 6 and 0"):
-        TemporalConfig(channels=6, grid=GRID, frames=0)
-    with pytest.raises(ConfigError, match="chain: expected one of released, exact, found 'reverse'"):
-        TemporalConfig(channels=6, grid=GRID, chain="reverse")
+    assert_refused(
+        (
+            lambda: TemporalConfig(channels=6, grid=GRID, frames=0),
+            ConfigError,
+            "at least 1 channel and 1 frame, found 6 and 0",
+        ),
+        (
+            lambda: TemporalConfig(channels=6, grid=GRID, chain="reverse"),
+            ConfigError,
+            "chain: expected one of released, exact, found 'reverse'",
+        ),
+    )

@@ -18,6 +18,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import assert_refused
 from safetensors.torch import load_file
 from torch_extra.model import small_model
 from torch_extra.model.small_model import RUN, small, small_released, trained
@@ -333,10 +334,14 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
 
 def test_other_options_in_the_same_folder_are_refused(da: DeepAccident, whole: Path, tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in whole.iterdir()}
-    with pytest.raises(ConfigError, match=r"run\.json: is of another run, its training differ; give the same options"):
-        trained(da, whole, replace(RUN, seed=1))
-    with pytest.raises(ConfigError, match=r"its from differ"):
-        trained(da, whole, weights=whole / BEST)
+    assert_refused(
+        (
+            lambda: trained(da, whole, replace(RUN, seed=1)),
+            ConfigError,
+            r"run\.json: is of another run, its training differ; give the same options",
+        ),
+        (lambda: trained(da, whole, weights=whole / BEST), ConfigError, r"its from differ"),
+    )
     assert {path.name: path.read_bytes() for path in whole.iterdir()} == before
     for content, said in (("[]", "is of another run"), ('{"preset": ', "cannot be read")):
         (tmp_path / "run.json").write_text(content)
@@ -546,7 +551,11 @@ def test_an_unknown_device_is_refused() -> None:
 
 
 def test_a_release_that_cannot_be_learned_from_is_refused(da: DeepAccident, tmp_path: Path) -> None:
-    with pytest.raises(NotAvailableError, match="test: no scenario of this split"):
-        trained(da, tmp_path / "a", replace(SHORT, split="test"))
-    with pytest.raises(ChoiceError, match="split"):
-        trained(da, tmp_path / "b", replace(SHORT, split="exam"))
+    assert_refused(
+        (
+            lambda: trained(da, tmp_path / "a", replace(SHORT, split="test")),
+            NotAvailableError,
+            "test: no scenario of this split",
+        ),
+        (lambda: trained(da, tmp_path / "b", replace(SHORT, split="exam")), ChoiceError, "split"),
+    )

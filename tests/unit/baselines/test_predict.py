@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import (
@@ -173,8 +174,16 @@ def test_a_task_or_horizon_that_is_none_is_refused(
     da_hidden: DeepAccident, tokens: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     out = tmp_path_factory.mktemp("results") / "out"
-    with pytest.raises(ChoiceError, match="task: expected one of motion, accident, detection, found 'warning'"):
-        predict_results(da_hidden, "warning", tokens, out)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=r"horizon: 0.7 s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …"):
-        predict_results(da_hidden, "motion", tokens, out, Baseline(horizon=0.7))
+    assert_refused(
+        (
+            lambda: predict_results(da_hidden, "warning", tokens, out),
+            ChoiceError,
+            "task: expected one of motion, accident, detection, found 'warning'",
+        ),
+        (
+            lambda: predict_results(da_hidden, "motion", tokens, out, Baseline(horizon=0.7)),
+            ConfigError,
+            r"horizon: 0.7 s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …",
+        ),
+    )
     assert not out.exists()

@@ -4,12 +4,10 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from http.client import IncompleteRead
 from typing import Any
-from urllib.parse import urljoin, urlsplit
+from urllib.parse import urlsplit
 
 import pytest
 from asking import Answer, TinyApp, ask, cookie_of
-from hypothesis import example, given
-from hypothesis import strategies as st
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.explore.access import HEADERS, Access, App, Gate, HostPort, Message, RootPath
@@ -108,33 +106,6 @@ def test_a_wrong_token_is_refused_even_with_a_cookie(served: Served, query: str)
 def test_the_address_without_the_token_is_relative(served: Served, target: str, location: str, name: str) -> None:
     answer = ask(served.port, target.format(f"{name}={served.token}"))
     assert (answer.status, answer.headers["location"]) == (303, location)
-
-
-_characters = st.sampled_from([*"az09-._~!$&'()*+,;=:@", "%2F", "%3F", "%C3%A9", "%"])
-_segments = st.lists(_characters, min_size=1, max_size=5).map("".join).filter(lambda text: text not in (".", ".."))
-_parts = st.lists(st.lists(st.sampled_from([*"az=:/?+;", "%26", "token"]), max_size=5).map("".join), max_size=4)
-
-
-@given(st.lists(_segments, max_size=4), st.sampled_from(["", "/"]), _parts, st.integers(0, 4))
-@example(["a"], "", [], 0)
-def test_the_relative_address_is_the_same_without_the_token(
-    segments: list[str], end: str, parts: list[str], place: int
-) -> None:
-    parts = [part for part in parts if part.partition("=")[0] != "token"]
-    path = "/" + "/".join(segments) + (end if segments else "")
-    with_token = "&".join([*parts[:place], "token=right", *parts[place:]])
-    sent = passed(
-        TinyApp(),
-        Access(port=1, token="right"),  # noqa: S106
-        raw_path=path.encode(),
-        query_string=with_token.encode(),
-        headers=[(b"host", b"localhost")],
-    )
-    assert sent[0]["status"] == 303
-    location = dict(sent[0]["headers"])[b"location"].decode()
-    query = "&".join(parts)
-    origin = "http://localhost:9000/user/me"
-    assert urljoin(f"{origin}{path}?{with_token}", location) == f"{origin}{path}" + (f"?{query}" if query else "")
 
 
 def test_a_cookie_opens_the_pages(served: Served) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.explore.background import Jobs
-from deepaccident_devkit.explore.choices import PAGE, Choices, found_by
+from deepaccident_devkit.explore.choices import Choices, found_by
 from deepaccident_devkit.explore.scenarios import Scenarios
 from deepaccident_devkit.selection.fields import FIELDS
 
@@ -187,7 +187,3 @@ def test_the_code_finds_the_same(da: DeepAccident, scenarios: Scenarios, tmp_pat
     done = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     assert done.exit_code == 0
     assert (tmp_path / "selection.txt").read_text().split("\n")[:-1] == [each.replace("/", " ") for each in wanted]
-
-
-def test_a_page_has_so_many() -> None:
-    assert PAGE % 2 == PAGE % 3 == PAGE % 4 == 0  # the last row of a grid is full

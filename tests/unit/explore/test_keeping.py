@@ -13,13 +13,6 @@ from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release.store import cache
 
 
-def test_a_value_is_made_once() -> None:
-    kept, made = Kept[int](10), []
-    for _ in range(3):
-        assert kept.get("a", lambda: made.append(1) or len(made)) == 1
-    assert made == [1]
-
-
 def test_several_threads_make_it_once() -> None:
     kept, made, go = Kept[int](10), [], threading.Event()
 

@@ -184,12 +184,6 @@ def main_number(run: EvaluationRun, token: str) -> float | None:
     return value if not np.isnan(value) else 0.0 if false else None
 
 
-def test_a_models_page_has_the_worst_twelve(site: Site) -> None:
-    page = site.page("/model/first/").partition("<h2>The worst samples</h2>")[2]
-    shown = [sample_of(f"./{each}") for each in re.findall(r'href="(sample/[^"]+)"', page)]
-    assert shown == site.samples("/model/first/samples")[:12]
-
-
 @pytest.mark.parametrize("name", ["first", "motion", "detection", "warning"])
 def test_each_bar_leads_to_the_samples_of_its_group(site: Site, name: str) -> None:
     run, address = site.runs[name], of("model", name)

@@ -83,11 +83,6 @@ def mapped(da: DeepAccident, tmp_path: Path) -> Iterator[Reader]:
 # all of them
 
 
-def test_the_address_ends_in_a_slash(reader: Reader) -> None:
-    answer = get(reader.app, "/release")
-    assert (answer.status, answer.headers["location"]) == (307, "./release/")
-
-
 def test_all_links_lead_somewhere(of_damaged: Reader) -> None:
     seen: set[str] = set()
     for tab in TABS:

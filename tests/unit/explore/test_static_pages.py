@@ -1,9 +1,7 @@
 """Pages as files: they say what served pages say, need nothing else, and are there as a whole or not at all."""
 
-import json
 import re
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urljoin
@@ -170,22 +168,6 @@ def test_a_replay_shows_the_first_model_that_can(made: Made, da_motion: DeepAcci
     without = render_replay(da_motion, normal(da_motion), tmp_path / "b.html")
     assert (made.index.parent / normal(da_motion) / "replay.html").read_bytes() == without.read_bytes()
     assert "predictions of" not in made.page(normal(da_motion)).text
-
-
-def test_the_next_model_is_shown_where_one_cannot_be(
-    da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    asked: list[object] = []
-
-    def tried(_dataset: object, _scenario: str, _path: Path, *, prediction: object = None) -> str | None:
-        asked.append(prediction)
-        return None if prediction == "second" else "no"
-
-    monkeypatch.setattr(static_pages, "tried_replay", tried)
-    names: Mapping[str, Any] = {name: name for name in ("first", "second", "third")}
-    work = static_pages.Work(token=accident(da_motion), folder="a/b", predictions=tuple(names.items()))
-    told = static_pages.tell(da_motion, tmp_path, work)
-    assert (told.model, told.reason, asked) == ("second", "", ["first", "second"])
 
 
 def test_the_same_call_gives_the_same_bytes(made: Made, da_motion: DeepAccident, tmp_path: Path) -> None:
@@ -391,9 +373,3 @@ def test_a_link_to_a_folder_stays_one(one: dict[str, Any], tmp_path: Path) -> No
     index = export_pages(folder=tmp_path / "link", **one)
     assert index == tmp_path.resolve() / "real" / "index.html"
     assert (tmp_path / "link").is_symlink()
-
-
-def test_the_mark_names_the_files(one: dict[str, Any], tmp_path: Path) -> None:
-    export_pages(folder=tmp_path / "out", **one)
-    mark = (tmp_path / "out" / ".deepaccident_pages").read_text().splitlines()
-    assert json.dumps(mark[1:]) == json.dumps(sorted({*contents(tmp_path / "out")} - {".deepaccident_pages"}))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -229,10 +230,10 @@ def test_changed_settings_are_refused(cache: ImageCache, tmp_path: Path, name: s
 
 
 def test_impossible_caches() -> None:
-    with pytest.raises(ConfigError, match="a cache holds images of one size; give ImageConfig"):
-        CachedImages(images=ImageConfig())
-    with pytest.raises(ChoiceError, match="codec: expected one of raw, jpeg"):
-        CachedImages(images=IMAGES, codec="png")  # type: ignore[arg-type]
+    assert_refused(
+        (lambda: CachedImages(images=ImageConfig()), ConfigError, "a cache holds images of one size; give ImageConfig"),
+        (lambda: CachedImages(images=IMAGES, codec="png"), ChoiceError, "codec: expected one of raw, jpeg"),
+    )
 
 
 def command(*words: str | Path) -> Any:

@@ -18,7 +18,6 @@ from deepaccident_devkit.errors import (
     ChoiceError,
     MissingExtraError,
     SensorFileError,
-    TokenError,
 )
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 from deepaccident_devkit.taxonomy import AGENTS, LIDAR
@@ -122,11 +121,6 @@ def test_choices_that_cannot_be_are_refused(
     with pytest.raises(ChoiceError, match=sentence):
         export_mcap(da, scenario, tmp_path / "a.mcap", **choices)
     assert not list(tmp_path.iterdir())
-
-
-def test_an_unknown_scenario_is_refused(da: DeepAccident, tmp_path: Path) -> None:
-    with pytest.raises(TokenError, match="no token 'nowhere/nothing'"):
-        export_mcap(da, "nowhere/nothing", tmp_path / "a.mcap")
 
 
 def test_missing_files_are_left_out_and_told(

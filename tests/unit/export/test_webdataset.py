@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -212,10 +213,10 @@ def test_the_same_bytes_again(da: DeepAccident, exported: Exported, tmp_path: Pa
 
 
 def test_impossible_choices() -> None:
-    with pytest.raises(ConfigError, match="shard_size: expected a number of bytes from 1, found 0"):
-        WebDataset(shard_size=0)
-    with pytest.raises(ChoiceError, match="frames: expected one of every, keyframes"):
-        WebDataset(frames="2hz")  # type: ignore[arg-type]
+    assert_refused(
+        (lambda: WebDataset(shard_size=0), ConfigError, "shard_size: expected a number of bytes from 1, found 0"),
+        (lambda: WebDataset(frames="2hz"), ChoiceError, "frames: expected one of every, keyframes"),
+    )
 
 
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """What holds whether torch is installed or not."""
 
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -37,17 +36,3 @@ def test_without_torch_the_models_commands_name_the_extra(
 def test_the_devkit_itself_does_not_import_torch() -> None:
     code = "import sys, deepaccident_devkit, deepaccident_devkit.cli; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_without_torch_the_loaders_benchmark_says_so(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.syspath_prepend(Path(__file__).parents[3])
-    benchmark = importlib.import_module("benchmarks.loader")
-    for name in [name for name in sys.modules if name.startswith("deepaccident_devkit.export.torch")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "torch", None)
-    assert benchmark.measure() == []
-    said = capsys.readouterr()
-    assert (said.out, said.err.count("\n")) == ("", 1)
-    assert "loader: not measured; the torch adapter needs PyTorch" in said.err

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pyquaternion import Quaternion
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes
@@ -91,7 +92,7 @@ def test_editing_what_it_returns_changes_nothing(box: Box) -> None:
 
 def test_refuses_other_than_one_row_and_other_than_three_numbers(box: Box) -> None:
     none = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
-    with pytest.raises(GeometryError, match=r"one row of Boxes, found 0; pick one with boxes\[i\]"):
-        Box(none)
-    with pytest.raises(GeometryError, match=r"translation: expected shape \(3\)"):
-        box.translate((1, 2))
+    assert_refused(
+        (lambda: Box(none), GeometryError, r"one row of Boxes, found 0; pick one with boxes\[i\]"),
+        (lambda: box.translate((1, 2)), GeometryError, r"translation: expected shape \(3\)"),
+    )

@@ -3,6 +3,7 @@ import pickle
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, footprints, points_in_boxes
@@ -306,9 +307,12 @@ def test_other_things_than_boxes_and_transforms_are_refused(two: Boxes) -> None:
     for compare in (two.iou_bev, two.iou_3d, two.distance_bev):
         with pytest.raises(GeometryError, match="other: expected Boxes, found NoneType"):
             compare(None)
-    with pytest.raises(GeometryError, match=r"a Box is one row of Boxes, found list; boxes\[0\] picks one"):
-        Box([])
-    with pytest.raises(GeometryError, match="target_from_source: expected an SE3, found ndarray; of a matrix"):
-        two.transform(np.eye(4), "ego")
-    with pytest.raises(GeometryError, match=r"frame: expected the name of a frame, .* found 5"):
-        two.transform(SE3.identity(), 5)
+    assert_refused(
+        (lambda: Box([]), GeometryError, r"a Box is one row of Boxes, found list; boxes\[0\] picks one"),
+        (
+            lambda: two.transform(np.eye(4), "ego"),
+            GeometryError,
+            "target_from_source: expected an SE3, found ndarray; of a matrix",
+        ),
+        (lambda: two.transform(SE3.identity(), 5), GeometryError, r"frame: expected the name of a frame, .* found 5"),
+    )

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, Boxes, BoxVisibility, PinholeCamera
@@ -43,10 +44,10 @@ def test_wrong_shapes_are_refused_and_the_intrinsic_is_a_copy() -> None:
     assert camera.intrinsic[0, 0] == 1
     with pytest.raises(ValueError, match="read-only"):
         camera.intrinsic[0, 0] = 2
-    with pytest.raises(GeometryError, match=r"points: expected shape \(N, 3\)"):
-        camera.project([1, 2, 3])
-    with pytest.raises(GeometryError, match=r"pixels: expected shape \(N, 2\)"):
-        camera.in_image([[1, 2, 3]])
+    assert_refused(
+        (lambda: camera.project([1, 2, 3]), GeometryError, r"points: expected shape \(N, 3\)"),
+        (lambda: camera.in_image([[1, 2, 3]]), GeometryError, r"pixels: expected shape \(N, 2\)"),
+    )
 
 
 def test_in_image_by_depth_and_margin() -> None:

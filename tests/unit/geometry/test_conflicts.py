@@ -11,6 +11,7 @@ from deepaccident_devkit.geometry.conflicts import time_to_collision
 
 EAST = [10.0, 0.0]
 CAR = [0.0, 0.0, 4.0, 2.0, 0.0]
+AHEAD = [24.0, 0.0, 4.0, 2.0, 0.0]
 
 
 def seconds(first, second, first_velocity, second_velocity) -> float:
@@ -18,18 +19,21 @@ def seconds(first, second, first_velocity, second_velocity) -> float:
     return time_to_collision(*arrays).item()
 
 
-def test_a_car_behind_another_needs_the_gap_at_its_closing_speed() -> None:
-    ahead = [24.0, 0.0, 4.0, 2.0, 0.0]
-    assert seconds(CAR, ahead, EAST, [0.0, 0.0]) == pytest.approx(2.0)
-    assert seconds(CAR, ahead, EAST, [5.0, 0.0]) == pytest.approx(4.0)
-    assert seconds(CAR, ahead, EAST, EAST) == math.inf
-    assert seconds(CAR, ahead, [0.0, 0.0], EAST) == math.inf
-
-
-def test_beside_each_other_nobody_is_hit_and_crossing_paths_meet() -> None:
-    assert seconds(CAR, [24.0, 2.5, 4.0, 2.0, 0.0], EAST, [0.0, 0.0]) == math.inf
-    crossing = [13.0, -13.0, 4.0, 2.0, math.pi / 2]
-    assert seconds(CAR, crossing, EAST, [0.0, 10.0]) == pytest.approx(1.0)
+@pytest.mark.parametrize(
+    ("other", "velocity", "other_velocity", "expected"),
+    [
+        (AHEAD, EAST, [0.0, 0.0], 2.0),
+        (AHEAD, EAST, [5.0, 0.0], 4.0),
+        (AHEAD, EAST, EAST, math.inf),
+        (AHEAD, [0.0, 0.0], EAST, math.inf),
+        ([24.0, 2.5, 4.0, 2.0, 0.0], EAST, [0.0, 0.0], math.inf),  # beside it
+        ([13.0, -13.0, 4.0, 2.0, math.pi / 2], EAST, [0.0, 10.0], 1.0),  # on a crossing path
+    ],
+)
+def test_a_car_needs_the_gap_at_its_closing_speed(
+    other: list[float], velocity: list[float], other_velocity: list[float], expected: float
+) -> None:
+    assert seconds(CAR, other, velocity, other_velocity) == pytest.approx(expected)
 
 
 def test_boxes_that_touch_now_have_no_time() -> None:

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid, LidarPointCloud
@@ -50,18 +51,29 @@ def rows(part: LidarPointCloud) -> list[int]:
     return (part.intensity * 10).round().astype(int).tolist()
 
 
-def test_crop_by_ranges_and_by_grid(cloud: LidarPointCloud) -> None:
-    assert rows(cloud.crop(x=(0, 10))) == [0, 1, 2]  # the start is in, the end is out
-    assert rows(cloud.crop(x=(-5, 11), z=(0.4, 3))) == [2, 3, 4]
-    assert rows(cloud.crop(BevGrid((0, 12, 1), (-2, 2, 1)))) == [0, 1, 2, 4]
-    assert rows(cloud.crop(BevGrid((0, 12, 1), (-2, 0, 1), "released"))) == [4]  # left is left in every orientation
-    assert rows(cloud.crop(BevGrid((0, 12, 1), (-2, 2, 1)), z=(0, 1))) == [0, 1, 2]
-    assert rows(cloud.crop()) == [0, 1, 2, 3, 4]
-    assert rows(cloud.crop(y=(1, 1))) == []
-    with pytest.raises(GeometryError, match=r"y: expected a start and an end not before it, found \(1, 0\)"):
-        cloud.crop(y=(1, 0))
-    with pytest.raises(GeometryError, match=r"z: expected shape \(2\)"):
-        cloud.crop(z=(1, 2, 3))  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("grid", "ranges", "expected"),
+    [
+        (None, {"x": (0, 10)}, [0, 1, 2]),  # the start is in, the end is out
+        (None, {"x": (-5, 11), "z": (0.4, 3)}, [2, 3, 4]),
+        (BevGrid((0, 12, 1), (-2, 2, 1)), {}, [0, 1, 2, 4]),
+        (BevGrid((0, 12, 1), (-2, 0, 1), "released"), {}, [4]),  # left is left in every orientation
+        (BevGrid((0, 12, 1), (-2, 2, 1)), {"z": (0, 1)}, [0, 1, 2]),
+        (None, {}, [0, 1, 2, 3, 4]),
+        (None, {"y": (1, 1)}, []),
+    ],
+)
+def test_crop_by_ranges_and_by_grid(
+    cloud: LidarPointCloud, grid: BevGrid | None, ranges: dict[str, tuple[float, float]], expected: list[int]
+) -> None:
+    assert rows(cloud.crop(grid, **ranges)) == expected
+
+
+def test_ranges_that_are_none(cloud: LidarPointCloud) -> None:
+    assert_refused(
+        (lambda: cloud.crop(y=(1, 0)), GeometryError, r"y: expected a start and an end not before it, found \(1, 0\)"),
+        (lambda: cloud.crop(z=(1, 2, 3)), GeometryError, r"z: expected shape \(2\)"),
+    )
 
 
 def test_remove_close_cuts_a_circle_around_the_sensor(cloud: LidarPointCloud) -> None:
@@ -71,10 +83,14 @@ def test_remove_close_cuts_a_circle_around_the_sensor(cloud: LidarPointCloud) ->
     assert rows(cloud.remove_close(1, sensor=(10, -2, -7))) == [0, 1, 2, 3]
     in_world = cloud.transform(SE3.from_yaw(0, (100, 0, 0)), "world")
     assert rows(in_world.remove_close(1.5, sensor=(100, 0, 2))) == [2, 3, 4]
-    with pytest.raises(GeometryError, match=r"does not know its sensor; give sensor=\(x, y, z\), or .* frame='lidar'"):
-        in_world.remove_close(1.5)
-    with pytest.raises(GeometryError, match="radius: expected metres from 0 on, found -1"):
-        cloud.remove_close(-1)
+    assert_refused(
+        (
+            lambda: in_world.remove_close(1.5),
+            GeometryError,
+            r"does not know its sensor; give sensor=\(x, y, z\), or .* frame='lidar'",
+        ),
+        (lambda: cloud.remove_close(-1), GeometryError, "radius: expected metres from 0 on, found -1"),
+    )
 
 
 def test_select_picks_points(cloud: LidarPointCloud) -> None:
@@ -118,12 +134,15 @@ def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
     for wrong in ("near", None, [1.0]):
         with pytest.raises(GeometryError, match="radius: expected metres from 0 on, found"):
             cloud.remove_close(wrong)
-    with pytest.raises(GeometryError, match=r"grid: expected a BevGrid, found \(-50, 50\); ranges go by name"):
-        cloud.crop((-50, 50))
-    with pytest.raises(GeometryError, match="target_from_source: expected an SE3, found NoneType"):
-        cloud.transform(None, "ego")
-    with pytest.raises(GeometryError, match="frame: expected the name of a frame"):
-        cloud.transform(SE3.identity(), 5)
+    assert_refused(
+        (
+            lambda: cloud.crop((-50, 50)),
+            GeometryError,
+            r"grid: expected a BevGrid, found \(-50, 50\); ranges go by name",
+        ),
+        (lambda: cloud.transform(None, "ego"), GeometryError, "target_from_source: expected an SE3, found NoneType"),
+        (lambda: cloud.transform(SE3.identity(), 5), GeometryError, "frame: expected the name of a frame"),
+    )
     assert rows(cloud.remove_close(np.float32(1.5))) == rows(cloud.remove_close(1.5))
 
 

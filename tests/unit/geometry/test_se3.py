@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pyquaternion import Quaternion
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
@@ -136,16 +137,21 @@ def test_what_cannot_be_moved_is_refused(points: object) -> None:
 
 def test_other_misuse_says_what_to_give(boxes: Boxes) -> None:
     pose = SE3.identity()
-    with pytest.raises(GeometryError, match=r"points: .*, found \(3, 8\); transpose it \(\.T\)$"):
-        SE3.identity().apply(np.zeros((3, 8)))
-    with pytest.raises(GeometryError, match=r"found \(4, 4\); of a matrix \(4, 4\) make SE3"):
-        pose @ np.eye(4)
-    with pytest.raises(GeometryError, match=r"vectors: expected shape \(…, 3\), found \(3, 2\)"):
-        pose.rotate(np.zeros((3, 2)))
-    with pytest.raises(GeometryError, match="frame: points of an array carry no name of a frame, found 'ego'"):
-        pose.apply([1, 2, 3], frame="ego")  # type: ignore[call-overload]
-    with pytest.raises(GeometryError, match=r"frame: expected the name of a frame, .* found 5"):
-        pose.apply(boxes, frame=5)
+    assert_refused(
+        (
+            lambda: SE3.identity().apply(np.zeros((3, 8))),
+            GeometryError,
+            r"points: .*, found \(3, 8\); transpose it \(\.T\)$",
+        ),
+        (lambda: pose @ np.eye(4), GeometryError, r"found \(4, 4\); of a matrix \(4, 4\) make SE3"),
+        (lambda: pose.rotate(np.zeros((3, 2))), GeometryError, r"vectors: expected shape \(…, 3\), found \(3, 2\)"),
+        (
+            lambda: pose.apply([1, 2, 3], frame="ego"),
+            GeometryError,
+            "frame: points of an array carry no name of a frame, found 'ego'",
+        ),
+        (lambda: pose.apply(boxes, frame=5), GeometryError, r"frame: expected the name of a frame, .* found 5"),
+    )
     for wrong in ("left", None, [0.1]):
         with pytest.raises(GeometryError, match="yaw: expected an angle in radians, found"):
             SE3.from_yaw(wrong)

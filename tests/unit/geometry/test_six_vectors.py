@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -30,12 +32,15 @@ def test_at_the_gimbal_the_pose_stays_although_the_angles_do_not() -> None:
     assert_allclose(SE3.from_six(pose.to_six()).matrix, pose.matrix, atol=1e-7)
 
 
-def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(GeometryError, match=r"matrix: expected shape \(…, 4, 4\), found \(3, 3\)"):
-        six_vectors.from_matrices(np.eye(3))
-    with pytest.raises(GeometryError, match=r"six: expected shape \(…, 6\), found \(4,\)"):
-        six_vectors.to_matrices(np.zeros(4))
-    with pytest.raises(GeometryError, match=r"vector: expected shape \(6\)"):
-        SE3.from_six(np.zeros((1, 6)))
-    with pytest.raises(GeometryError, match=r"vector: .* holds NaN or infinity"):
-        SE3.from_six([0, 0, np.nan, 0, 0, 0])
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: six_vectors.from_matrices(np.eye(3)), r"matrix: expected shape \(…, 4, 4\), found \(3, 3\)"),
+        (lambda: six_vectors.to_matrices(np.zeros(4)), r"six: expected shape \(…, 6\), found \(4,\)"),
+        (lambda: SE3.from_six(np.zeros((1, 6))), r"vector: expected shape \(6\)"),
+        (lambda: SE3.from_six([0, 0, np.nan, 0, 0, 0]), r"vector: .* holds NaN or infinity"),
+    ],
+)
+def test_wrong_shapes_are_refused(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(GeometryError, match=sentence):
+        make()

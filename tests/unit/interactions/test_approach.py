@@ -30,18 +30,27 @@ def test_passing_by_the_gap_is_least_beside_the_other() -> None:
     assert np.isnan(nearest_approach(CAR, AHEAD, TEN, np.full(2, np.nan))).all()
 
 
-def test_one_that_brakes_stops_and_stays() -> None:
-    assert seconds(CAR, AHEAD, 10, 0, 0, 0) == pytest.approx(2)
-    assert seconds(CAR, AHEAD, 10, 0, -2.5, 0) == pytest.approx(4)  # stops at the bumper
-    assert seconds(CAR, AHEAD, 10, 0, -2.51, 0) == math.inf
-    assert seconds(CAR, AHEAD, 0, 0, -1, 0) == seconds(CAR, AHEAD, 0, 0, 0, -1) == math.inf
-    assert seconds(CAR, AHEAD, 0, 0, 1, 0) == pytest.approx(math.sqrt(40))
-    assert seconds(CAR, AHEAD, 10, 5, 0, -5) == pytest.approx(2.25)  # the one ahead stops after 2.5 m
-    assert seconds(CAR, TURNED, 10, 10, -20, -20) == math.inf
-    assert seconds(CAR, TURNED, 10, 10, -5, -5) == pytest.approx(2)
-    assert seconds(CAR, AHEAD, 0, -10, 0, 2) == pytest.approx((10 - math.sqrt(20)) / 2)  # it backs, slower and slower
-    assert seconds(CAR, CAR, 0, 0, 0, 0) == 0
-    assert math.isnan(seconds(CAR, AHEAD, 10, 0, np.nan, 0))
+@pytest.mark.parametrize(
+    ("first", "second", "speeds", "rates", "expected"),
+    [
+        (CAR, AHEAD, (10, 0), (0, 0), 2),
+        (CAR, AHEAD, (10, 0), (-2.5, 0), 4),  # stops at the bumper
+        (CAR, AHEAD, (10, 0), (-2.51, 0), math.inf),
+        (CAR, AHEAD, (0, 0), (-1, 0), math.inf),
+        (CAR, AHEAD, (0, 0), (0, -1), math.inf),
+        (CAR, AHEAD, (0, 0), (1, 0), math.sqrt(40)),
+        (CAR, AHEAD, (10, 5), (0, -5), 2.25),  # the one ahead stops after 2.5 m
+        (CAR, TURNED, (10, 10), (-20, -20), math.inf),
+        (CAR, TURNED, (10, 10), (-5, -5), 2),
+        (CAR, AHEAD, (0, -10), (0, 2), (10 - math.sqrt(20)) / 2),  # it backs, slower and slower
+        (CAR, CAR, (0, 0), (0, 0), 0),
+        (CAR, AHEAD, (10, 0), (np.nan, 0), math.nan),
+    ],
+)
+def test_one_that_brakes_stops_and_stays(
+    first: np.ndarray, second: np.ndarray, speeds: tuple[float, float], rates: tuple[float, float], expected: float
+) -> None:
+    assert seconds(first, second, *speeds, *rates) == pytest.approx(expected, nan_ok=True)
 
 
 def test_many_pairs_are_as_each_alone_and_dimensions_stay() -> None:

@@ -48,14 +48,20 @@ def test_one_that_drives_up_to_another() -> None:
     assert found["tit"].item(1) == pytest.approx(0.1 * sum(3 - gap / 10 for gap in gaps))
 
 
-def test_thresholds_decide_and_so_does_the_radius() -> None:
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        (InteractionConfig(), [(1, 2), (1, 3)]),
+        (InteractionConfig(max_ttc=2.1), [(1, 3)]),  # 2.2 s at the last frame
+        (InteractionConfig(max_ttc=2.2, max_gap=3.4), [(1, 2)]),
+        (InteractionConfig(max_gap=3.5), [(1, 2), (1, 3)]),
+        (InteractionConfig(radius=25.9), [(1, 3)]),
+        (InteractionConfig(radius=26.1), [(1, 2), (1, 3)]),
+    ],
+)
+def test_thresholds_decide_and_so_does_the_radius(config: InteractionConfig, expected: list[tuple[int, int]]) -> None:
     paths = {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0), 3: straight(5, 0, 5.5, 10)}
-    assert pairs_in(paths) == [(1, 2), (1, 3)]
-    assert pairs_in(paths, config=InteractionConfig(max_ttc=2.1)) == [(1, 3)]  # 2.2 s at the last frame
-    assert pairs_in(paths, config=InteractionConfig(max_ttc=2.2, max_gap=3.4)) == [(1, 2)]
-    assert pairs_in(paths, config=InteractionConfig(max_gap=3.5)) == [(1, 2), (1, 3)]
-    assert pairs_in(paths, config=InteractionConfig(radius=25.9)) == [(1, 3)]
-    assert pairs_in(paths, config=InteractionConfig(radius=26.1)) == [(1, 2), (1, 3)]
+    assert pairs_in(paths, config=config) == expected
 
 
 def test_one_dimension_is_that_of_the_one_who_drives_up() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, TokenError
@@ -113,10 +114,10 @@ def test_it_goes_with_the_tables_and_with_the_index(own_release: Path, own: Deep
 
 def test_many_at_once_are_as_one_by_one(own: DeepAccident, computed: list[str]) -> None:
     tokens = [each["token"] for each in own.scenario]
-    with pytest.raises(ChoiceError, match="workers: expected a number of at least 1"):
-        next(iter(interactions_of(own, workers=0)))
-    with pytest.raises(TokenError, match="has no token 'x/y'"):
-        interactions_of(own, ["x/y"])
+    assert_refused(
+        (lambda: next(iter(interactions_of(own, workers=0))), ChoiceError, "workers: expected a number of at least 1"),
+        (lambda: interactions_of(own, ["x/y"]), TokenError, "has no token 'x/y'"),
+    )
     found = list(interactions_of(own))
     assert [each.scenario for each in found] == tokens == computed
     shutil.rmtree(own.tables_folder / scenario.FOLDER)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import BoolArray, FloatArray
@@ -178,12 +179,15 @@ def test_without_any_picture_there_is_no_map(own_bev_release: DeepAccident, town
 
 
 def test_towns_and_scenarios_that_are_none(bev_release: DeepAccident, town: str) -> None:
-    with pytest.raises(ChoiceError, match=r"^town: expected one of Town\d+.*, found 'Town99'"):
-        town_map(bev_release, "Town99")
-    with pytest.raises(TokenError, match="has no token 'x'"):
-        town_map(bev_release, town, scenarios=["x"])
-    with pytest.raises(ChoiceError, match="expected several tokens or records, found 'x'; put it into a list"):
-        town_map(bev_release, town, scenarios="x")
+    assert_refused(
+        (lambda: town_map(bev_release, "Town99"), ChoiceError, r"^town: expected one of Town\d+.*, found 'Town99'"),
+        (lambda: town_map(bev_release, town, scenarios=["x"]), TokenError, "has no token 'x'"),
+        (
+            lambda: town_map(bev_release, town, scenarios="x"),
+            ChoiceError,
+            "expected several tokens or records, found 'x'; put it into a list",
+        ),
+    )
     elsewhere = next(each for each in bev_release.scenario if each["town"] != town)
     with pytest.raises(NotAvailableError, match=rf"none of the 1 scenarios given is in {town}"):
         town_map(bev_release, town, scenarios=[elsewhere])

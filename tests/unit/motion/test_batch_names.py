@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
@@ -103,14 +104,25 @@ def test_labels_answer_to_the_names_of_the_heads() -> None:
 def test_batches_that_do_not_fit_are_refused() -> None:
     labels = made()
     batch = labels.as_batch("beverse")
-    with pytest.raises(ChoiceError, match="names: expected one of fiery, beverse, deepaccident, found 'stp3'"):
-        labels.as_batch("stp3")
-    with pytest.raises(FieldError, match="batch: fiery labels have 'centerness'; there are future_egomotions"):
-        MotionLabels.from_batch(batch, labels.config, "fiery")
-    with pytest.raises(GeometryError, match=r"motion_segmentation: expected shape \(5, 80, 100\)"):
-        MotionLabels.from_batch(
-            {**batch, "motion_segmentation": batch["motion_instance"][None]}, labels.config, "beverse"
-        )
+    assert_refused(
+        (
+            lambda: labels.as_batch("stp3"),
+            ChoiceError,
+            "names: expected one of fiery, beverse, deepaccident, found 'stp3'",
+        ),
+        (
+            lambda: MotionLabels.from_batch(batch, labels.config, "fiery"),
+            FieldError,
+            "batch: fiery labels have 'centerness'; there are future_egomotions",
+        ),
+        (
+            lambda: MotionLabels.from_batch(
+                {**batch, "motion_segmentation": batch["motion_instance"][None]}, labels.config, "beverse"
+            ),
+            GeometryError,
+            r"motion_segmentation: expected shape \(5, 80, 100\)",
+        ),
+    )
 
 
 def test_settings_of_the_other_codes() -> None:
@@ -133,7 +145,15 @@ def test_settings_of_the_other_codes() -> None:
     assert config_from_names(converter, "beverse").grid == BevGrid((0, 30, 0.15), (-15, 30, 0.15))
     assert config_from_names(converter, "deepaccident").grid == BevGrid((0, 30, 0.15), (-30, 15, 0.15))
     assert config_from_names({}, "beverse") == MotionLabelConfig.preset("beverse")
-    with pytest.raises(ConfigError, match="ybound: expected start, end and cell size in metres, found 3"):
-        config_from_names({"grid_conf": {"ybound": 3}}, "deepaccident")
-    with pytest.raises(ConfigError, match="future_frames: expected a whole number from 1"):
-        config_from_names({"future_frames": 0}, "beverse")
+    assert_refused(
+        (
+            lambda: config_from_names({"grid_conf": {"ybound": 3}}, "deepaccident"),
+            ConfigError,
+            "ybound: expected start, end and cell size in metres, found 3",
+        ),
+        (
+            lambda: config_from_names({"future_frames": 0}, "beverse"),
+            ConfigError,
+            "future_frames: expected a whole number from 1",
+        ),
+    )

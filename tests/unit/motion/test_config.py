@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import BevGrid
@@ -79,21 +80,43 @@ def test_what_cannot_be_is_refused_with_the_remedy(changes, sentence) -> None:
 
 
 def test_unknown_words_are_refused() -> None:
-    with pytest.raises(ChoiceError, match=r"preset: expected one of deepaccident, .*, found 'nuscenes'"):
-        MotionLabelConfig.preset("nuscenes")
-    with pytest.raises(ConfigError, match="preset: there is no field 'futureframes'; there are grid, "):
-        MotionLabelConfig.preset("fiery", futureframes=3)
-    with pytest.raises(ChoiceError, match="protocol: expected one of released, clean, beverse, fiery, found 'paper'"):
-        MotionLabelConfig(protocol="paper")
-    with pytest.raises(ChoiceError, match=r"drawn_when: expected one of present, .*, found 'later'"):
-        replace(LABEL_PROTOCOLS["clean"], drawn_when="later")
+    assert_refused(
+        (
+            lambda: MotionLabelConfig.preset("nuscenes"),
+            ChoiceError,
+            r"preset: expected one of deepaccident, .*, found 'nuscenes'",
+        ),
+        (
+            lambda: MotionLabelConfig.preset("fiery", futureframes=3),
+            ConfigError,
+            "preset: there is no field 'futureframes'; there are grid, ",
+        ),
+        (
+            lambda: MotionLabelConfig(protocol="paper"),
+            ChoiceError,
+            "protocol: expected one of released, clean, beverse, fiery, found 'paper'",
+        ),
+        (
+            lambda: replace(LABEL_PROTOCOLS["clean"], drawn_when="later"),
+            ChoiceError,
+            r"drawn_when: expected one of present, .*, found 'later'",
+        ),
+    )
     for protocol in (3, ["clean"], None):
         with pytest.raises(ChoiceError, match="protocol: expected one of released"):
             MotionLabelConfig(protocol=protocol)
-    with pytest.raises(ConfigError, match="half_cell_shift: expected True or False, found 1"):
-        replace(LABEL_PROTOCOLS["clean"], half_cell_shift=1)
-    with pytest.raises(ConfigError, match="warp 'fiery' needs native 'fiery', found 'released'"):
-        replace(LABEL_PROTOCOLS["released"], warp="fiery")
+    assert_refused(
+        (
+            lambda: replace(LABEL_PROTOCOLS["clean"], half_cell_shift=1),
+            ConfigError,
+            "half_cell_shift: expected True or False, found 1",
+        ),
+        (
+            lambda: replace(LABEL_PROTOCOLS["released"], warp="fiery"),
+            ConfigError,
+            "warp 'fiery' needs native 'fiery', found 'released'",
+        ),
+    )
     for agents in ("nobody", ["pole"], [], 5, "ego_vehicle"):
         with pytest.raises(ChoiceError, match="agents: expected"):
             MotionLabelConfig(agents=agents)
@@ -170,14 +193,20 @@ def test_on_grids_of_more_than_255_cells_the_mark_is_255() -> None:
 def test_an_augmentation_turns_then_scales_then_mirrors() -> None:
     moved = Augmentation(rotation=np.pi / 2, scale=2, flip=True).matrix @ [1, 0, 3, 1]
     np.testing.assert_allclose(moved, [0, -2, 6, 1], atol=1e-12)
-    with pytest.raises(ConfigError, match="augmentation: scale: expected a factor above 0, 1 for none, found 0"):
-        Augmentation(scale=0)
-    with pytest.raises(ConfigError, match="augmentation: rotation: expected finite radians, found nan"):
-        Augmentation(rotation=np.nan)
-    with pytest.raises(ConfigError, match="augmentation: flip: expected True or False, found 'no'"):
-        Augmentation(flip="no")
-    with pytest.raises(ConfigError, match="augmentation: rotation: expected finite radians, found 'x'"):
-        Augmentation(rotation="x")
+    assert_refused(
+        (
+            lambda: Augmentation(scale=0),
+            ConfigError,
+            "augmentation: scale: expected a factor above 0, 1 for none, found 0",
+        ),
+        (
+            lambda: Augmentation(rotation=np.nan),
+            ConfigError,
+            "augmentation: rotation: expected finite radians, found nan",
+        ),
+        (lambda: Augmentation(flip="no"), ConfigError, "augmentation: flip: expected True or False, found 'no'"),
+        (lambda: Augmentation(rotation="x"), ConfigError, "augmentation: rotation: expected finite radians, found 'x'"),
+    )
 
 
 def test_the_narrowest_and_the_widest_centre() -> None:

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -295,20 +296,22 @@ def test_arrays_are_read_only_and_whole() -> None:
     assert {getattr(made, name).dtype for name in ("centerness", "offset", "flow")} == {np.dtype(np.float32)}
 
 
-def test_what_does_not_fit_is_refused_with_the_remedy() -> None:
-    with pytest.raises(GeometryError, match=r"frames: expected 5.* found 4; give None for frames beyond the recording"):
-        labels([frame()] * 4)
-    with pytest.raises(GeometryError, match=r"egomotion: expected shape \(7, 6\), found \(5, 6\)"):
-        labels([frame()] * 5, np.zeros((5, 6)))
-    with pytest.raises(GeometryError, match="egomotion: not all numbers are finite"):
-        labels([frame()] * 5, np.full((7, 6), np.nan))
-    with pytest.raises(GeometryError, match=r"FrameBoxes.yaw: expected shape \(0\), found \(1,\)"):
-        replace(frame(), yaw=np.zeros(1))
-    with pytest.raises(GeometryError, match=r"FrameBoxes.center: row 1 is not finite"):
-        frame((0, 0, 1, 0, 1), (0, np.nan, 2, 0, 1))
-    with pytest.raises(GeometryError, match=r"FrameBoxes.center: expected shape \(N, 3\), found \(\)"):
-        replace(frame(), center=5)
-    with pytest.raises(GeometryError, match=r"FrameBoxes.ego_from_lidar: row 0 is not finite; give None for"):
-        replace(frame(), ego_from_lidar=np.full((4, 4), np.nan))
-    with pytest.raises(GeometryError, match="frames: expected FrameBoxes, or None beyond the recording, found 'a'"):
-        labels(["a"] * 5)
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: labels([frame()] * 4), r"frames: expected 5.* found 4; give None for frames beyond the recording"),
+        (lambda: labels([frame()] * 5, np.zeros((5, 6))), r"egomotion: expected shape \(7, 6\), found \(5, 6\)"),
+        (lambda: labels([frame()] * 5, np.full((7, 6), np.nan)), "egomotion: not all numbers are finite"),
+        (lambda: replace(frame(), yaw=np.zeros(1)), r"FrameBoxes.yaw: expected shape \(0\), found \(1,\)"),
+        (lambda: frame((0, 0, 1, 0, 1), (0, np.nan, 2, 0, 1)), r"FrameBoxes.center: row 1 is not finite"),
+        (lambda: replace(frame(), center=5), r"FrameBoxes.center: expected shape \(N, 3\), found \(\)"),
+        (
+            lambda: replace(frame(), ego_from_lidar=np.full((4, 4), np.nan)),
+            r"FrameBoxes.ego_from_lidar: row 0 is not finite; give None for",
+        ),
+        (lambda: labels(["a"] * 5), "frames: expected FrameBoxes, or None beyond the recording, found 'a'"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_the_remedy(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(GeometryError, match=sentence):
+        make()

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 import tiny
 from processes import wait_for
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, LabelFilesError, NotAvailableError, TokenError
@@ -314,12 +315,18 @@ class TestBatches:
             ):
                 write_label_files(small, folder, tokens, names=other, workers=1)
             assert contents(folder) == before
-        with pytest.raises(
-            LabelFilesError, match=r"holds batches of fiery, which np\.load opens .* without --names on"
-        ):
-            LabelFiles(tmp_path / "fiery")
-        with pytest.raises(ChoiceError, match="expected one of fiery, beverse, deepaccident, or None, found 'lss'"):
-            write_label_files(small, tmp_path / "lss", tokens, names="lss")
+        assert_refused(
+            (
+                lambda: LabelFiles(tmp_path / "fiery"),
+                LabelFilesError,
+                r"holds batches of fiery, which np\.load opens .* without --names on",
+            ),
+            (
+                lambda: write_label_files(small, tmp_path / "lss", tokens, names="lss"),
+                ChoiceError,
+                "expected one of fiery, beverse, deepaccident, or None, found 'lss'",
+            ),
+        )
 
     def test_a_manifest_without_names_is_of_label_files(self, small: DeepAccident, out: Path) -> None:
         write(small, out, tokens_of(small, 3))
@@ -422,12 +429,15 @@ class TestRefusing:
     def test_what_cannot_be_drawn_is_said_before_anything_is_written(self, root: Path, tmp_path: Path) -> None:
         small, out = opened(root), tmp_path / "labels"
         unlabelled = opened(tiny.write_tiny_release(tmp_path / "test", labelled=False))
-        with pytest.raises(NotAvailableError, match="ego_vehicle/003 has no label"):
-            write(unlabelled, out, tokens_of(unlabelled, 3))
-        with pytest.raises(TokenError, match="no token 'nothing'"):
-            write(small, out, [*tokens_of(small, 3), "nothing"])
-        with pytest.raises(ChoiceError, match="expected at least one sample, found none"):
-            write(small, out, [])
+        assert_refused(
+            (
+                lambda: write(unlabelled, out, tokens_of(unlabelled, 3)),
+                NotAvailableError,
+                "ego_vehicle/003 has no label",
+            ),
+            (lambda: write(small, out, [*tokens_of(small, 3), "nothing"]), TokenError, "no token 'nothing'"),
+            (lambda: write(small, out, []), ChoiceError, "expected at least one sample, found none"),
+        )
         for one in (tokens_of(small, 3)[0], small.sample[3]):
             with pytest.raises(ChoiceError, match="put it into a list"):
                 write_label_files(small, out, one)

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -69,12 +70,18 @@ def test_nothing_to_draw() -> None:
         assert (cells.shape, owner.shape) == ((0,), (0,))
 
 
-def test_what_is_no_polygon_is_refused() -> None:
-    with pytest.raises(GeometryError, match=r"polygons: expected shape \(N, N, 2\), found \(4, 2\)"):
-        filled_cells(np.zeros((4, 2)), (8, 8))
-    with pytest.raises(GeometryError, match="polygons: expected at least 3 corners, found 2"):
-        filled_cells(np.zeros((1, 2, 2)), (8, 8))
-    with pytest.raises(GeometryError, match="image: expected numbers from 0 to 1, found 0 to 2"):
-        filled_cells(np.zeros((2, 4, 2)), (8, 8), [0, 2], 2)
-    with pytest.raises(GeometryError, match="polygons: expected whole numbers of int64"):
-        filled_cells(np.full((1, 4, 2), 0.5), (8, 8))
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: filled_cells(np.zeros((4, 2)), (8, 8)), r"polygons: expected shape \(N, N, 2\), found \(4, 2\)"),
+        (lambda: filled_cells(np.zeros((1, 2, 2)), (8, 8)), "polygons: expected at least 3 corners, found 2"),
+        (
+            lambda: filled_cells(np.zeros((2, 4, 2)), (8, 8), [0, 2], 2),
+            "image: expected numbers from 0 to 1, found 0 to 2",
+        ),
+        (lambda: filled_cells(np.full((1, 4, 2), 0.5), (8, 8)), "polygons: expected whole numbers of int64"),
+    ],
+)
+def test_what_is_no_polygon_is_refused(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(GeometryError, match=sentence):
+        make()

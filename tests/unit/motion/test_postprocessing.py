@@ -5,6 +5,7 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
@@ -184,22 +185,44 @@ def test_results_cannot_be_changed_and_own_nobodys_arrays() -> None:
 
 def test_settings_that_cannot_be() -> None:
     assert post_processing("motion") == PostProcessing()
-    with pytest.raises(ChoiceError, match="post-processing: expected one of motion, accident, fiery, found 'vpq'"):
-        predict_instances(drawn({}), "vpq")
-    with pytest.raises(ChoiceError, match="foreground: expected one of argmax, sigmoid, found 'softmax'"):
-        PostProcessing(foreground="softmax")
-    with pytest.raises(ChoiceError, match="scan: expected one of devkit, released, fiery, found 'left'"):
-        PostProcessing(scan="left")
-    with pytest.raises(ConfigError, match="link_distance: expected a number of cells from 0, found nan"):
-        PostProcessing(link_distance=float("nan"))
-    with pytest.raises(ConfigError, match=r"max_centers: expected a whole number from 1 .*, found True"):
-        PostProcessing(max_centers=True)
-    with pytest.raises(ConfigError, match="redraw: expected True or False, found 1"):
-        PostProcessing(redraw=1)
-    with pytest.raises(ConfigError, match="expected PostProcessing or the name of one, found None"):
-        predict_instances(drawn({}), None)
-    with pytest.raises(ConfigError, match=r"heads: expected MotionHeads, found dict; MotionHeads.from_labels"):
-        predict_instances({})
+    assert_refused(
+        (
+            lambda: predict_instances(drawn({}), "vpq"),
+            ChoiceError,
+            "post-processing: expected one of motion, accident, fiery, found 'vpq'",
+        ),
+        (
+            lambda: PostProcessing(foreground="softmax"),
+            ChoiceError,
+            "foreground: expected one of argmax, sigmoid, found 'softmax'",
+        ),
+        (
+            lambda: PostProcessing(scan="left"),
+            ChoiceError,
+            "scan: expected one of devkit, released, fiery, found 'left'",
+        ),
+        (
+            lambda: PostProcessing(link_distance=float("nan")),
+            ConfigError,
+            "link_distance: expected a number of cells from 0, found nan",
+        ),
+        (
+            lambda: PostProcessing(max_centers=True),
+            ConfigError,
+            r"max_centers: expected a whole number from 1 .*, found True",
+        ),
+        (lambda: PostProcessing(redraw=1), ConfigError, "redraw: expected True or False, found 1"),
+        (
+            lambda: predict_instances(drawn({}), None),
+            ConfigError,
+            "expected PostProcessing or the name of one, found None",
+        ),
+        (
+            lambda: predict_instances({}),
+            ConfigError,
+            r"heads: expected MotionHeads, found dict; MotionHeads.from_labels",
+        ),
+    )
     assert PostProcessing(max_centers=np.int64(100), link_distance=10) == PostProcessing()
 
 
@@ -243,33 +266,72 @@ def test_heads_come_from_anything_that_holds_an_array() -> None:
 def test_heads_that_cannot_be() -> None:
     good = np.zeros((2, 2, 3, 4), dtype=np.float32)
     heat = good[:, :1]
-    with pytest.raises(GeometryError, match=r"flow: expected numbers, found Tensor .*detach\(\)\.cpu\(\)"):
-        MotionHeads.from_arrays(good, heat, good, Tensor(good, RuntimeError("Can't call numpy() on Tensor that …")))
-    with pytest.raises(GeometryError, match=r"offset: expected numbers, found ndarray \(no numbers: <U1\)"):
-        MotionHeads.from_arrays(good, heat, good.astype("U1"), good)
-    with pytest.raises(GeometryError, match=r"segmentation: expected \(T, 2, H, W\), .*, found \(2, 3, 3, 4\)$"):
-        MotionHeads.from_arrays(np.zeros((2, 3, 3, 4)), heat, good, good)
-    with pytest.raises(GeometryError, match=r"found \(2, 3, 4, 2\); move the channels to the second axis"):
-        MotionHeads.from_arrays(np.moveaxis(good, 1, -1), heat, good, good)
-    with pytest.raises(GeometryError, match=r"found \(2, 1, 3, 4\); of a single logit x for actors, stack -x and x"):
-        MotionHeads.from_arrays(heat, heat, good, good)
-    with pytest.raises(GeometryError, match=r"centerness: expected shape \(2, 1, 3, 4\), found \(2, 2, 3, 4\)"):
-        MotionHeads.from_arrays(good, good, good, good)
-    with pytest.raises(GeometryError, match=r"flow: expected shape \(2, 2, 3, 4\), found \(1, 2, 3, 4\)"):
-        MotionHeads.from_arrays(good, heat, good, good[:1])
-    with pytest.raises(GeometryError, match=r"at least one frame of one cell, found \(0, 2, 3, 4\)"):
-        MotionHeads.from_arrays(good[:0], heat[:0], good[:0], good[:0])
+    assert_refused(
+        (
+            lambda: MotionHeads.from_arrays(
+                good, heat, good, Tensor(good, RuntimeError("Can't call numpy() on Tensor that …"))
+            ),
+            GeometryError,
+            r"flow: expected numbers, found Tensor .*detach\(\)\.cpu\(\)",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(good, heat, good.astype("U1"), good),
+            GeometryError,
+            r"offset: expected numbers, found ndarray \(no numbers: <U1\)",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(np.zeros((2, 3, 3, 4)), heat, good, good),
+            GeometryError,
+            r"segmentation: expected \(T, 2, H, W\), .*, found \(2, 3, 3, 4\)$",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(np.moveaxis(good, 1, -1), heat, good, good),
+            GeometryError,
+            r"found \(2, 3, 4, 2\); move the channels to the second axis",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(heat, heat, good, good),
+            GeometryError,
+            r"found \(2, 1, 3, 4\); of a single logit x for actors, stack -x and x",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(good, good, good, good),
+            GeometryError,
+            r"centerness: expected shape \(2, 1, 3, 4\), found \(2, 2, 3, 4\)",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(good, heat, good, good[:1]),
+            GeometryError,
+            r"flow: expected shape \(2, 2, 3, 4\), found \(1, 2, 3, 4\)",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(good[:0], heat[:0], good[:0], good[:0]),
+            GeometryError,
+            r"at least one frame of one cell, found \(0, 2, 3, 4\)",
+        ),
+    )
     certain = good.copy()
     certain[1, 0, 2, 3], certain[1, 1, 2, 3] = -np.inf, np.inf
     assert MotionHeads.from_arrays(certain, heat, good, good).segmentation[1, 0, 2, 3] == -np.inf
     broken = good.copy()
     broken[1, 0, 2, 3] = np.nan
-    with pytest.raises(GeometryError, match=r"segmentation: nan at \(1, 0, 2, 3\) cannot be used"):
-        MotionHeads.from_arrays(broken, heat, good, good)
-    with pytest.raises(GeometryError, match=r"offset: inf at \(0, 0, 0, 0\)"):
-        MotionHeads.from_arrays(good, heat, good + np.inf, good)
-    with pytest.raises(ChoiceError, match="orientation: expected one of devkit, released, fiery, found 'up'"):
-        MotionHeads.from_arrays(good, heat, good, good, orientation="up")
+    assert_refused(
+        (
+            lambda: MotionHeads.from_arrays(broken, heat, good, good),
+            GeometryError,
+            r"segmentation: nan at \(1, 0, 2, 3\) cannot be used",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(good, heat, good + np.inf, good),
+            GeometryError,
+            r"offset: inf at \(0, 0, 0, 0\)",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(good, heat, good, good, orientation="up"),
+            ChoiceError,
+            "orientation: expected one of devkit, released, fiery, found 'up'",
+        ),
+    )
 
 
 def test_labels_are_a_prediction_that_is_right_and_255_is_no_vector() -> None:

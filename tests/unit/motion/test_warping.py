@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError
 from deepaccident_devkit.geometry import BevGrid, six_vectors
@@ -84,20 +85,35 @@ def test_released_bilinear_sampling_blurs_without_motion_and_the_exact_one_does_
 
 def test_what_does_not_fit_is_refused() -> None:
     raster = np.zeros(GRID.shape)
-    with pytest.raises(GeometryError, match=r"raster: expected shape \(…, 8, 8\), found \(8, 7\)"):
-        warp(raster[:, :7], np.eye(4), GRID, CLEAN)
-    with pytest.raises(GeometryError, match=r"source_from_target: expected shape \(4, 4\)"):
-        warp(raster, np.eye(3), GRID, CLEAN)
-    with pytest.raises(GeometryError, match="not all numbers are finite"):
-        warp(raster, np.full((4, 4), np.nan), GRID, RELEASED)
-    with pytest.raises(ChoiceError, match="mode: expected one of nearest, bilinear, found 'cubic'"):
-        warp(raster, np.eye(4), GRID, CLEAN, "cubic")  # type: ignore[arg-type]
-    with pytest.raises(GeometryError, match="more than a warp can number"):
-        nearest_indices(np.eye(4), BevGrid((-50, 50, 0.02), (-50, 50, 0.02)), CLEAN)
-    with pytest.raises(GeometryError, match="egomotion: expected at least 2 rows for 3 maps"):
-        past_to_present(np.zeros((3, 8, 8)), np.zeros((1, 6)), grid=GRID)
-    with pytest.raises(GeometryError, match=r"relative_pose: expected shape \(3, 6\)"):
-        agents_to_ego(np.zeros((3, 8, 8)), np.zeros((2, 6)), grid=GRID)
+    assert_refused(
+        (
+            lambda: warp(raster[:, :7], np.eye(4), GRID, CLEAN),
+            GeometryError,
+            r"raster: expected shape \(…, 8, 8\), found \(8, 7\)",
+        ),
+        (lambda: warp(raster, np.eye(3), GRID, CLEAN), GeometryError, r"source_from_target: expected shape \(4, 4\)"),
+        (lambda: warp(raster, np.full((4, 4), np.nan), GRID, RELEASED), GeometryError, "not all numbers are finite"),
+        (
+            lambda: warp(raster, np.eye(4), GRID, CLEAN, "cubic"),
+            ChoiceError,
+            "mode: expected one of nearest, bilinear, found 'cubic'",
+        ),
+        (
+            lambda: nearest_indices(np.eye(4), BevGrid((-50, 50, 0.02), (-50, 50, 0.02)), CLEAN),
+            GeometryError,
+            "more than a warp can number",
+        ),
+        (
+            lambda: past_to_present(np.zeros((3, 8, 8)), np.zeros((1, 6)), grid=GRID),
+            GeometryError,
+            "egomotion: expected at least 2 rows for 3 maps",
+        ),
+        (
+            lambda: agents_to_ego(np.zeros((3, 8, 8)), np.zeros((2, 6)), grid=GRID),
+            GeometryError,
+            r"relative_pose: expected shape \(3, 6\)",
+        ),
+    )
 
 
 def test_past_motions_are_multiplied_in_the_order_of_time_as_released_and_rightly_if_exact() -> None:
@@ -216,10 +232,14 @@ def test_released_vectors_keep_their_values_when_the_frame_turns() -> None:
 
 def test_labels_at_the_present_are_not_warped_again() -> None:
     present = make_labels(MotionLabelConfig(grid=GRID), ONE_AHEAD).to_present()
-    with pytest.raises(NotAvailableError, match="in the present frame already"):
-        present.to_present()
-    with pytest.raises(ChoiceError, match="mode: expected one of nearest, bilinear"):
-        make_labels(MotionLabelConfig(grid=GRID), ONE_AHEAD).to_present(centerness="linear")  # type: ignore[arg-type]
+    assert_refused(
+        (present.to_present, NotAvailableError, "in the present frame already"),
+        (
+            lambda: make_labels(MotionLabelConfig(grid=GRID), ONE_AHEAD).to_present(centerness="linear"),
+            ChoiceError,
+            "mode: expected one of nearest, bilinear",
+        ),
+    )
 
 
 def test_a_chain_of_frames_starts_at_the_identity() -> None:

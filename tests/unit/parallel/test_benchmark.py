@@ -37,14 +37,6 @@ def test_every_engine_is_measured(benchmark: ModuleType, monkeypatch: pytest.Mon
         assert minutes[0] * times[0] == pytest.approx(minutes[1] * times[1])
 
 
-def test_a_missing_engine_is_told_of(
-    benchmark: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(benchmark.shutil, "which", lambda _: None)
-    assert [kind for kind in ("here", "own", "mpi") if benchmark.installed(kind)] == ["here", "own"]
-    assert capsys.readouterr().err == "engine: mpi is not installed; its figures are left out\n"
-
-
 def test_the_serial_share_is_of_one_core_and_bounds_all_cores(benchmark: ModuleType) -> None:
     seen = {"samples": 100, "handed": 20, "item_s": 0.5, "batch_s": 0.5, "growth_mb": 1.0}
     here = benchmark.Seen(**seen, export_s=10.0, outside_s=0.9, batch_busy_s=0.0)

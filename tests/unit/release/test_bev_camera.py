@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.release import read_bev, write_bev
 from deepaccident_devkit.taxonomy import BEV_SHAPE
 
@@ -46,8 +46,3 @@ def test_other_arrays_are_refused(path: Path, shape: tuple[int, ...], dtype: str
     message = rf"^{path}: expected shape \(1200, 1200, 3\) of uint8, {found}; restore the file from its archive$"
     with pytest.raises(SensorFileError, match=message):
         read_bev(path, raw=raw)
-
-
-def test_a_missing_file(path: Path) -> None:
-    with pytest.raises(MissingFileError, match=r"bev\.npz: no such file"):
-        read_bev(path)

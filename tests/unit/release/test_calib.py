@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.errors import CalibError, DeepAccidentError, MissingFileError
+from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.geometry import PinholeCamera
 from deepaccident_devkit.release import Calib, read_calib, read_calibs, write_calib
 from deepaccident_devkit.release.calib import KEYS
@@ -147,22 +147,6 @@ def test_damaged_files(path: Path, raw_calib: RawCalib) -> None:
         path.write_bytes(whole[:end])
         with pytest.raises(CalibError, match=f"(?s)^{path}: .*{REMEDY}$"):
             read_calib(path)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MissingFileError, match=r"gone\.pkl: no such file; unpack the archive"):
-        read_calib(tmp_path / "gone.pkl")
-
-
-def test_the_error_survives_the_way_out_of_a_worker(path: Path) -> None:
-    path.write_bytes(b"")
-    with pytest.raises(CalibError, match="empty") as caught:
-        read_calib(path)
-    copied = pickle.loads(pickle.dumps(caught.value))
-    assert type(copied) is CalibError
-    assert isinstance(copied, DeepAccidentError)
-    assert isinstance(copied, ValueError)
-    assert str(copied) == str(caught.value)
 
 
 def test_slightly_imprecise_poses_are_taken(path: Path, raw_calib: RawCalib) -> None:

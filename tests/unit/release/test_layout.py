@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import DatarootError, VersionError
 from deepaccident_devkit.release import find_release
@@ -83,12 +84,19 @@ def test_an_unknown_version(root: Path) -> None:
 def test_no_release_there(root: Path, version: str) -> None:
     file = root / "file.txt"
     file.write_text("")
-    with pytest.raises(DatarootError, match=rf"^{root / 'gone'}: does not exist; give the folder"):
-        find_release(root / "gone", version)
-    with pytest.raises(DatarootError, match=rf"^{file}: is a file; give the folder"):
-        find_release(file, version)
-    with pytest.raises(DatarootError, match=rf"^{root}: no scenario found; expected .*deepaccident synth OUT"):
-        find_release(root, version)
+    assert_refused(
+        (
+            lambda: find_release(root / "gone", version),
+            DatarootError,
+            rf"^{root / 'gone'}: does not exist; give the folder",
+        ),
+        (lambda: find_release(file, version), DatarootError, rf"^{file}: is a file; give the folder"),
+        (
+            lambda: find_release(root, version),
+            DatarootError,
+            rf"^{root}: no scenario found; expected .*deepaccident synth OUT",
+        ),
+    )
     # the shell of one: sensors and labels, but no calib; files where folders are expected
     (root / ACCIDENT / "ego_vehicle" / "label" / NAME).mkdir(parents=True)
     (root / ACCIDENT / "other_vehicle").write_text("")
@@ -213,10 +221,14 @@ def test_links_that_lead_to_themselves_or_back_hold_nothing(root: Path) -> None:
 def test_a_dataroot_that_links_to_itself(root: Path, name: str) -> None:
     link = root / name
     link.symlink_to(name)
-    with pytest.raises(DatarootError, match=rf"{link}: is a link that leads nowhere; give the folder"):
-        find_release(open_dataroot(link))
-    with pytest.raises(DatarootError, match=rf"{root}: no scenario found; {link} is a link"):
-        find_release(open_dataroot(root))
+    assert_refused(
+        (
+            lambda: find_release(open_dataroot(link)),
+            DatarootError,
+            rf"{link}: is a link that leads nowhere; give the folder",
+        ),
+        (lambda: find_release(open_dataroot(root)), DatarootError, rf"{root}: no scenario found; {link} is a link"),
+    )
 
 
 COPIES = ("{}-001", "{} (1)", "{} 2", "{}-20240101T000000Z-001", "{} - Copy", "Copy of {}", "{}_old", "{}.1")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
+from deepaccident_devkit.errors import GeometryError, SensorFileError
 from deepaccident_devkit.release import read_lidar, write_lidar
 
 RAW = np.array([[10.0, 2.5, -1.5, 0.25], [-3, -4, 0.5, 1]])
@@ -51,11 +51,6 @@ def test_other_arrays_are_refused(path: Path, data: np.ndarray, found: str, raw:
     message = rf"^{path}: expected points \(N, 4\) of floats, found {found}; restore the file from its archive$"
     with pytest.raises(SensorFileError, match=message):
         read_lidar(path, raw=raw)
-
-
-def test_a_missing_file(path: Path) -> None:
-    with pytest.raises(MissingFileError, match=r"points\.npz: no such file"):
-        read_lidar(path)
 
 
 def test_writing_restores_carlas_signs_in_single_precision_as_float64(path: Path) -> None:

@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import assert_refused
 from strategies import mutations
 
 from deepaccident_devkit.errors import MetaError, MissingFileError
@@ -167,10 +168,10 @@ def test_faults_name_file_line_and_remedy(write, text: str, message: str) -> Non
 
 def test_binary_garbage_and_a_missing_file(write, tmp_path: Path) -> None:
     path = write(b"\x80\x04\x95\xff\xfe" * 10)
-    with pytest.raises(MetaError, match=f"^{path}: not a text file .*{REMEDY}$"):
-        read_meta(path)
-    with pytest.raises(MissingFileError, match=r"gone\.txt: no such file; unpack"):
-        read_meta(tmp_path / "gone.txt")
+    assert_refused(
+        (lambda: read_meta(path), MetaError, f"^{path}: not a text file .*{REMEDY}$"),
+        (lambda: read_meta(tmp_path / "gone.txt"), MissingFileError, r"gone\.txt: no such file; unpack"),
+    )
 
 
 def test_written_text_is_as_the_release_has_it(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Layers: what a caller may ask of a picture."""
 
-import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.axes import LAYERS, layers_of
@@ -17,7 +17,15 @@ def test_one_layer_needs_no_list_and_any_iterable_is_fine() -> None:
 
 
 def test_a_layer_that_the_picture_has_not_is_refused_with_those_it_has() -> None:
-    with pytest.raises(ChoiceError, match="layers: expected one of image, boxes, found 'points'"):
-        layers_of(["points"], (), ("image", "boxes"))
-    with pytest.raises(ChoiceError, match=r"layers: expected one of image, .*, found 'box'; did you mean 'boxes'"):
-        layers_of(["box"], (), LAYERS)  # type: ignore[list-item]
+    assert_refused(
+        (
+            lambda: layers_of(["points"], (), ("image", "boxes")),
+            ChoiceError,
+            "layers: expected one of image, boxes, found 'points'",
+        ),
+        (
+            lambda: layers_of(["box"], (), LAYERS),
+            ChoiceError,
+            r"layers: expected one of image, .*, found 'box'; did you mean 'boxes'",
+        ),
+    )

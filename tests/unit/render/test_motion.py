@@ -10,6 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -208,12 +209,23 @@ def test_outputs_have_the_rows_that_they_have(labels: MotionLabels) -> None:
     alone = instances_of(labels.instance, labels.config.grid)
     assert len(draw_motion_output(alone, fig=detached_figure((10, 3))).axes) == 5 + 1
     assert len(draw_motion_output(alone, style="trail", fig=detached_figure((6, 5))).axes) == 2
-    with pytest.raises(ChoiceError, match="map: this prediction has only instance, not flow; give heads for it"):
-        draw_motion_map(alone, "flow", 0, ax=new_axes())
-    with pytest.raises(ChoiceError, match="prediction: expected a number from 0 to 0, or from the end, found 1"):
-        draw_motion_output(alone, number=1)
-    with pytest.raises(ChoiceError, match="style: expected one of maps, trail, found 'film'"):
-        draw_motion_output(alone, style="film")  # type: ignore[arg-type]
+    assert_refused(
+        (
+            lambda: draw_motion_map(alone, "flow", 0, ax=new_axes()),
+            ChoiceError,
+            "map: this prediction has only instance, not flow; give heads for it",
+        ),
+        (
+            lambda: draw_motion_output(alone, number=1),
+            ChoiceError,
+            "prediction: expected a number from 0 to 0, or from the end, found 1",
+        ),
+        (
+            lambda: draw_motion_output(alone, style="film"),
+            ChoiceError,
+            "style: expected one of maps, trail, found 'film'",
+        ),
+    )
 
 
 def test_labels_as_a_trail(da_motion: DeepAccident, sample: str) -> None:

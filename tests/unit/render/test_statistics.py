@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from picture_texts import text_faults
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
@@ -19,10 +20,14 @@ def test_every_group_is_drawn_on_the_figure_given(statistics: DatasetStatistics)
         figure = detached_figure((10, 8))
         assert render_statistics(statistics, group, fig=figure) is figure
         assert all(ax.get_title() for ax in figure.axes)
-    with pytest.raises(ChoiceError, match="expected one of scenarios, ends, ego"):
-        render_statistics(statistics, "weather")
-    with pytest.raises(ChoiceError, match="expected polar axes"):
-        draw_angles(statistics.histograms["collision_angles"], ax=figure.add_subplot())
+    assert_refused(
+        (lambda: render_statistics(statistics, "weather"), ChoiceError, "expected one of scenarios, ends, ego"),
+        (
+            lambda: draw_angles(statistics.histograms["collision_angles"], ax=figure.add_subplot()),
+            ChoiceError,
+            "expected polar axes",
+        ),
+    )
 
 
 @pytest.mark.parametrize("group", STATISTICS_FIGURES)

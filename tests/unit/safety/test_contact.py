@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import assert_refused
 from replayed_accidents import head_on, rear_end, straight, wild_accidents
 
 from deepaccident_devkit.errors import GeometryError
@@ -114,10 +115,10 @@ def test_contact_counts_within_a_window_alone() -> None:
 
 def test_arrays_of_other_shapes() -> None:
     accident = rear_end()
-    with pytest.raises(GeometryError, match="paths: expected"):
-        pair_of(accident.paths[:1], accident.sizes)
-    with pytest.raises(GeometryError, match="sizes: expected"):
-        pair_of(accident.paths, accident.sizes[:1])
+    assert_refused(
+        (lambda: pair_of(accident.paths[:1], accident.sizes), GeometryError, "paths: expected"),
+        (lambda: pair_of(accident.paths, accident.sizes[:1]), GeometryError, "sizes: expected"),
+    )
     pair = pair_of(accident.paths, accident.sizes)
     with pytest.raises(GeometryError, match="starts: expected"):
         contact_times(pair, [1.0], [4.0])

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, coalition_leads, shapley_values
@@ -76,7 +77,11 @@ def test_partners_are_numbered_by_bits() -> None:
 
 
 def test_wrong_shapes_are_named() -> None:
-    with pytest.raises(GeometryError, match=r"observed: expected shape \(…, agents, 2, frames\), found \(5, 3, 4\)"):
-        coalition_leads(np.zeros((5, 3, 4), dtype=bool))
-    with pytest.raises(GeometryError, match="2\\^n coalitions, found shape \\(6,\\)"):
-        shapley_values(np.zeros(6))
+    assert_refused(
+        (
+            lambda: coalition_leads(np.zeros((5, 3, 4), dtype=bool)),
+            GeometryError,
+            r"observed: expected shape \(…, agents, 2, frames\), found \(5, 3, 4\)",
+        ),
+        (lambda: shapley_values(np.zeros(6)), GeometryError, "2\\^n coalitions, found shape \\(6,\\)"),
+    )

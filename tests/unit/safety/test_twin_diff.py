@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -106,10 +107,10 @@ def test_the_pairs_least_gap_in_the_twin() -> None:
 
 
 def test_limits_are_checked() -> None:
-    with pytest.raises(ConfigError, match="distance: expected a number above 0, found 0"):
-        Parting(distance=0)
-    with pytest.raises(ConfigError, match="heading: expected a number above 0, found nan"):
-        Parting(heading=math.nan)
+    assert_refused(
+        (lambda: Parting(distance=0), ConfigError, "distance: expected a number above 0, found 0"),
+        (lambda: Parting(heading=math.nan), ConfigError, "heading: expected a number above 0, found nan"),
+    )
 
 
 def test_an_accident_and_its_twin(da_motion: DeepAccident) -> None:
@@ -152,10 +153,10 @@ def test_what_is_missing_is_said_and_counted(own_release: Path) -> None:
         shutil.rmtree(folder / second["name"])
     shutil.rmtree(own_release / ".deepaccident")
     da = DeepAccident("v1", own_release, verbose=False)
-    with pytest.raises(NotAvailableError, match="this release has no twin of it"):
-        twin_diff(da, first["token"])
-    with pytest.raises(NotAvailableError, match="has no labels"):
-        twin_diff(da, second["token"])
+    assert_refused(
+        (lambda: twin_diff(da, first["token"]), NotAvailableError, "this release has no twin of it"),
+        (lambda: twin_diff(da, second["token"]), NotAvailableError, "has no labels"),
+    )
     report = twin_report(da)
     assert [each.accident for each in report.diffs] == [third["token"]]
     assert [each.scenario for each in report.skipped] == [first["token"], second["token"]]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from tiny import META, TYPE, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
@@ -256,10 +257,14 @@ def test_a_single_scenario_by_token_or_record(tiny: DeepAccident) -> None:
     want = dataset_statistics(tiny, [record["token"]]).to_json()
     assert dataset_statistics(tiny, record["token"]).to_json() == want
     assert dataset_statistics(tiny, record).to_json() == want
-    with pytest.raises(TokenError, match="nowhere"):
-        dataset_statistics(tiny, "nowhere")
-    with pytest.raises(ChoiceError, match="scenarios: expected tokens or records of scenarios, found 3"):
-        dataset_statistics(tiny, 3)
+    assert_refused(
+        (lambda: dataset_statistics(tiny, "nowhere"), TokenError, "nowhere"),
+        (
+            lambda: dataset_statistics(tiny, 3),
+            ChoiceError,
+            "scenarios: expected tokens or records of scenarios, found 3",
+        ),
+    )
 
 
 def test_a_release_without_labels_counts_what_it_can(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.collision import separation
@@ -123,12 +124,18 @@ def test_a_scenario_in_which_nobody_meets_is_given_up(build_own, monkeypatch):
 
 def test_a_twin_that_cannot_be_made_is_named_by_its_file(build_own, monkeypatch):
     monkeypatch.setattr("deepaccident_devkit.synth.scenario.perform_twin", lambda *_: None)
-    with pytest.raises(ConfigError, match=r"own.yaml:3: actors: the road users collide although all obey the rules"):
-        build_own(LATE.partition("meet:")[0])
-    with pytest.raises(
-        ConfigError, match=r"own.yaml:3: actors: the road users collide in the normal twin too, even if"
-    ):
-        build_own(LATE.replace("offset: 3", "offset: 0"), twin=True)
+    assert_refused(
+        (
+            lambda: build_own(LATE.partition("meet:")[0]),
+            ConfigError,
+            r"own.yaml:3: actors: the road users collide although all obey the rules",
+        ),
+        (
+            lambda: build_own(LATE.replace("offset: 3", "offset: 0"), twin=True),
+            ConfigError,
+            r"own.yaml:3: actors: the road users collide in the normal twin too, even if",
+        ),
+    )
 
 
 def test_a_slow_cyclist_is_hit(build_own):

@@ -20,11 +20,9 @@ from tiny_index import INDEX, OTHER, THIRD, contents, edit, label, opened
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import (
     BrokenReleaseError,
-    ChoiceError,
     DatarootError,
     IndexStoreError,
     NotAvailableError,
-    SplitFileError,
 )
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.tables import index as index_module
@@ -138,12 +136,6 @@ def test_the_same_scenario_in_two_split_files(own_release: Path) -> None:
 def test_the_same_scenario_in_two_folders(own_release: Path) -> None:
     shutil.copytree(own_release / "train", own_release / "val", dirs_exist_ok=True)
     with pytest.raises(BrokenReleaseError, match=r"stands in two folders: .*train and .*val; remove one"):
-        opened(own_release)
-
-
-def test_a_split_file_that_is_none(own_release: Path) -> None:
-    (own_release / "val.txt").write_text("type1_subtype1_accident\n")
-    with pytest.raises(SplitFileError, match=r"val\.txt:1: expected '<scenario_type> <scenario>'"):
         opened(own_release)
 
 
@@ -385,8 +377,3 @@ def test_an_accident_that_does_not_end_where_meta_says_is_told(
     whole = tiny.write_tiny_release(tmp_path / "whole")
     opened(whole)
     assert not caplog.records
-
-
-def test_workers_below_one_are_refused(root: Path) -> None:
-    with pytest.raises(ChoiceError, match="workers: expected a number of at least 1, or None, found 0"):
-        opened(root, workers=0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import IndexStoreError, TableError, TokenError
@@ -40,7 +41,7 @@ def test_a_row_that_only_a_damaged_index_holds(da: DeepAccident) -> None:
 
 
 def test_unknown_names(da: DeepAccident) -> None:
-    with pytest.raises(TableError, match="no table 'box'"):
-        RecordTables(da).table("box", np.arange(1))
-    with pytest.raises(TokenError, match="has no token 'nowhere'"):
-        RecordTables(da).rows(["nowhere"])
+    assert_refused(
+        (lambda: RecordTables(da).table("box", np.arange(1)), TableError, "no table 'box'"),
+        (lambda: RecordTables(da).rows(["nowhere"]), TokenError, "has no token 'nowhere'"),
+    )

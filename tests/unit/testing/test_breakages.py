@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError
@@ -102,12 +103,27 @@ def test_what_cannot_be_broken(make_deepaccident_release, tmp_path: Path) -> Non
     with pytest.raises(ChoiceError, match=r"breakage: expected one of label-empty, .*found 'label-purple'"):
         broken_release(tmp_path / "release", "label-purple")
     assert not (tmp_path / "release").exists()
-    with pytest.raises(ConfigError, match=r"'lidar-cut' cannot break .*, which lacks a part: .*npz"):
-        broken_release(tmp_path / "release", "lidar-cut", BARE)
-    with pytest.raises(ConfigError, match="which lacks a part: a second vehicle that records; choose a complete"):
-        broken_release(tmp_path / "one", "agents-swapped", SmallRelease(agents=("ego_vehicle",), channels=()))
-    with pytest.raises(ConfigError, match="has no labelled scenario to break"):
-        broken_release(tmp_path / "test", "lidar-cut", SmallRelease(splits=("test",), frames=1, channels=()))
+    assert_refused(
+        (
+            lambda: broken_release(tmp_path / "release", "lidar-cut", BARE),
+            ConfigError,
+            r"'lidar-cut' cannot break .*, which lacks a part: .*npz",
+        ),
+        (
+            lambda: broken_release(
+                tmp_path / "one", "agents-swapped", SmallRelease(agents=("ego_vehicle",), channels=())
+            ),
+            ConfigError,
+            "which lacks a part: a second vehicle that records; choose a complete",
+        ),
+        (
+            lambda: broken_release(
+                tmp_path / "test", "lidar-cut", SmallRelease(splits=("test",), frames=1, channels=())
+            ),
+            ConfigError,
+            "has no labelled scenario to break",
+        ),
+    )
 
 
 @pytest.mark.parametrize(

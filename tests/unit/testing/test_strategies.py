@@ -12,7 +12,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.release import read_label
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.testing import SmallRelease, write_small_release
-from deepaccident_devkit.testing.strategies import damaged, label_lines, label_texts, small_releases
+from deepaccident_devkit.testing.strategies import label_lines, label_texts, small_releases
 
 UNSHRUNK = settings(phases=[Phase.generate])
 
@@ -39,11 +39,6 @@ def test_a_label_is_read_with_all_its_boxes_and_nothing_else(scratch: Path, text
 def test_labels_with_windows_lines_and_with_short_ones_are_drawn() -> None:
     assert "\r\n" in find(label_texts(), lambda text: "\r\n" in text, settings=UNSHRUNK)
     assert "\ncar\n" in find(label_texts(), lambda text: "\ncar\n" in text, settings=UNSHRUNK)
-
-
-@given(damaged(b"0.0 0.0\ncar 1.0"))
-def test_damaged_bytes_are_bytes(content: bytes) -> None:
-    assert len(content) <= 2 * len(b"0.0 0.0\ncar 1.0") + 4
 
 
 @given(small_releases())

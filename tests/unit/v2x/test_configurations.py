@@ -1,8 +1,10 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
@@ -43,13 +45,20 @@ def test_partners_are_renamed_as_in_the_released_code(ego: str, side: str, expec
     assert set(everyone) == set(AGENTS)
 
 
-def test_wrong_roles_agents_and_sides() -> None:
-    with pytest.raises(ChoiceError, match=r"partners: expected one of behind, .*found 'front'"):
-        AgentConfig("mine", ("front",))  # type: ignore[arg-type]
-    with pytest.raises(ChoiceError, match=r"agent: expected one of ego_vehicle, .*found 'bus'"):
-        AGENT_CONFIGS["all"].agents_for("bus")
-    with pytest.raises(ChoiceError, match="side: expected one of ego_vehicle, other_vehicle, found 'left'"):
-        AGENT_CONFIGS["all"].agents_for(POLE, side="left")  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: AgentConfig("mine", ("front",)), r"partners: expected one of behind, .*found 'front'"),
+        (lambda: AGENT_CONFIGS["all"].agents_for("bus"), r"agent: expected one of ego_vehicle, .*found 'bus'"),
+        (
+            lambda: AGENT_CONFIGS["all"].agents_for(POLE, side="left"),
+            "side: expected one of ego_vehicle, other_vehicle, found 'left'",
+        ),
+    ],
+)
+def test_wrong_roles_agents_and_sides(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(ChoiceError, match=sentence):
+        make()
 
 
 def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
@@ -60,12 +69,15 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
     assert cooperating_agents(da_b, sample, [POLE, OTHER, POLE]) == (OTHER, POLE)
     assert cooperating_agents(da_b, sample, [POLE]) == (POLE,)
     assert cooperating_agents(da_b, sample, "available") == cooperating_agents(da_b, sample, None)
-    with pytest.raises(ChoiceError, match=r"expected one of single, .*found 'infrastructure'; .*\['infrastructure'\]"):
-        cooperating_agents(da_b, sample, POLE)
-    with pytest.raises(ChoiceError, match="at least one agent"):
-        cooperating_agents(da_b, sample, [])
-    with pytest.raises(TokenError, match="table 'sample' has no token"):
-        cooperating_agents(da_b, sample + "9")
+    assert_refused(
+        (
+            lambda: cooperating_agents(da_b, sample, POLE),
+            ChoiceError,
+            r"expected one of single, .*found 'infrastructure'; .*\['infrastructure'\]",
+        ),
+        (lambda: cooperating_agents(da_b, sample, []), ChoiceError, "at least one agent"),
+        (lambda: cooperating_agents(da_b, sample + "9"), TokenError, "table 'sample' has no token"),
+    )
 
 
 def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident, v2x
 from deepaccident_devkit.errors import ConfigError
@@ -195,8 +196,16 @@ def test_every_call_that_takes_agents_takes_a_link() -> None:
 
 
 def test_likely_mistakes_of_units_are_named() -> None:
-    with pytest.raises(ConfigError, match=r"latency: 200 s is longer than any scenario; if .* milliseconds, give 0\.2"):
-        Link(latency=200)
-    with pytest.raises(ConfigError, match=r"heading_std is 5 radians, .*; if these are degrees, give 0\.08727"):
-        PoseNoise(heading_std=5.0)
+    assert_refused(
+        (
+            lambda: Link(latency=200),
+            ConfigError,
+            r"latency: 200 s is longer than any scenario; if .* milliseconds, give 0\.2",
+        ),
+        (
+            lambda: PoseNoise(heading_std=5.0),
+            ConfigError,
+            r"heading_std is 5 radians, .*; if these are degrees, give 0\.08727",
+        ),
+    )
     assert Link(latency=20).latency_frames == 200

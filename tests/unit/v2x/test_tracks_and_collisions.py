@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import tiny
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
@@ -39,12 +40,15 @@ def test_a_trajectory_in_a_samples_frame(da: DeepAccident) -> None:
 
 def test_trajectories_that_cannot_be(da: DeepAccident) -> None:
     instance = da.instance[0]["token"]
-    with pytest.raises(TokenError, match="has no actor 7"):
-        da.trajectory(f"{da.scenario[0]['token']}/actor/7")
-    with pytest.raises(ChoiceError, match="frame 'ego' is one of a sample"):
-        da.trajectory(instance, frame="ego")
-    with pytest.raises(ChoiceError, match="different worlds"):
-        da.trajectory(instance, f"{da.scenario[1]['token']}/ego_vehicle/001", "ego")
+    assert_refused(
+        (lambda: da.trajectory(f"{da.scenario[0]['token']}/actor/7"), TokenError, "has no actor 7"),
+        (lambda: da.trajectory(instance, frame="ego"), ChoiceError, "frame 'ego' is one of a sample"),
+        (
+            lambda: da.trajectory(instance, f"{da.scenario[1]['token']}/ego_vehicle/001", "ego"),
+            ChoiceError,
+            "different worlds",
+        ),
+    )
 
 
 def test_tracks_of_every_scenario_are_its_own(da: DeepAccident) -> None:
@@ -188,15 +192,15 @@ def test_overlapping_boxes_have_no_gap_and_still_a_side(tmp_path: Path) -> None:
 
 def test_collisions_that_cannot_be_told(tmp_path: Path) -> None:
     silent = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path / "silent", meta=None), verbose=False)
-    with pytest.raises(NotAvailableError, match="has no meta file"):
-        silent.collision(tiny.TOKEN)
-    with pytest.raises(NotAvailableError, match="no scenario ends in an accident that a meta file names"):
-        first_accident(silent)
+    assert_refused(
+        (lambda: silent.collision(tiny.TOKEN), NotAvailableError, "has no meta file"),
+        (lambda: first_accident(silent), NotAvailableError, "no scenario ends in an accident that a meta file names"),
+    )
     unseen = accident(tmp_path / "unseen", lambda _: [])
-    with pytest.raises(NotAvailableError, match="no label shows the colliding pair 1223 and 1212"):
-        unseen.collision(tiny.TOKEN)
-    with pytest.raises(TokenError, match="table 'scenario' has no token"):
-        unseen.collision("nowhere")
+    assert_refused(
+        (lambda: unseen.collision(tiny.TOKEN), NotAvailableError, "no label shows the colliding pair 1223 and 1212"),
+        (lambda: unseen.collision("nowhere"), TokenError, "table 'scenario' has no token"),
+    )
 
 
 def side_by_side(frame: int) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from evaluating import Sums
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import MOST_SAID, EvaluationError
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator, ratio
@@ -124,10 +125,10 @@ def test_a_damaged_state_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(EvaluationError, match=r"state\.json: no saved evaluation .*begin again"):
         Sums().resume(path)
     path.write_bytes(filled("abcd").save(path).read_bytes()[:-9])
-    with pytest.raises(EvaluationError, match="no saved evaluation"):
-        Sums().resume(path)
-    with pytest.raises(EvaluationError, match="nowhere"):
-        Sums().resume(tmp_path / "nowhere")
+    assert_refused(
+        (lambda: Sums().resume(path), EvaluationError, "no saved evaluation"),
+        (lambda: Sums().resume(tmp_path / "nowhere"), EvaluationError, "nowhere"),
+    )
 
 
 def test_a_hostile_state_is_refused_in_few_words(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import Accident, MotionOutput, instances_of
@@ -61,10 +62,14 @@ class TestMotionOutput:
         assert same(MotionOutput(grid=GRID, heads=output.heads, orientation="fiery"), output)
         maps = np.zeros((1, 5, *GRID.shape[::-1]), dtype=np.int32)
         assert MotionOutput(grid=GRID, instances=maps, orientation="fiery").grid.orientation == "fiery"
-        with pytest.raises(GeometryError, match="orientation devkit"):
-            MotionOutput(grid=GRID, heads=output.heads)
-        with pytest.raises(ChoiceError, match="orientation: expected one of"):
-            MotionOutput(grid=GRID, instances=maps, orientation="north")  # type: ignore[arg-type]
+        assert_refused(
+            (lambda: MotionOutput(grid=GRID, heads=output.heads), GeometryError, "orientation devkit"),
+            (
+                lambda: MotionOutput(grid=GRID, instances=maps, orientation="north"),
+                ChoiceError,
+                "orientation: expected one of",
+            ),
+        )
 
     @pytest.mark.parametrize("heads", [stacked()[0], stacked(), dict(zip(NAMES, stacked(), strict=True)), 3, [None]])
     def test_arrays_are_no_heads(self, heads: Any) -> None:

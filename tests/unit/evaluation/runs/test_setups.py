@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
@@ -142,11 +143,15 @@ class TestLoader:
             SampleLoader(da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident"))
 
     def test_refused(self, da_motion: DeepAccident, motion: Results) -> None:
-        with pytest.raises(
-            EvaluationError, match=r"holds motion results; detection is evaluated from detection results"
-        ):
-            SampleLoader(da_motion, motion, EvaluationSetup(task="detection"))
-        with pytest.raises(
-            EvaluationError, match=r"look 2 s ahead \(3 frames, 1 s apart, .*, less than the horizon of 2.5 s; add"
-        ):
-            SampleLoader(da_motion, motion, EvaluationSetup(task="motion", horizon=2.5))
+        assert_refused(
+            (
+                lambda: SampleLoader(da_motion, motion, EvaluationSetup(task="detection")),
+                EvaluationError,
+                r"holds motion results; detection is evaluated from detection results",
+            ),
+            (
+                lambda: SampleLoader(da_motion, motion, EvaluationSetup(task="motion", horizon=2.5)),
+                EvaluationError,
+                r"look 2 s ahead \(3 frames, 1 s apart, .*, less than the horizon of 2.5 s; add",
+            ),
+        )

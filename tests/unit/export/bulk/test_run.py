@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 from tiny_format import KilledFormat, TinyFormat
 
 from deepaccident_devkit import DeepAccident
@@ -200,12 +201,15 @@ def test_a_folder_of_other_settings_is_refused(
 def test_a_folder_with_other_things_is_refused(small: DeepAccident, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     before = states(tmp_path)
-    with pytest.raises(ExportError, match=r"is not empty \(notes.txt\) and holds no tiny export; choose a new folder"):
-        written(small, tmp_path)
-    with pytest.raises(ExportError, match=r"notes.txt: is a file; give a folder"):
-        written(small, tmp_path / "notes.txt")
-    with pytest.raises(ExportError, match=r"cannot be written \(.*Not a directory"):
-        written(small, tmp_path / "notes.txt" / "out")
+    assert_refused(
+        (
+            lambda: written(small, tmp_path),
+            ExportError,
+            r"is not empty \(notes.txt\) and holds no tiny export; choose a new folder",
+        ),
+        (lambda: written(small, tmp_path / "notes.txt"), ExportError, r"notes.txt: is a file; give a folder"),
+        (lambda: written(small, tmp_path / "notes.txt" / "out"), ExportError, r"cannot be written \(.*Not a directory"),
+    )
     assert states(tmp_path) == before
 
 
@@ -214,11 +218,6 @@ def test_what_was_left_before_the_manifest_is_no_other_thing(small: DeepAccident
     (tmp_path / ".deepaccident-parts" / ".lock").touch()
     temporary_path(tmp_path / MANIFEST).touch()
     assert contents(written(small, tmp_path).folder) == contents(whole)
-
-
-def test_an_empty_path_is_refused(small: DeepAccident) -> None:
-    with pytest.raises(ExportError, match="expected a folder for the export, found an empty path"):
-        export_release(small, "", TinyFormat())
 
 
 def test_a_place_that_cannot_be_written_to(small: DeepAccident, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from question_files import Asked, ask
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -201,12 +202,14 @@ def test_two_answers_to_a_question(asked: Asked, tmp_path: Path) -> None:
 
 def test_files_that_are_something_else(asked: Asked, tmp_path: Path) -> None:
     path, truth = written(tmp_path / "answers.jsonl", perfect(asked)), asked.done.folder / "truth.jsonl"
-    with pytest.raises(
-        ResultsError, match=rf"^{path}:1: .*; this is no line of a truth file; give truth\.jsonl of the export"
-    ):
-        read_answers(path, path)
-    with pytest.raises(ResultsError, match=f"^{tmp_path}/none: cannot be read"):
-        read_answers(tmp_path / "none", truth)
+    assert_refused(
+        (
+            lambda: read_answers(path, path),
+            ResultsError,
+            rf"^{path}:1: .*; this is no line of a truth file; give truth\.jsonl of the export",
+        ),
+        (lambda: read_answers(tmp_path / "none", truth), ResultsError, f"^{tmp_path}/none: cannot be read"),
+    )
     empty = written(tmp_path / "empty", [])
     with pytest.raises(ResultsError, match=f"^{empty}: holds no question"):
         read_answers(path, empty)

@@ -193,15 +193,23 @@ def test_when_the_colliders_were_last_seen(da_motion: DeepAccident, tmp_path: Pa
     assert told == {"ego", "hidden", "seen"}
 
 
-def test_the_seconds_of_an_accident() -> None:
-    assert seconds_ahead(10, 10, 3) == [True, None, None]
-    assert seconds_ahead(11, 11, 3) == [False, True, None]
-    assert seconds_ahead(30, 30, 3) == [False, False, True]
-    assert seconds_ahead(31, 31, 3) == [False, False, False]
-    assert seconds_ahead(1, 1, 1) == [True]
-    assert seconds_ahead(None, 9, 2) == [None, None]
-    assert seconds_ahead(None, 10, 2) == [False, None]
-    assert seconds_ahead(None, 25, 3) == [False, False, None]
+@pytest.mark.parametrize(
+    ("accident", "frames", "seconds", "expected"),
+    [
+        (10, 10, 3, [True, None, None]),
+        (11, 11, 3, [False, True, None]),
+        (30, 30, 3, [False, False, True]),
+        (31, 31, 3, [False, False, False]),
+        (1, 1, 1, [True]),
+        (None, 9, 2, [None, None]),
+        (None, 10, 2, [False, None]),
+        (None, 25, 3, [False, False, None]),
+    ],
+)
+def test_the_seconds_of_an_accident(
+    accident: int | None, frames: int, seconds: int, expected: list[bool | None]
+) -> None:
+    assert seconds_ahead(accident, frames, seconds) == expected
 
 
 def test_the_readme_and_the_schema(asked: Asked) -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -44,13 +45,21 @@ def test_every_file_is_found_and_no_other(tmp_path: Path, files: dict[tuple[str,
         assert not folder or last in members.folders_in(above)
 
 
-def test_folders_of_a_release_by_what_leads_to_them() -> None:
-    kind = "type1_subtype2_normal"
-    assert release_folder(("a", kind, "meta")) == f"{kind}/meta"
-    assert release_folder(("train", kind, "meta")) == f"train/{kind}/meta"
-    assert release_folder(("x", "val", "train", "y", kind)) == f"train/{kind}"
-    assert release_folder((kind, kind, "meta")) == f"{kind}/meta"
-    assert release_folder(("DeepAccident_mini", kind)) == f"DeepAccident_mini/{kind}"
-    assert release_folder(("split_txt_files",)) == ""
-    assert release_folder((kind, "..", "meta")) is None
-    assert release_folder((".deepaccident", kind)) is None
+KIND = "type1_subtype2_normal"
+
+
+@pytest.mark.parametrize(
+    ("folders", "expected"),
+    [
+        (("a", KIND, "meta"), f"{KIND}/meta"),
+        (("train", KIND, "meta"), f"train/{KIND}/meta"),
+        (("x", "val", "train", "y", KIND), f"train/{KIND}"),
+        ((KIND, KIND, "meta"), f"{KIND}/meta"),
+        (("DeepAccident_mini", KIND), f"DeepAccident_mini/{KIND}"),
+        (("split_txt_files",), ""),
+        ((KIND, "..", "meta"), None),
+        ((".deepaccident", KIND), None),
+    ],
+)
+def test_folders_of_a_release_by_what_leads_to_them(folders: tuple[str, ...], expected: str | None) -> None:
+    assert release_folder(folders) == expected

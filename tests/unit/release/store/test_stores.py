@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from packing import files_of, image_sum, packed
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -88,10 +89,14 @@ def test_local_path_of_a_folder_is_the_file_itself(da_partial: DeepAccident, da:
 def test_a_file_that_no_archive_holds_is_missing(release_root: Path, tmp_path: Path) -> None:
     packed(release_root, tmp_path / "some.zip", chosen=lambda path: "lidar01" not in path.parts)
     dataset = DeepAccident(dataroot=tmp_path / "some.zip", workers=1, verbose=False)
-    with pytest.raises(MissingFileError, match=r"some\.zip/.*lidar01.*no such file"):
-        dataset.load_point_cloud(dataset.sample[0])
-    with pytest.raises(MissingFileError, match="no such file; add the archive that holds it"):
-        dataset.local_path(dataset.sample[0], "lidar01")
+    assert_refused(
+        (lambda: dataset.load_point_cloud(dataset.sample[0]), MissingFileError, r"some\.zip/.*lidar01.*no such file"),
+        (
+            lambda: dataset.local_path(dataset.sample[0], "lidar01"),
+            MissingFileError,
+            "no such file; add the archive that holds it",
+        ),
+    )
 
 
 @pytest.mark.slow

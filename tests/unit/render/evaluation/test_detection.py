@@ -1,8 +1,8 @@
 """Panels of detection results: what they draw is what the result says."""
 
-import pytest
 from drawing import new_axes, words
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult
@@ -17,7 +17,11 @@ def test_precision_is_drawn_up_to_the_recall_that_is_reached(detected: Detection
     ax = render_precision_recall(detected, "truck", ax=new_axes())
     assert not ax.lines
     assert "none in the truth" in words(ax)
-    with pytest.raises(ChoiceError, match="name: expected one of car, van, truck, found 'bus'"):
-        render_precision_recall(detected, "bus")
-    with pytest.raises(ChoiceError, match="ring: expected 0 to 0, found 1"):
-        render_precision_recall(detected, "car", ring=1)
+    assert_refused(
+        (
+            lambda: render_precision_recall(detected, "bus"),
+            ChoiceError,
+            "name: expected one of car, van, truck, found 'bus'",
+        ),
+        (lambda: render_precision_recall(detected, "car", ring=1), ChoiceError, "ring: expected 0 to 0, found 1"),
+    )

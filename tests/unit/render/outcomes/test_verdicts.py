@@ -1,7 +1,7 @@
 """Verdicts on a sample's prediction: whose rules decide, and with which truth."""
 
 import numpy as np
-import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
@@ -28,10 +28,14 @@ def test_a_prediction_is_judged_in_its_own_task(da_motion: DeepAccident, sample:
     assert judged_as(motion, "accident") == (motion, "accident")
     assert judged_as(iter([]), None) == ([], "accident")
     assert judged_as(detected, None) == (detected, "detection")
-    with pytest.raises(ChoiceError, match="task of this prediction: expected one of detection, found 'motion'"):
-        judged_as(detected, "motion")
-    with pytest.raises(EvaluationError, match="prediction: expected a MotionOutput or a list of Accidents"):
-        judged_as(boxes, None)
+    assert_refused(
+        (
+            lambda: judged_as(detected, "motion"),
+            ChoiceError,
+            "task of this prediction: expected one of detection, found 'motion'",
+        ),
+        (lambda: judged_as(boxes, None), EvaluationError, "prediction: expected a MotionOutput or a list of Accidents"),
+    )
 
 
 def test_motion_is_judged_by_the_released_rules(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:

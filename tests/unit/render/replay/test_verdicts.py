@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import assert_refused
 from replay_page import accident, data_of, normal
 
 from deepaccident_devkit import DeepAccident
@@ -103,7 +104,17 @@ def test_predictions_of_something_else_are_refused(
     boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
     with ResultsWriter(tmp_path / "boxes.json", "detection") as writer:
         writer.add(token, DetectedBoxes(boxes=boxes, scores=np.zeros(0)))
-    with pytest.raises(EvaluationError, match="holds detection results; accident is evaluated from motion or accident"):
-        render_replay(da_motion, None, tmp_path / "a.html", prediction=read_results(tmp_path / "boxes.json"))
-    with pytest.raises(EvaluationError, match="expected a MotionOutput or a list of Accidents, found list with int"):
-        render_replay(da_motion, None, tmp_path / "a.html", prediction={token: [7]})  # type: ignore[dict-item]
+    assert_refused(
+        (
+            lambda: render_replay(
+                da_motion, None, tmp_path / "a.html", prediction=read_results(tmp_path / "boxes.json")
+            ),
+            EvaluationError,
+            "holds detection results; accident is evaluated from motion or accident",
+        ),
+        (
+            lambda: render_replay(da_motion, None, tmp_path / "a.html", prediction={token: [7]}),
+            EvaluationError,
+            "expected a MotionOutput or a list of Accidents, found list with int",
+        ),
+    )

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from picture_texts import text_faults
+from refusals import assert_refused
 from replayed_accidents import head_on, rear_end
 
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
@@ -50,10 +51,18 @@ def test_a_line_ends_where_few_recordings_are_long_enough() -> None:
 
 def test_groups_without_accidents(report: AvoidabilityReport) -> None:
     assert len(render_avoidability(report, "head-on", fig=detached_figure((10, 6))).axes) == 8
-    with pytest.raises(NotAvailableError, match="no accident of the group 'pedestrians'"):
-        render_avoidability(report, "pedestrians")
-    with pytest.raises(ChoiceError, match="group: expected one of vehicles, head-on, pedestrians"):
-        render_avoidability(report, "trucks")
+    assert_refused(
+        (
+            lambda: render_avoidability(report, "pedestrians"),
+            NotAvailableError,
+            "no accident of the group 'pedestrians'",
+        ),
+        (
+            lambda: render_avoidability(report, "trucks"),
+            ChoiceError,
+            "group: expected one of vehicles, head-on, pedestrians",
+        ),
+    )
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from urllib.parse import unquote
 
 import pytest
 from damaged_releases import damaged_release
+from refusals import assert_refused
 from report_page import Page, page_of
 
 from deepaccident_devkit import DeepAccident
@@ -176,10 +177,14 @@ def test_a_second_report_replaces_the_first(report: SafetyReport, folder: Path, 
     assert [path.read_bytes() for path in save_safety_report(report, tmp_path)] == contents
     assert (tmp_path / "mine.txt").is_file()
     assert not (tmp_path / "replays").exists()
-    with pytest.raises(ConfigError, match="is a file; give a folder"):
-        save_safety_report(report, folder / "report.html")
-    with pytest.raises(ChoiceError, match="replays: expected 0 or more, or None for all, found -1"):
-        save_safety_report(report, tmp_path, replays=-1)
+    assert_refused(
+        (lambda: save_safety_report(report, folder / "report.html"), ConfigError, "is a file; give a folder"),
+        (
+            lambda: save_safety_report(report, tmp_path, replays=-1),
+            ChoiceError,
+            "replays: expected 0 or more, or None for all, found -1",
+        ),
+    )
 
 
 @pytest.mark.parametrize("name", ["figures", "replays"])

@@ -7,7 +7,7 @@ from deepaccident_devkit.synth.sensors.annotate import Views, camera_visible
 from deepaccident_devkit.synth.sensors.render import look
 from deepaccident_devkit.synth.solids import Block
 
-SIZE, SLOPE = (400, 200), np.array([0.004, 0.004])
+SIZE = (400, 200)
 
 
 WALL = (120, 120, 120)

@@ -1,6 +1,7 @@
 import os
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.spec import parse_spec, read_spec
@@ -93,10 +94,14 @@ def test_a_file_is_read_in_utf8_and_named_in_its_errors(tmp_path, small):
     with pytest.raises(ConfigError, match=r"mein.yaml:7: view: expected one of open, hidden"):
         read_spec(path)
     path.write_bytes(b"\xff")
-    with pytest.raises(ConfigError, match=r"mein.yaml: cannot be read .*; give a YAML file in UTF-8"):
-        read_spec(path)
-    with pytest.raises(ConfigError, match=r"other.yaml: no such file; give the path of a scenario file"):
-        read_spec(tmp_path / "other.yaml")
+    assert_refused(
+        (lambda: read_spec(path), ConfigError, r"mein.yaml: cannot be read .*; give a YAML file in UTF-8"),
+        (
+            lambda: read_spec(tmp_path / "other.yaml"),
+            ConfigError,
+            r"other.yaml: no such file; give the path of a scenario file",
+        ),
+    )
 
 
 def test_what_is_no_regular_file_is_not_opened(tmp_path):

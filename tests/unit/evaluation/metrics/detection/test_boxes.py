@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
@@ -27,10 +28,14 @@ def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
     assert own in detection_truth(da, sample, detection_protocol("opencood", own_box=True)).actor_id
     assert set(alone.actor_id.tolist()) <= set(cooperative.actor_id.tolist())
     assert {each.frame for each in (released, paper, cooperative)} == {"lidar"}
-    with pytest.raises(ConfigError, match="choose truth='cooperative'"):
-        detection_truth(da, sample, "paper", agents="single")
-    with pytest.raises(ConfigError, match="label_velocity"):
-        detection_truth(da, sample, detection_protocol("opencood", label_velocity=True))
+    assert_refused(
+        (lambda: detection_truth(da, sample, "paper", agents="single"), ConfigError, "choose truth='cooperative'"),
+        (
+            lambda: detection_truth(da, sample, detection_protocol("opencood", label_velocity=True)),
+            ConfigError,
+            "label_velocity",
+        ),
+    )
 
 
 def test_detected_boxes_say_their_frame_and_change_it() -> None:

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.detection import (
@@ -236,10 +237,10 @@ def test_boxes_of_another_frame_are_refused() -> None:
 
 
 def test_detected_boxes_are_checked_and_read_only() -> None:
-    with pytest.raises(GeometryError, match="scores"):
-        DetectedBoxes(boxes=truth_at((1, 1)), scores=[0.5, 0.6])
-    with pytest.raises(GeometryError, match="not all numbers are finite"):
-        found_at((1, 1, math.nan))
+    assert_refused(
+        (lambda: DetectedBoxes(boxes=truth_at((1, 1)), scores=[0.5, 0.6]), GeometryError, "scores"),
+        (lambda: found_at((1, 1, math.nan)), GeometryError, "not all numbers are finite"),
+    )
     detected = found_at((1, 1, 0.5))
     with pytest.raises(ValueError, match="read-only"):
         detected.scores[0] = 1
