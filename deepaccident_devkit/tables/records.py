@@ -48,6 +48,7 @@ class CollisionRecord(TypedDict):
         list[str | None] | None,
         Items(
             type="string",
+            nullable=True,
             doc="Which agents the pair are; null for a road user that records nothing, null where meta is silent.",
         ),
     ]
