@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
+from deepaccident_devkit import nuscenes_names
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
@@ -43,6 +44,14 @@ VISIBLE: Final = (None, *get_args(Visible))
 
 class Dataset(OpenTables):
     """One release: its tables (`OpenTables`), poses, boxes and sensor files."""
+
+    if not TYPE_CHECKING:  # which would take every name for a known one
+
+        def __getattr__(self, name: str) -> Any:
+            """Say what to use in place of a name of the nuScenes devkit; raises MissingNameError."""
+            if name in nuscenes_names.DATASET:
+                raise nuscenes_names.missing_name(type(self), name, nuscenes_names.DATASET[name])
+            return object.__getattribute__(self, name)  # raises as it did before
 
     # poses
 
@@ -194,6 +203,7 @@ class Dataset(OpenTables):
         """
         return self._path(self._sensor(sample_data, channel)[0])
 
+    @nuscenes_names.with_keywords_named
     def get_sample_data(
         self, sample_data: RowArgument, channel: str | None = None
     ) -> tuple[Path, list[Box], FloatArray | None]:

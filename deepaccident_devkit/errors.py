@@ -127,6 +127,14 @@ class FieldError(LookupFailedError):
     """The table has no such field."""
 
 
+class MissingNameError(ArgumentError, AttributeError):
+    """An object has no attribute of this name; the nuScenes devkit's has."""
+
+
+class KeywordError(ArgumentError, TypeError):
+    """A function has no argument of this name; the nuScenes devkit's has."""
+
+
 class ChoiceError(ArgumentError, ValueError):
     """An argument is not one of the values it can take (a frame, a channel, a layout, …)."""
 

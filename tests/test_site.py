@@ -20,6 +20,7 @@ NOT_FOR_USERS = {
         "deepaccident",
         "files",
         "json_text",
+        "nuscenes_names",
         "overview",
         "pages",
         "parallel",

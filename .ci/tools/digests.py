@@ -37,7 +37,7 @@ EXPORTS = {
     "cache": ("sensors", ["cache", "--size", "16x9", "--where", "length=1..1000"]),
     "labels": ("labelled", ["labels", "--samples", "all", "--split"]),
     "labels of beverse": ("labelled", ["labels", "--samples", "evaluate", "--names", "beverse", "--split"]),
-    "mcap": ("sensors", ["export", "mcap"]),
+    "mcap": ("sensors", ["export", "mcap", "--motion-labels", "deepaccident"]),
     "mmdet3d": ("sensors", ["export", "mmdet3d"]),
     "mmdet3d released": ("sensors", ["export", "mmdet3d", "--style", "released"]),
     "nuscenes": ("sensors", ["export", "nuscenes"]),

@@ -26,6 +26,7 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field_option, together, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ExportError, NotAvailableError
+from deepaccident_devkit.motion import PRESETS
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
 from deepaccident_devkit.text import choice, size_text
 from deepaccident_devkit.v2x.collisions import default_scenario
@@ -355,11 +356,14 @@ def _town_line(told: dict[str, Any]) -> str:
     show_default=True,
     help="Only every N-th point of a cloud.",
 )
+@click.option("--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels by this preset.")
+@click.option("--results", type=PATH, metavar="FILE", help="Also write the predictions of this results file.")
 def _mcap(
     scenario: str | None,
     out: Path,
     agents: tuple[str, ...],
     channels: tuple[str, ...],
+    results: Path | None,
     **options: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as an MCAP file for Foxglove or rerun.
@@ -367,18 +371,20 @@ def _mcap(
     SCENARIO is a token, such as type1_subtype1_accident/Town03_type001_subtype0001_scenario00024. Without SCENARIO the
     command takes the first scenario with a collision, or if there is none, the first scenario.
     """
+    from deepaccident_devkit.evaluation.results import read_results
     from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 
     names = agent_names(agents)
-    choices = {name: options.pop(name) for name in ("frames", "points")}
+    choices = {name: options.pop(name) for name in ("frames", "points", "motion_labels")}
     choices["agents"] = None if names == AGENTS else names
     choices["channels"] = words_of(channels) if channels else None
     config = McapConfig.of(**choices)  # before the release is indexed
     if LIDAR not in (config.channels or ()):
         refuse_unused(f"without the channel {LIDAR}", "points")
+    prediction = None if results is None else read_results(results)
     dataset = DeepAccident(**options)
     token = scenario or default_scenario(dataset)
-    made = export_mcap(dataset, token, out, progress=True, **choices)
+    made = export_mcap(dataset, token, out, prediction=prediction, progress=True, **choices)
     click.echo(f"{made}: {token}, {made.stat().st_size / 1e6:.1f} MB; open it in Foxglove, or with: rerun {made}")
 
 

@@ -28,6 +28,7 @@ from deepaccident_devkit.geometry.footprints import gaps, intersection_areas
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
+from deepaccident_devkit.nuscenes_names import BOX, BOX_MADE, without_names
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
 from deepaccident_devkit.text import Pictured
 
@@ -357,6 +358,7 @@ def checked_boxes(name: str, boxes: object) -> Boxes:
     return boxes
 
 
+@without_names(BOX)
 class Box:
     """One oriented box in a right-handed coordinate frame: a view of one row of `Boxes`.
 
@@ -371,10 +373,7 @@ class Box:
     ) -> None:
         """Wrap the only row of `boxes`; raises GeometryError if there are none or several, or these are no `Boxes`."""
         if others or not isinstance(boxes, Boxes):
-            raise GeometryError(
-                f"a Box is one row of Boxes, found {type(boxes).__name__}; boxes[0] picks one, and nuScenes' "
-                "Box(center, wlh, orientation) is Box.from_wlh(center, wlh, orientation, frame='ego')"
-            )
+            raise GeometryError(f"a Box is one row of Boxes, found {type(boxes).__name__}; {BOX_MADE}")
         if len(boxes) != 1:
             raise GeometryError(f"a Box is one row of Boxes, found {len(boxes)}; pick one with boxes[i]")
         self._boxes = boxes

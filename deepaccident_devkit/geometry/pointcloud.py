@@ -22,6 +22,7 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
+from deepaccident_devkit.nuscenes_names import CLOUD, without_names
 from deepaccident_devkit.text import Pictured
 
 Range = tuple[float, float]
@@ -29,6 +30,7 @@ _SOURCES: Final = {"agent": np.int8, "time_lag": np.float32}
 """Columns that only some clouds have, and the types of their numbers."""
 
 
+@without_names(CLOUD)
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarPointCloud(FrozenArrays, Pictured):
     """N points in one right-handed coordinate frame; arrays are read-only views.

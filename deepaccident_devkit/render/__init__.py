@@ -1,5 +1,8 @@
 """All pictures. A function for one panel takes `ax=` and returns the Axes; nothing here opens a window."""
 
+from typing import TYPE_CHECKING
+
+from deepaccident_devkit.nuscenes_names import with_keywords_named
 from deepaccident_devkit.render.accident import render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
 from deepaccident_devkit.render.axes import LAYERS, Layer, detached_figure
@@ -52,3 +55,8 @@ __all__ = [
     "render_visibility_matrix",
     "style",
 ]
+
+if not TYPE_CHECKING:  # the types stay those of the functions themselves
+    for _name in __all__:
+        if _name.startswith("render_"):
+            globals()[_name] = with_keywords_named(globals()[_name], __name__)

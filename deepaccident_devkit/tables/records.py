@@ -9,6 +9,7 @@ from types import UnionType
 from typing import Annotated, Any, TypedDict, Union, get_args, get_origin, get_type_hints
 
 from deepaccident_devkit.errors import TableError
+from deepaccident_devkit.nuscenes_names import table_remedy
 from deepaccident_devkit.tables.columns import (
     Choice,
     Column,
@@ -48,6 +49,7 @@ class CollisionRecord(TypedDict):
         list[str | None] | None,
         Items(
             type="string",
+            nullable=True,
             doc="Which agents the pair are; null for a road user that records nothing, null where meta is silent.",
         ),
     ]
@@ -348,7 +350,8 @@ def table_spec(name: str) -> TableSpec:
     specs = table_specs()
     known = spelled(name, specs)
     if known not in specs:
-        raise TableError(f"no table {name!r}; there are {', '.join(specs)}{meant_text(name, specs)}")
+        remedy = table_remedy(name) or meant_text(name, specs)
+        raise TableError(f"no table {name!r}; there are {', '.join(specs)}{remedy}")
     return specs[known]
 
 

@@ -7,6 +7,7 @@ from typing import Any, Generic, NoReturn, TypeVar, cast, overload
 import numpy as np
 
 from deepaccident_devkit.errors import FieldError, IndexStoreError, TableError, TokenError
+from deepaccident_devkit.nuscenes_names import field_remedy
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.records import table_spec, table_specs
 from deepaccident_devkit.tables.resolve import Resolver
@@ -51,7 +52,8 @@ class RecordDict(dict[str, Any]):
     __slots__ = ()
 
     def __missing__(self, field: object) -> NoReturn:
-        raise FieldError(f"the record has no field {field!r}; it has {', '.join(self)}{meant_text(field, self)}")
+        remedy = field_remedy(field) or f"; it has {', '.join(self)}{meant_text(field, self)}"
+        raise FieldError(f"the record has no field {field!r}{remedy}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (dict(self),)

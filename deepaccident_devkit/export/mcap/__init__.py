@@ -18,10 +18,10 @@ from typing import Any
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
-from deepaccident_devkit.export.mcap.config import EPOCH, McapConfig
+from deepaccident_devkit.export.mcap.config import EPOCH, McapConfig, Predictions
 from deepaccident_devkit.files import path_of
 
-__all__ = ["EPOCH", "McapConfig", "export_mcap"]
+__all__ = ["EPOCH", "McapConfig", "Predictions", "export_mcap"]
 
 
 def export_mcap(
@@ -29,21 +29,22 @@ def export_mcap(
     scenario: RowArgument,
     path: str | os.PathLike[str],
     *,
+    prediction: Predictions | None = None,
     progress: bool = False,
     **choices: Any,
 ) -> Path:
-    """Write a scenario into an MCAP file: poses, images, point clouds and boxes of all agents on one timeline.
+    """Write a scenario into an MCAP file: poses, images, point clouds, boxes and labels of all agents on one timeline.
 
     Messages are Foxglove's, as protobuf. Images have the bytes of their files. The same release and choices give the
-    same bytes, with the same versions of the libraries. The file is written completely or not at all. Sensor files that
-    were not downloaded are left out, and a log line counts them.
+    same bytes, with the same versions of the libraries. The file is written completely or not at all.
 
     Args:
         dataset: the release.
         scenario: token or record.
         path: path of the file; an existing file is replaced.
+        prediction: results, or a mapping from sample token to prediction; rendered in addition to the labels.
         progress: whether to show a bar.
-        **choices: the fields of `McapConfig`: `agents`, `channels`, `frames`, `points`.
+        **choices: the fields of `McapConfig`: `agents`, `channels`, `frames`, `points`, `motion_labels`.
 
     Returns:
         The path.
@@ -52,7 +53,7 @@ def export_mcap(
         MissingExtraError: the extra `mcap` is not installed.
         TokenError: no such scenario.
         ChoiceError: no such choice, agent, channel or frame, or the path is a folder.
-        NotAvailableError: an agent is not in this (partial) release.
+        NotAvailableError: an agent is not in this (partial) release, or no sample in the file has a prediction.
         SensorFileError: a sensor file cannot be read.
     """
     config = McapConfig.of(**choices)
@@ -65,4 +66,4 @@ def export_mcap(
         if (error.name or "").partition(".")[0] not in ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google"):
             raise
         raise MissingExtraError(f"the MCAP export needs {error.name}: in a checkout, pip install '.[mcap]'") from error
-    return write_scenario(dataset, scenario, target, config, progress=progress)
+    return write_scenario(dataset, scenario, target, config, prediction=prediction, progress=progress)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.results import Prediction, Results
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.motion.config import label_config
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
 from deepaccident_devkit.text import choice, possible_text
 from deepaccident_devkit.v2x import Agents
@@ -15,6 +18,8 @@ from deepaccident_devkit.v2x import Agents
 EPOCH: Final = 1_704_067_200
 """Unix seconds of every scenario's first frame: recordings have no date, but viewers need one (2024-01-01 UTC)."""
 EXPORTED_CHANNELS: Final = (*CAMERAS, LIDAR)
+Predictions = Results | Mapping[str, Prediction]
+"""Predictions by sample token."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,12 +32,14 @@ class McapConfig:
         channels: sensors to export: cameras and `lidar01`; None for all of these.
         frames: numbers of frames, from 1; None for all.
         points: n for every n-th point of a cloud; 1 for all.
+        motion_labels: configuration of motion labels, or the name of a preset (`motion.PRESETS`); None for none.
     """
 
     agents: Agents = None
     channels: Iterable[str] | None = None
     frames: Iterable[int] | None = None
     points: int = 1
+    motion_labels: MotionLabelConfig | str | None = None
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError."""
@@ -40,6 +47,8 @@ class McapConfig:
         object.__setattr__(self, "frames", _frame_numbers(self.frames))
         if checked_whole("points", self.points, "n for every n-th point", ChoiceError) < 1:
             raise ChoiceError(f"points: expected a number from 1, for every n-th point, found {self.points!r}")
+        if self.motion_labels is not None:
+            object.__setattr__(self, "motion_labels", label_config(self.motion_labels))
 
     @classmethod
     def of(cls, **choices: Any) -> McapConfig:

@@ -38,6 +38,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.mcap.config import EPOCH
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.render.boxes import EDGES
+from deepaccident_devkit.render.roles import recorders_of
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR
 from deepaccident_devkit.v2x.configurations import Agents, agents_of, cooperating_agents
@@ -151,12 +152,28 @@ def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[st
     return tuple(agent for agent in AGENTS if agent in chosen)
 
 
+class Roles:
+    """The colliding pair, the vehicles that record, and all others."""
+
+    def __init__(self, dataset: Dataset, scenario: str) -> None:
+        """Read the roles of a scenario from its meta."""
+        collision = dataset.get("scenario", scenario)["collision"]
+        self.pair: frozenset[int] = frozenset() if collision is None else frozenset(collision["ids"])
+        self.agents: Mapping[int, str] = recorders_of(dataset, scenario)
+
+    def role(self, actor: int) -> str:
+        """The role of an actor, such as `ego_vehicle, collides`; empty for most actors."""
+        words = [self.agents[actor]] if actor in self.agents else []
+        return ", ".join([*words, "collides"] if actor in self.pair else words)
+
+
 COLORED_POINT: Final = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
 )
 """A point of a rendering; viewers take the colour from the last four fields."""
 _NUMERIC_TYPES: Final = {
     np.dtype("u1"): PackedElementField.UINT8,
+    np.dtype("<i4"): PackedElementField.INT32,
     np.dtype("<f4"): PackedElementField.FLOAT32,
 }
 
@@ -312,16 +329,21 @@ def segment_points(segments: FloatArray, color: str, alpha: float = 1.0) -> AnyA
     which = np.repeat(np.arange(len(segments)), counts)
     step = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (step / np.maximum(counts - 1, 1)[which])[:, None]
-    points = np.zeros(len(which), dtype=COLORED_POINT)
-    points["x"], points["y"], points["z"] = (segments[which, 0] * (1 - share) + segments[which, 1] * share).T
-    points["red"], points["green"], points["blue"] = rgb(color).tolist()
-    points["alpha"] = round(255 * alpha)
-    return points
+    return colored_points(segments[which, 0] * (1 - share) + segments[which, 1] * share, color, alpha)
 
 
 def strip_points(points: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
     """Points of `COLORED_POINT` along a line through points (N, 3)."""
     return segment_points(np.stack([points[:-1], points[1:]], axis=1), color, alpha)
+
+
+def colored_points(xyz: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
+    """Points (N, 3) as (N,) `COLORED_POINT` of one colour."""
+    points = np.zeros(len(xyz), dtype=COLORED_POINT)
+    points["x"], points["y"], points["z"] = xyz.T
+    points["red"], points["green"], points["blue"] = rgb(color).tolist()
+    points["alpha"] = round(255 * alpha)
+    return points
 
 
 def joined(parts: Sequence[AnyArray]) -> AnyArray:

@@ -20,10 +20,12 @@ from tqdm import tqdm
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.export.mcap.config import EXPORTED_CHANNELS, McapConfig
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.export.mcap.config import EXPORTED_CHANNELS, McapConfig, Predictions
 from deepaccident_devkit.export.mcap.messages import (
     Moment,
     Recording,
+    Roles,
     above,
     box_segments,
     cloud_message,
@@ -42,14 +44,16 @@ from deepaccident_devkit.export.mcap.messages import (
     strip_points,
     transform_message,
 )
+from deepaccident_devkit.export.mcap.predicted import MotionMaps, PredictedScenes
 from deepaccident_devkit.files import replacing
 from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.motion.config import label_config
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.colors import AGENT_COLORS
-from deepaccident_devkit.render.roles import recorders_of, role_colors
+from deepaccident_devkit.render.roles import role_colors
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, LIDAR, UNTRACKED_ID
 from deepaccident_devkit.v2x import cooperative_view
@@ -83,6 +87,7 @@ def write_scenario(
     path: Path,
     config: McapConfig,
     *,
+    prediction: Predictions | None,
     progress: bool,
 ) -> Path:
     """The work of `export_mcap`, with the same arguments and errors."""
@@ -93,6 +98,10 @@ def write_scenario(
     sensors = Sensors(dataset, config)
     parts: list[Callable[[Moment, Recording], None]]
     parts = [Story(dataset, token).write, partial(write_poses, dataset), sensors.write, Actors(dataset, token).write]
+    if config.motion_labels is not None:
+        parts.append(MotionMaps(dataset, token, label_config(config.motion_labels)).write)
+    if prediction is not None:
+        parts.append(_predicted(prediction, moments, token).write)
     with replacing(path) as temporary, temporary.open("wb") as stream, Recording(stream) as recording:
         recording.add_metadata(METADATA, scenario_metadata(dataset, token))
         for moment in tqdm(moments, desc=path.name, disable=not progress, unit="frame"):
@@ -100,6 +109,15 @@ def write_scenario(
                 write(moment, recording)
     sensors.tell_missing()
     return path
+
+
+def _predicted(prediction: Predictions, moments: list[Moment], scenario: str) -> PredictedScenes:
+    scenes = PredictedScenes(prediction)
+    if not any(scenes.has(sample) for moment in moments for sample in moment.samples.values()):
+        raise NotAvailableError(
+            f"prediction: has nothing of {scenario} at these agents and frames, such as {moments[0].first_sample!r}"
+        )
+    return scenes
 
 
 METADATA: Final = "deepaccident_devkit"
@@ -235,9 +253,7 @@ class Actors:
     def __init__(self, dataset: Dataset, scenario: str) -> None:
         """Prepare the boxes of a scenario."""
         self._dataset = dataset
-        collision = dataset.get("scenario", scenario)["collision"]
-        self._pair: frozenset[int] = frozenset() if collision is None else frozenset(collision["ids"])
-        self._recorders: Mapping[int, str] = recorders_of(dataset, scenario)
+        self._roles = Roles(dataset, scenario)
         tracks = scenario_tracks(dataset, scenario)
         self._paths: Mapping[int, tuple[IntArray, FloatArray]] = {
             actor: (tracks.index[rows], tracks.boxes.center[rows])
@@ -310,7 +326,7 @@ class Actors:
 
     def _facts(self, boxes: Boxes, row: int, actor: int) -> dict[str, str]:
         category, velocity = CATEGORIES[boxes.category[row]], boxes.velocity[row]
-        role = self._role(actor)
+        role = self._roles.role(actor)
         identity = "untracked" if actor == UNTRACKED_ID else str(actor)
         return {
             "text": f"{category} {identity}" + (f" ({role})" if role else ""),
@@ -323,11 +339,6 @@ class Actors:
             "num_lidar_pts": str(boxes.num_lidar_pts[row]),
             "camera_visible": str(bool(boxes.camera_visible[row])).lower(),
         }
-
-    def _role(self, actor: int) -> str:
-        """The role of an actor, such as `ego_vehicle, collides`; empty for most actors."""
-        words = [self._recorders[actor]] if actor in self._recorders else []
-        return ", ".join([*words, "collides"] if actor in self._pair else words)
 
     def _trail(self, actor: int, index: int) -> tuple[FloatArray, FloatArray]:
         """Where an actor was and where it will be, (n, 3) each, in world; both include the present."""

@@ -16,10 +16,16 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.errors import (
     ChoiceError,
+    ConfigError,
     MissingExtraError,
+    NotAvailableError,
     SensorFileError,
 )
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
+from deepaccident_devkit.motion import MotionHeads, motion_labels
 from deepaccident_devkit.taxonomy import AGENTS, LIDAR
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -53,17 +59,22 @@ def test_actors_are_those_that_the_chosen_agents_annotated(da: DeepAccident, sce
     assert len(message.entities) == len(da.boxes(f"{scenario}/infrastructure/002"))
 
 
+def test_labels_can_be_left_out(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    topics = set(exported(da, scenario, tmp_path, labels=False).messages)
+    assert topics == {"/log", "/tf", "/ego_vehicle/pose", "/time_to_impact"}
+
+
 @pytest.mark.slow
 def test_scenarios_without_labels_have_poses_and_no_boxes(own_release: Path, tmp_path: Path) -> None:
     for folder in list(own_release.glob("*/*/*/label")):
         shutil.rmtree(folder)
     unlabelled = DeepAccident("v1", own_release, verbose=False)
     token = unlabelled.scenario[0]["token"]
-    file = exported(unlabelled, token, tmp_path, frames=[1, 2])
+    file = exported(unlabelled, token, tmp_path, motion_labels="deepaccident", frames=[1, 2])
     assert len(file.only("/tf")) == 2
     assert [len(message.entities) for message in file.only("/actors")] == [0, 0]
     assert [len(message.data) for message in file.only("/actors/points")] == [0, 0]
-    assert not [topic for topic in file.messages if "annotations" in topic]
+    assert not [topic for topic in file.messages if "annotations" in topic or "motion" in topic]
 
 
 def test_a_normal_scenario_has_no_countdown(da: DeepAccident, tmp_path: Path) -> None:
@@ -86,7 +97,7 @@ def test_the_code_on_the_page_runs(da: DeepAccident, tmp_path: Path, monkeypatch
 
 def test_the_page_lists_every_topic(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
     page = (DOCS / "interactive_3d.md").read_text(encoding="utf-8")
-    file = exported(da, scenario, tmp_path, channels=None)
+    file = exported(da, scenario, tmp_path, channels=None, motion_labels="deepaccident")
     for topic in file.messages:
         general = re.sub("Camera_[A-Za-z]+", "<camera>", topic.replace("ego_vehicle", "<agent>"))
         assert f"| `{general}` |" in page
@@ -113,6 +124,7 @@ def test_every_nth_point(da: DeepAccident, scenario: str, tmp_path: Path) -> Non
         ({"points": 0}, "points: expected a number from 1, for every n-th point, found 0"),
         ({"points": "some"}, "points: expected n for every n-th point, found 'some'"),
         ({"agents": ["ego"]}, "agent: expected one of ego_vehicle, .*found 'ego'"),
+        ({"motion_labels": "mine"}, "expected one of .*found 'mine'"),
     ],
 )
 def test_choices_that_cannot_be_are_refused(
@@ -157,6 +169,61 @@ def test_something_else_in_an_images_place_is_an_error(
         export_mcap(da, scenario, tmp_path / "a.mcap", channels=["Camera_Front"])
 
 
+def test_a_predicted_motion_is_drawn_on_its_cells(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    sample = f"{scenario}/ego_vehicle/002"
+    labels = motion_labels(da, sample).to_present()
+    instances = MotionOutput(grid=labels.config.grid, instances=labels.instance[None])
+    heads = MotionOutput(grid=labels.config.grid, heads=(MotionHeads.from_labels(labels),))
+    drawn = []
+    for prediction in (instances, heads):
+        (message,) = exported(da, scenario, tmp_path, prediction={sample: prediction}).only(
+            "/ego_vehicle/prediction/motion/points"
+        )
+        assert message.frame_id == "ego_vehicle"
+        drawn.append(cloud_of(message))
+    for cloud in drawn:
+        index, _ = labels.config.grid.index_of(xyz_of(cloud[cloud["frame"] == 0]))
+        present = np.zeros(labels.instance[0].shape, dtype=bool)
+        present[tuple(index.T)] = True
+        np.testing.assert_array_equal(present, labels.instance[0] > 0)
+
+
+def test_predicted_accidents_stand_where_they_are_foreseen(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    foreseen = Accident(positions=np.array([[10.0, 2.0], [13.0, -1.0]]), time=1.5, score=0.75, ids=(3, 9))
+    with ResultsWriter(tmp_path / "results.json", "accident") as writer:
+        writer.add(f"{scenario}/ego_vehicle/002", [foreseen])
+    file = exported(da, scenario, tmp_path, prediction=read_results(tmp_path / "results.json"), frames=[1, 2])
+    ((record, message),) = file.messages["/ego_vehicle/prediction/accidents"]
+    (entity,) = message.entities
+    assert record.log_time == file.messages["/tf"][1][0].log_time
+    assert entity.frame_id == "ego_vehicle"
+    places = [[sphere.pose.position.x, sphere.pose.position.y] for sphere in entity.spheres]
+    np.testing.assert_allclose(places, foreseen.positions)
+    assert entity.texts[0].text == "accident in 1.5 s (score 0.75)"
+    assert ("actor_ids", "3, 9") in [(pair.key, pair.value) for pair in entity.metadata]
+
+
+def test_detected_boxes_are_drawn_in_their_own_frame(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    boxes = DetectedBoxes.from_arrays([[5, 1, 0]], [[4, 2, 1.5]], [0.5], [0.9], category=["van"], frame="lidar")
+    file = exported(da, scenario, tmp_path, prediction={f"{scenario}/ego_vehicle/002": boxes})
+    ((entity,),) = (message.entities for message in file.only("/ego_vehicle/prediction/boxes"))
+    assert entity.frame_id == f"ego_vehicle/{LIDAR}"
+    assert (entity.cubes[0].pose.position.x, entity.cubes[0].size.y) == (5, 2)
+    cloud = xyz_of(cloud_of(file.only("/ego_vehicle/prediction/boxes/points")[0]))
+    nearest = np.linalg.norm(cloud[None] - boxes.boxes.corners()[0][:, None], axis=-1).min(axis=1)
+    assert (nearest < 1e-4).all()
+
+
+def test_predictions_that_are_none_are_refused(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    sample = f"{scenario}/ego_vehicle/002"
+    with pytest.raises(ConfigError, match=r"prediction: expected Results, or a mapping .*, found list"):
+        exported(da, scenario, tmp_path, prediction=[sample])
+    with pytest.raises(ConfigError, match="a list of Accident or DetectedBoxes for each sample, found str"):
+        exported(da, scenario, tmp_path, prediction={sample: "an accident"})
+    with pytest.raises(NotAvailableError, match=f"prediction: has nothing of {scenario} at these agents and frames"):
+        exported(da, scenario, tmp_path, prediction={sample: []}, frames=[3])
+
+
 @pytest.mark.parametrize("package", ["mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google.protobuf"])
 def test_without_the_extra_the_error_names_it(
     da: DeepAccident, scenario: str, tmp_path: Path, package: str, monkeypatch: pytest.MonkeyPatch
@@ -190,12 +257,16 @@ def test_the_verb_writes_the_first_accident(da: DeepAccident, tmp_path: Path) ->
     }
 
 
-def test_the_verb_takes_a_scenario(da: DeepAccident, tmp_path: Path) -> None:
+def test_the_verb_takes_a_scenario_and_predictions(da: DeepAccident, tmp_path: Path) -> None:
     token, out = da.scenario[1]["token"], tmp_path / "a.mcap"
-    arguments = [da.dataroot, token, "--out", out, "--frame-range", 2]
+    with ResultsWriter(tmp_path / "results.json", "accident") as writer:
+        writer.add(f"{token}/ego_vehicle/002", [])
+    arguments = [da.dataroot, token, "--out", out, "--frame-range", 2, "--results", tmp_path / "results.json"]
     done = CliRunner().invoke(export, ["mcap", *map(str, arguments), "--channels", "Camera_Front"])
     assert done.exit_code == 0, done.output
-    assert read_mcap(out).metadata["deepaccident_devkit"]["scenario"] == token
+    file = read_mcap(out)
+    assert file.metadata["deepaccident_devkit"]["scenario"] == token
+    assert len(file.only("/ego_vehicle/prediction/accidents")) == 1
 
 
 def test_the_verb_refuses_what_it_cannot_read(tmp_path: Path) -> None:

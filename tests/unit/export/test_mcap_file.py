@@ -12,6 +12,7 @@ from PIL import Image
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.export.mcap import EPOCH, export_mcap
+from deepaccident_devkit.motion import motion_labels
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR
 from deepaccident_devkit.v2x import cooperative_boxes, visible_instances
@@ -28,7 +29,7 @@ def scenario(da: DeepAccident) -> str:
 @pytest.fixture(scope="module")
 def path(da: DeepAccident, scenario: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     wanted = tmp_path_factory.mktemp("mcap") / "new folder" / "accident.mcap"
-    made = export_mcap(da, scenario, wanted)
+    made = export_mcap(da, scenario, wanted, motion_labels="deepaccident")
     assert made == wanted
     return made
 
@@ -49,6 +50,7 @@ def test_every_topic_has_a_message_a_frame_and_the_schema_of_its_kind(file: Mcap
         expected[f"/{agent}/{LIDAR}/points"] = "PointCloud"
         expected[f"/{agent}/annotations"] = "SceneUpdate"
         expected[f"/{agent}/annotations/points"] = "PointCloud"
+        expected[f"/{agent}/motion_labels/points"] = "PointCloud"
         for camera in CAMERAS:
             expected[f"/{agent}/{camera}/image"] = "CompressedImage"
             expected[f"/{agent}/{camera}/calibration"] = "CameraCalibration"
@@ -236,6 +238,21 @@ def test_trails_lead_through_the_actors_centres(da: DeepAccident, scenario: str,
     np.testing.assert_allclose(places, centers, atol=1e-9)
 
 
+def test_motion_labels_are_points_on_their_cells(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    labels = motion_labels(da, sample(scenario, "ego_vehicle", 1), "deepaccident").to_present()
+    message = file.only("/ego_vehicle/motion_labels/points")[0]
+    cloud, grid = cloud_of(message), labels.config.grid
+    assert message.frame_id == "ego_vehicle"
+    index, inside = grid.index_of(xyz_of(cloud))
+    assert inside.all()
+    drawn = np.zeros_like(labels.instance)
+    drawn[cloud["frame"], index[:, 0], index[:, 1]] = cloud["instance"]
+    expected = np.where(labels.label_valid[:, None, None], labels.instance, 0)
+    np.testing.assert_array_equal(drawn, expected)
+    assert (expected[0] > 0).any()
+    assert len(cloud) == np.count_nonzero(expected)
+
+
 def test_the_countdown_ends_at_the_impact(da: DeepAccident, scenario: str, file: McapFile) -> None:
     values = [message.value for message in file.only("/time_to_impact")]
     assert values == pytest.approx([0.5, 0.4, 0.3, 0.2, 0.1, 0.0])
@@ -254,5 +271,5 @@ def test_the_metadata_tell_where_the_file_is_from(scenario: str, file: McapFile)
 
 
 def test_the_same_choices_give_the_same_bytes(da: DeepAccident, scenario: str, path: Path, tmp_path: Path) -> None:
-    again = export_mcap(da, da.get("scenario", scenario), tmp_path / "again.mcap")
+    again = export_mcap(da, da.get("scenario", scenario), tmp_path / "again.mcap", motion_labels="deepaccident")
     assert again.read_bytes() == path.read_bytes()

@@ -1,8 +1,10 @@
 """The interactions of a release's scenarios: computed once, kept, made again where the file is no good."""
 
+import json
 import shutil
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from refusals import assert_refused
@@ -13,6 +15,8 @@ from deepaccident_devkit.interactions import InteractionConfig, Interactions, in
 from deepaccident_devkit.interactions.table import interaction_specs
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.testing import SmallRelease, write_small_release
+
+SCHEMA = Path(__file__).parents[3] / "schema"
 
 
 @pytest.fixture
@@ -136,12 +140,20 @@ def test_processes_may_make_the_same_files_at_once(own: DeepAccident) -> None:
     assert len(kept) == 2
 
 
-def test_tables_have_the_declared_columns(da_motion: DeepAccident) -> None:
+def test_tables_are_as_their_schema_says(da_motion: DeepAccident) -> None:
     accident = da_motion.find(collision=True)[0]
     found = da_motion.interactions(accident)
     for name, table in (("interaction", found.to_arrow()), ("interaction_pair", found.pairs.to_arrow())):
-        assert len(table) > 5
-        assert table.column_names == [each.field for each in interaction_specs()[name].columns]
+        schema = json.loads((SCHEMA / f"{name}.json").read_text(encoding="utf-8"))
+        jsonschema.Draft202012Validator.check_schema(schema)
+        validator = jsonschema.Draft202012Validator(schema)
+        records = table.to_pylist()
+        assert len(records) > 5
+        for record in records[:: max(1, len(records) // 20)]:
+            validator.validate(record)
+            assert (
+                list(record) == list(schema["properties"]) == [each.field for each in interaction_specs()[name].columns]
+            )
     tokens = found.to_arrow()["frame_token"].to_pylist()
     frames = [da_motion.get("frame", token)["index"] for token in tokens]
     assert frames == found.frame.tolist()
