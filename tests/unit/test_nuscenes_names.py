@@ -1,0 +1,157 @@
+"""nuScenes' names that are not here: each error names a counterpart that is, and nothing else changes."""
+
+import copy
+import inspect
+import json
+import pickle
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident, DeepAccidentError, nuscenes_names, render
+from deepaccident_devkit.errors import FieldError, KeywordError, MissingNameError, TableError
+from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud
+from deepaccident_devkit.tables.records import table_specs
+
+CLASSES: list[tuple[type, Mapping[str, str]]] = [
+    (DeepAccident, nuscenes_names.DATASET),
+    (Box, nuscenes_names.BOX),
+    (LidarPointCloud, nuscenes_names.CLOUD),
+]
+NAMED = {"da": DeepAccident, "box": Box, "cloud": LidarPointCloud, "render": render}
+"""What the first words of counterparts stand for."""
+
+
+@pytest.fixture
+def box() -> Box:
+    return Box(Boxes.from_arrays([(1.0, 2.0, 3.0)], [(4.0, 2.0, 1.0)], [0.5]), "token", "instance")
+
+
+@pytest.fixture
+def cloud() -> LidarPointCloud:
+    return LidarPointCloud(np.ones((2, 3)), np.ones(2, dtype=np.float32))
+
+
+@pytest.mark.parametrize(("kind", "names"), CLASSES)
+def test_none_of_the_names_is_here(kind: type, names: Mapping[str, str]) -> None:
+    assert [name for name in names if hasattr(kind, name)] == []
+
+
+def test_none_of_the_tables_is_here() -> None:
+    assert nuscenes_names.TABLES.keys() & table_specs().keys() == set()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [*(names for _, names in CLASSES), nuscenes_names.KEYWORDS, nuscenes_names.FIELDS],
+    ids=["dataset", "box", "cloud", "keywords", "fields"],
+)
+def test_each_counterpart_is_here(names: Mapping[str, str]) -> None:
+    for text in names.values():
+        for owner, name in re.findall(r"\b(da|box|cloud|render)\.(\w+)", text):
+            assert hasattr(NAMED[owner], name), text
+
+
+def test_each_table_to_use_is_here() -> None:
+    words = [word for text in nuscenes_names.TABLES.values() for word in re.findall(r"'(\w+)'", text)]
+    assert {"scenario", "annotation"} <= set(words) <= table_specs().keys()
+
+
+@pytest.mark.parametrize("name", nuscenes_names.DATASET)
+def test_the_dataset_names_the_counterpart(da: DeepAccident, name: str) -> None:
+    with pytest.raises(MissingNameError, match=rf"^DeepAccident has no '{name}': .* \(see docs/from_nuscenes\.md\)$"):
+        getattr(da, name)
+    assert not hasattr(da, name)
+
+
+def test_the_error_is_ours_and_an_attribute_error(da: DeepAccident) -> None:
+    with pytest.raises(AttributeError, match=r"DeepAccident has no 'scene': use da\.scenario") as raised:
+        _ = da.scene  # type: ignore[attr-defined]
+    assert isinstance(raised.value, DeepAccidentError)
+
+
+def test_other_names_fail_as_ever(da: DeepAccident) -> None:
+    with pytest.raises(AttributeError, match=r"^'DeepAccident' object has no attribute 'samplex'$"):
+        _ = da.samplex  # type: ignore[attr-defined]
+    with pytest.raises(AttributeError, match=r"^'DeepAccident' object has no attribute '_tables'$"):
+        _ = object.__new__(DeepAccident).scenario  # the error of the property itself
+    assert copy.copy(da).sample[0] == da.sample[0]
+
+
+@pytest.mark.parametrize("name", nuscenes_names.TABLES)
+def test_an_unknown_table_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
+    with pytest.raises(TableError, match=rf"no table '{name}'; .*; of nuScenes' table '{name}': .*from_nuscenes\.md"):
+        da.get(name, "x")
+    with pytest.raises(TableError, match=r"category; did you mean 'sample'\?$"):
+        da.get("sampel", "x")
+
+
+@pytest.mark.parametrize("name", ["get_sample_data", *(each for each in render.__all__ if each.startswith("render_"))])
+def test_an_argument_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
+    method = getattr(da, name)
+    for argument, counterpart in nuscenes_names.KEYWORDS.items():
+        assert argument not in inspect.signature(method).parameters
+        sentence = f"^{name} has no argument '{argument}': {re.escape(counterpart)} "
+        with pytest.raises(KeywordError, match=sentence) as raised:
+            method("x", **{argument: None})
+        assert isinstance(raised.value, TypeError)
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'colour'"):
+        method("x", colour=1)
+    assert pickle.loads(pickle.dumps(method.__func__)) is method.__func__
+
+
+@pytest.mark.parametrize("table", table_specs())
+def test_a_field_of_nuscenes_names_the_counterpart(da: DeepAccident, table: str) -> None:
+    record = getattr(da, table)[0]
+    for field, counterpart in nuscenes_names.FIELDS.items():
+        if field in record:  # of this table it is ours too
+            assert (table, field) in {("agent", "first_sample_token"), ("agent", "last_sample_token")}
+            continue
+        with pytest.raises(FieldError, match=rf"^the record has no field '{field}': {re.escape(counterpart)} "):
+            record[field]
+    with pytest.raises(KeyError, match=r"^the record has no field 'tokn'; it has token, .*; did you mean 'token'\?$"):
+        record["tokn"]
+    assert record.get("data") is None
+
+
+def test_records_are_dicts_and_their_copies_plain(da: DeepAccident) -> None:
+    record = da.sample[0]
+    assert isinstance(record, dict)
+    assert json.loads(json.dumps(record)) == record
+    assert repr(record) == repr(dict(record))
+    for copied in (copy.copy(record), copy.deepcopy(record), pickle.loads(pickle.dumps(record)), record.copy()):
+        assert (type(copied), copied) == (dict, record)
+
+
+@pytest.mark.parametrize("name", nuscenes_names.BOX)
+def test_a_box_names_the_counterpart(box: Box, name: str) -> None:
+    with pytest.raises(MissingNameError, match=f"^Box has no '{name}': use "):
+        getattr(box, name)
+    assert not hasattr(box, name)
+
+
+@pytest.mark.parametrize("name", nuscenes_names.CLOUD)
+def test_a_cloud_names_the_counterpart_also_of_its_class(cloud: LidarPointCloud, name: str) -> None:
+    for owner in (cloud, LidarPointCloud):
+        with pytest.raises(MissingNameError, match=f"^LidarPointCloud has no '{name}': use "):
+            getattr(owner, name)
+
+
+def test_copies_and_look_ups_are_as_ever(box: Box, cloud: LidarPointCloud) -> None:
+    for again in (copy.copy(box), copy.deepcopy(box), pickle.loads(pickle.dumps(box))):
+        assert (repr(again), again.token, again.instance_token) == (repr(box), "token", "instance")
+    assert len(pickle.loads(pickle.dumps(cloud))) == len(copy.deepcopy(cloud)) == 2
+    for kind in (Box, LidarPointCloud):
+        assert "__getattr__" not in vars(kind)  # it would slow each attribute
+        assert dict(inspect.getmembers(kind))["transform"] is vars(kind)["transform"]
+
+
+def test_the_page_has_every_name() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "from_nuscenes.md").read_text(encoding="utf-8")
+    left = " ".join(re.findall(r"^\| (.*) \| .* \|$", page, re.MULTILINE))
+    every = {name for _, names in CLASSES for name in names} | set(nuscenes_names.TABLES)
+    every |= nuscenes_names.KEYWORDS.keys() | nuscenes_names.FIELDS.keys()
+    assert sorted(name for name in every if not re.search(rf"\b{name}\b", left)) == []
