@@ -171,10 +171,12 @@ def test_several_processes_write_one_evaluation(
 
 def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path: Path) -> None:
     words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
-    done = evaluate(*words, "--by", "town", "--switch", "reading.present=false", "--json", "--out", tmp_path / "b")
+    done = evaluate(
+        *words, "--by", "town", "--switch", "reading.danger_distance=0.5", "--json", "--out", tmp_path / "b"
+    )
     summary = json.loads(done.stdout)
     assert list(summary["breakdowns"]) == ["all", "town"]
-    assert summary["switches"] == {"reading.present": False}
+    assert summary["switches"] == {"reading.danger_distance": 0.5}
     assert summary == read_bundle(tmp_path / "b").summary
     assert f"written: {tmp_path / 'b'}" in done.stderr
 
@@ -366,7 +368,7 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
-            (("--switch", "reading.present"), "--switch: expected NAME=VALUE, found 'reading.present'"),
+            (("--switch", "reading.danger_distance"), "--switch: expected NAME=VALUE, found 'reading.danger_distance'"),
             (("--by", "wether"), "Invalid value for '--by'"),
             (("--protocol", "boxy"), "Invalid value for '--protocol'"),
         ],

@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ReleaseError, TokenError
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
@@ -69,7 +70,7 @@ class FileCount:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SplitFiles:
+class SplitFiles(ShortRepr):
     """What is here of the scenarios of a split.
 
     Attributes:

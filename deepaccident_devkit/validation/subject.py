@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +17,6 @@ from deepaccident_devkit.tables.build import ScenarioFiles, scenario_boxes
 from deepaccident_devkit.tables.scan import frame_ranges
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
 from deepaccident_devkit.validation.codes import CODES
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 _SURE_REACH = 35.0
 """Metres at the most within which a label is taken to be complete."""
@@ -113,6 +109,8 @@ class Subject:
         rows = np.flatnonzero((self.label_id == UNTRACKED_ID) & (self.boxes.agent == agent))
         if not len(rows) or not len(frames):
             return np.zeros(len(frames), dtype=bool)
+        from scipy.spatial import cKDTree
+
         tree = cKDTree(np.unique(tree_points(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE), axis=0))
         points = tree_points(places, frames, _UNTRACKED_PLACE)
         distance, _ = tree.query(points, distance_upper_bound=_UNTRACKED_PLACE)

@@ -70,7 +70,7 @@ def test_the_hidden_accident_is_foreseen_by_the_pole_and_named(da_hidden: DeepAc
     assert set(alarm.ids or ()) == set(collision["ids"])
     assert alarm.time == pytest.approx(1.5, abs=0.11)
     evaluator = AccidentEvaluator("boxes")
-    evaluator.update(token, [alarm], accident_context(da_hidden, token, 2.0))
+    evaluator.update(token, [alarm], None, accident_context(da_hidden, token, 2.0))
     assert evaluator.compute().position_error == pytest.approx(0, abs=1.5)
 
 

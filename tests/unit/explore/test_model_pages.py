@@ -564,7 +564,7 @@ def test_a_comparison_has_the_largest_differences_first(site: Site) -> None:
 
 
 def test_quiet_where_nothing_comes_is_better_than_a_false_alarm(da_motion: DeepAccident, tmp_path: Path) -> None:
-    setup = replace(BOXES, switches={"reading.present": False})
+    setup = replace(BOXES, switches={"reading.danger_distance": 0.5})
     selection = default_selection(setup, "train", scope="all")
     tokens = selection.tokens(da_motion)
     for name, foreseen in (("quiet", ()), ("loud", ELSEWHERE)):

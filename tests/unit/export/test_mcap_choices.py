@@ -59,11 +59,6 @@ def test_actors_are_those_that_the_chosen_agents_annotated(da: DeepAccident, sce
     assert len(message.entities) == len(da.boxes(f"{scenario}/infrastructure/002"))
 
 
-def test_labels_can_be_left_out(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
-    topics = set(exported(da, scenario, tmp_path, labels=False).messages)
-    assert topics == {"/log", "/tf", "/ego_vehicle/pose", "/time_to_impact"}
-
-
 @pytest.mark.slow
 def test_scenarios_without_labels_have_poses_and_no_boxes(own_release: Path, tmp_path: Path) -> None:
     for folder in list(own_release.glob("*/*/*/label")):

@@ -81,10 +81,10 @@ def test_every_file_says_version_protocol_and_partial(run: EvaluationRun, tmp_pa
 
 
 def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
-    switched = replace(run, setup=replace(run.setup, switches={"reading.present": False}))
+    switched = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
     summary = switched.summary()
-    assert summary["switches"] == {"reading.present": False}
-    assert summary["settings"]["choices"]["reading"]["present"] is False
+    assert summary["switches"] == {"reading.danger_distance": 0.5}
+    assert summary["settings"]["choices"]["reading"]["danger_distance"] == 0.5
     assert summary["counts"] == {"samples": 6, "scenarios": 2, "left_out": 0}
     assert summary["metrics"]["positives"] == 3
     assert {"python", "numpy"} <= summary["environment"].keys()

@@ -242,10 +242,10 @@ class TestRefused:
             EvaluationError, match=r"by the same rules: task 'accident' and 'motion'; protocol .*, and \d+"
         ):
             compare_bundles(a, motion_bundles[0], FEW)
-        other = saved("b", setup=replace(run.setup, switches={"reading.present": False}))
+        other = saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
         with pytest.raises(
             EvaluationError,
-            match=r"switches/reading.present 'absent' and False; settings/choices/reading/present True and False; eval",
+            match=r"switches/reading.danger_distance 'absent' and 0.5; settings/choices/reading/danger_distance 1.0",
         ):
             compare_bundles(a, other, FEW)
 
