@@ -134,11 +134,18 @@ class Index(ShortRepr):
         Broken scenarios are read: a file mended in place leaves its folder's time alone, and one that is restored from
         an archive may have the damaged one's size and time.
         """
-        sizes = {name: size for name, (size, _) in self.table_files.items()}
-        if self.fingerprint != fingerprint or (sizes and sizes != _sizes(self.tables_folder)):
+        if self.fingerprint != fingerprint or not self._has_sizes():
             return False
         broken = {problem.scenario: problem.contents for problem in self.problems if problem.contents}
         return all(contents_digest(each) == broken[each.token] for each in layout.scenarios if each.token in broken)
+
+    def is_whole(self) -> bool:
+        """Whether the content of all tables is what was written; by size first, for a hole has gigabytes to read."""
+        return self._has_sizes() and table_files(self.tables_folder) == self.table_files
+
+    def _has_sizes(self) -> bool:
+        sizes = {name: size for name, (size, _) in self.table_files.items()}
+        return not sizes or sizes == _sizes(self.tables_folder)
 
 
 def open_index(
@@ -290,8 +297,9 @@ def _written_tables(
     text = repr((SCHEMA_VERSION, made_from))
     name = _TABLES + hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
     folder, before = place_in(store.folder, name, opened=True), Index.read(store.folder)
-    files = table_files(folder)
-    if before is None or (before.tables, before.table_files) != (name, files):
+    if before is not None and before.tables == name and before.is_whole():
+        files = dict(before.table_files)
+    else:
         remove_in(store.folder, name)  # damaged, or of a process that was stopped before its manifest
         with replacing_folder(folder) as temporary:
             join_tables(temporary, [store.path(each.token) for each in outcomes], assigned)
