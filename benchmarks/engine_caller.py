@@ -20,7 +20,7 @@ from benchmarks.measure import best_of, one_core
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export import bulk
 from deepaccident_devkit.export.opencood import OpenCood
-from deepaccident_devkit.parallel import cluster_executor, run_batch
+from deepaccident_devkit.parallel import cluster_executor, run_batch, store
 from deepaccident_devkit.parallel.pool import own_workers
 
 WARMING_S = 0.5
@@ -119,7 +119,7 @@ def exported(dataset: DeepAccident, executor: Executor | None) -> tuple[float, f
         return results[0]
 
     form = OpenCood(without_clouds=True)  # the release has labels alone
-    with TemporaryDirectory(dir=dataset.dataroot.parent) as folder, mock.patch.object(bulk, "run_batch", timed):
+    with TemporaryDirectory(dir=dataset.dataroot.parent) as folder, mock.patch.object(store, "run_batch", timed):
         seconds = best_of(
             1, lambda: bulk.export_release(dataset, Path(folder) / "out", form, workers=1, executor=executor)
         )

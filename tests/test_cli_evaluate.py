@@ -223,14 +223,6 @@ class TestPartial:
         assert all("PARTIAL: 5 of 8 samples" in title for title in titles)
         assert "PARTIAL: 5 of 8 samples" in (tmp_path / "bundle" / "report.html").read_text(encoding="utf-8")
 
-    def test_the_list_that_was_meant(self, da_motion: DeepAccident, tmp_path: Path) -> None:
-        meant = da_motion.evaluation_samples("train", "paper", scope="all")
-        results = write_accidents(da_motion, tmp_path / "all.json", meant)
-        with pytest.raises(
-            ResultsError, match=r"made for split train, samples evaluate \(the last 2 s\), scope all, all"
-        ):
-            evaluate("accident", da_motion.dataroot, "--results", results, "--protocol", "boxes", "--split", "train")
-
 
 class TestVerify:
     def test_the_same(self, bundle: Path, da_motion: DeepAccident) -> None:

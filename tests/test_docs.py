@@ -67,6 +67,7 @@ STAND_FOR = {
 """What the words in capitals of a command line may be."""
 NOT_RUN = {
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
+    "safety describe OUT": "of what synth makes",
     "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
     "info s3:": "tests/cloud has releases on S3",
     "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",

@@ -292,9 +292,8 @@ def _evaluate(release: DeepAccident, out: Path) -> None:
 
 
 def _next_steps(out: Path) -> tuple[NextStep, ...]:
-    root, five, scenario, results = (
-        shlex.quote(str(path)) for path in (out / "release", out / "five_agents", out / _SCENARIO_FILE, out / _RESULTS)
-    )
+    names = ("release", "five_agents", "own", _SCENARIO_FILE, _RESULTS)
+    root, five, own, scenario, results = (shlex.quote(str(out / name)) for name in names)
     of_both = f"--split {_SELECTION.split} --scope {_SELECTION.scope}"
     return (
         NextStep("See what the release holds:", f"deepaccident info {root} --where collision=true"),
@@ -313,6 +312,6 @@ def _next_steps(out: Path) -> tuple[NextStep, ...]:
         ),
         NextStep(
             "Edit the scenario file of the accident, such as its weather, and see what happens in it:",
-            f"deepaccident synth --design {scenario} --check",
+            f"deepaccident synth {own} --design {scenario} --scenarios 2 --sensors none",
         ),
     )
