@@ -86,7 +86,7 @@ class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     frames: Annotated[Count, Meta(description="T: how many a prediction has, the present one first.")]
     step: Annotated[float, Meta(gt=0, description="Seconds from one frame to the next.")]
     labels: Annotated[
-        Literal[(*LABEL_PROTOCOLS, None)],  # type: ignore[valid-type]
+        Literal[(*LABEL_PROTOCOLS,)] | None,  # type: ignore[valid-type]
         Meta(description="The label protocol that the model learned from."),
     ]
 
