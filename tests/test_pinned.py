@@ -18,6 +18,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.geometry.quaternions import to_matrix
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, MotionLabelConfig, motion_labels
 
@@ -74,10 +75,17 @@ def same(found: Any, expected: Any) -> bool:
 def tables(da: DeepAccident, _: DeepAccident, __: Path) -> Pins:
     """Each column of each table."""
     return {
-        f"{table}.{column}": pin(da.arrow(table)[column].to_pylist())
+        f"{table}.{column}": pin(turns(column, da.arrow(table)[column].to_pylist()))
         for table in da.table_names
         for column in da.arrow(table).column_names
     }
+
+
+def turns(column: str, values: Any) -> Any:
+    """A column; rotations as matrices, headings by cosine and sine: half a turn has two quaternions and two angles."""
+    if column == "rotation":
+        return to_matrix(values)
+    return [np.cos(values), np.sin(values)] if column == "yaw" else values
 
 
 def pairs(_: DeepAccident, da: DeepAccident, __: Path) -> Pins:
