@@ -285,7 +285,7 @@ class _Export:
             if tally.samples:
                 count = len(scenarios)
                 linked = {way: number * count for way, number in tally.linked.items()}
-                files, size = tally.files * count, tally.bytes * count
+                files, size = tally.files * len(units), tally.bytes * count  # a unit of many has one file for all
                 return Tally(samples=tally.samples * count, files=files, bytes=size, linked=linked)
         if alone and not failed:
             raise NotAvailableError(self.form.nothing)
