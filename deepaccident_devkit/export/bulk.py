@@ -23,7 +23,7 @@ from deepaccident_devkit.errors import ConfigError, ExportError, MissingFileErro
 from deepaccident_devkit.export.format import Format, Link, Output, Tally, Unit, flat_name
 from deepaccident_devkit.files import path_of, place_in, remove_in, remove_leftovers, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_record
-from deepaccident_devkit.parallel import Engine, Places, Store, run_batch
+from deepaccident_devkit.parallel import Engine, Failure, Places, Store, Tried, check_failures, run_batch
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders, sensor_digest
 from deepaccident_devkit.release.layout import ScenarioFolder
@@ -49,8 +49,8 @@ _RECORD: Final = 2
 _SENSORS: Final = "sensors"
 """Name of the hash of the list of a scenario's sensor files, beside the hashes of its truth."""
 States: TypeAlias = "Mapping[str, dict[str, str | None]]"
-Job: TypeAlias = tuple[Unit, tuple[ScenarioFolder, ...]]
-"""A unit, and where its scenarios lie."""
+Job: TypeAlias = "tuple[Unit, States | Failure]"
+"""A unit, and the states of its scenarios."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,21 +213,22 @@ def export_release(
     folders = scenario_folders(dataset, scenarios)
     if absent := [token for token in scenarios if token not in folders]:
         raise MissingFileError(f"{dataset.dataroot}: scenario {absent[0]} is gone; open the release again")
+    groups = [[folders[token] for token in unit.scenarios] for unit in units]
+    # also if nothing is there yet: workers that cannot do the work say so before a folder is made
+    states = run_batch(Tried(export.states), groups, label="comparing", places=Places(reads=dataset.places), **how)
+    jobs = {unit.name: (unit, found) for unit, found in zip(units, states, strict=True)}
     if manifest.release:
-        reads = Places(reads=dataset.places)
-        states = run_batch(export.state, list(folders.values()), label="comparing", places=reads, **how)
-        if _is_current(root, manifest.release.scenarios, dict(zip(folders, states, strict=True))):
+        check_failures(zip(jobs, states, strict=True), str(root))
+        if _is_current(root, manifest.release.scenarios, _all_states(jobs)):
             return Exported(folder=root, written=0, kept=len(units), tally=manifest.written)
-    jobs = {unit.name: (unit, tuple(folders[token] for token in unit.scenarios)) for unit in units}
     whole, written = export.completed(manifest, jobs, how)
     return Exported(folder=root, written=written, kept=len(units) - written, tally=whole.written)
 
 
 @dataclass(frozen=True, slots=True)
 class _Done:
-    """A unit that was written: the states of its scenarios and its counts, and whether that was now."""
+    """A unit that was written: its counts, and whether that was now."""
 
-    scenarios: States
     tally: Tally
     new: bool
 
@@ -284,7 +285,7 @@ class _Export:
             if tally.samples:
                 count = len(scenarios)
                 linked = {way: number * count for way, number in tally.linked.items()}
-                files, size = tally.files * count, tally.bytes * count
+                files, size = tally.files * len(units), tally.bytes * count  # a unit of many has one file for all
                 return Tally(samples=tally.samples * count, files=files, bytes=size, linked=linked)
         if alone and not failed:
             raise NotAvailableError(self.form.nothing)
@@ -302,15 +303,17 @@ class _Export:
             output.tally.bytes += sum(each.stat().st_size for each in measured.rglob("*") if each.is_file())
         return output.tally
 
-    def state(self, folder: ScenarioFolder) -> dict[str, str | None]:
-        """What is compared of a scenario: the hashes of its truth, and of the list of its sensor files."""
+    def states(self, folders: Sequence[ScenarioFolder]) -> States:
+        """What is compared of scenarios: the hashes of their truth, and of the lists of their sensor files."""
         sensors = self.form.sensors()
-        listed = {_SENSORS: sensor_digest(folder, sensors)} if sensors else {}
-        return {**folder_hashes(folder).as_dict(), **listed}
+        return {
+            each.token: folder_hashes(each).as_dict() | ({_SENSORS: sensor_digest(each, sensors)} if sensors else {})
+            for each in folders
+        }
 
     def completed(self, before: Manifest, jobs: Mapping[str, Job], how: Engine) -> tuple[Manifest, int]:
         """Write what is left, beside others that write it; the manifest, and how many units are new."""
-        units, store = [unit for unit, _ in jobs.values()], self.store
+        store = self.store
 
         def by_another() -> Manifest | None:
             """The manifest, if another process has completed the export meanwhile."""
@@ -320,7 +323,7 @@ class _Export:
         def begin() -> None:
             if by_another() is None:
                 Manifest(format=self.form.name, settings=before.settings).write(self.root)
-                self._remove_others({unit.name for unit in units})
+                self._remove_others(jobs)
 
         with store.shared(begin, tidy=self._remove_half_written) as turn:
             if (whole := by_another()) is not None:
@@ -329,7 +332,7 @@ class _Export:
             places = Places(reads=self.dataset.places, writes=(self.root,))
             done = store.run(self.write, jobs, label=self.form.name, places=places, **how)
             if turn.alone() and by_another() is None:
-                whole = self._finished(units, list(done.values()), before.settings)
+                whole = self._finished(jobs, list(done.values()), before.settings)
                 self._remove_kept()
                 whole.write(self.root)
             else:
@@ -338,18 +341,19 @@ class _Export:
 
     def write(self, job: Job) -> _Done:
         """Write a unit, unless it was written from the same files before."""
-        unit, folders = job
-        states = {each.token: self.state(each) for each in folders}
+        unit, states = job
+        if isinstance(states, Failure):
+            raise ReleaseError(states.message)
         key = digest_of({"devkit": __version__, "record": _RECORD, "states": states})
         name = f"{self.form.name}/{unit.name}/{_DONE}"
         if (content := self.store.kept(name, key)) is not None:
-            return _Done(states, parsed_record(content, Tally), new=False)
+            return _Done(parsed_record(content, Tally), new=False)
         with self._output(unit) as output:
             self.form.write(self.dataset, unit, output)
         self.store.keep(name, key, json.dumps(asdict(output.tally)).encode())
-        return _Done(states, output.tally, new=True)
+        return _Done(output.tally, new=True)
 
-    def _finished(self, units: Sequence[Unit], done: Sequence[_Done], settings: dict[str, Any]) -> Manifest:
+    def _finished(self, jobs: Mapping[str, Job], done: Sequence[_Done], settings: dict[str, Any]) -> Manifest:
         """Write what spans units; the manifest of the complete export. If there is no sample, nothing is left."""
         if not any(each.tally.samples for each in done):
             self._remove_others(())
@@ -360,11 +364,10 @@ class _Export:
                 self.root.rmdir()
             raise NotAvailableError(self.form.nothing)
         with self._output() as output:
-            self.form.finish(self.dataset, units, output, self.parts)
-        scenarios: dict[str, dict[str, str | None]] = {}
+            self.form.finish(self.dataset, [unit for unit, _ in jobs.values()], output, self.parts)
         for each in done:
-            scenarios.update(each.scenarios)
             output.tally.add(each.tally)
+        scenarios = _all_states(jobs)
         made_from = MadeFrom(fingerprint=digest_of(_truth(scenarios)), scenarios=dict(sorted(scenarios.items())))
         return Manifest(format=self.form.name, settings=settings, release=made_from, written=output.tally)
 
@@ -441,6 +444,16 @@ def _chosen(dataset: Dataset, form: Format) -> list[str]:
     if not chosen:
         raise NotAvailableError("no scenario of this release is in that split and matches the filters; change them")
     return chosen
+
+
+def _all_states(jobs: Mapping[str, Job]) -> dict[str, dict[str, str | None]]:
+    """The states of the scenarios of all units, none of which has failed."""
+    return {
+        token: state
+        for _, states in jobs.values()
+        if not isinstance(states, Failure)
+        for token, state in states.items()
+    }
 
 
 def _truth(states: States) -> dict[str, dict[str, Any]]:

@@ -59,6 +59,17 @@ logger = logging.getLogger(__name__)
 _SPLITS: Final[Mapping[str | None, str]] = {"train": "train", "val": "validate", "test": "test", None: "unknown"}
 """Our split → their folder."""
 _AGENTS: Final = "agents.json"
+CAMERA_NAMES: Final[Mapping[str, str]] = {
+    "Camera_Front": "camera0",
+    "Camera_BackRight": "camera1",
+    "Camera_BackLeft": "camera2",
+    "Camera_Back": "camera3",
+    "Camera_FrontLeft": "camera4",
+    "Camera_FrontRight": "camera5",
+}
+"""Our camera → theirs. OPV2V has four: front, right rear, left rear, back; loaders leave out the other two."""
+_KMH: Final = 3.6
+_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,18 +216,6 @@ class Recording:
         return sum(len(files[channel]) for files in self._there.values())
 
 
-CAMERA_NAMES: Final[Mapping[str, str]] = {
-    "Camera_Front": "camera0",
-    "Camera_BackRight": "camera1",
-    "Camera_BackLeft": "camera2",
-    "Camera_Back": "camera3",
-    "Camera_FrontLeft": "camera4",
-    "Camera_FrontRight": "camera5",
-}
-"""Our camera → theirs. OPV2V has four: front, right rear, left rear, back; loaders leave out the other two."""
-_KMH: Final = 3.6
-
-
 class Moments:
     """The moments of one agent of a scenario, computed at once.
 
@@ -328,9 +327,6 @@ def carla_six(pose: ArrayLike) -> FloatArray:
     pitch = np.arcsin(np.clip(m[..., 2, 0], -1.0, 1.0))
     angles = np.degrees(np.stack([roll, yaw, pitch], axis=-1))
     return np.concatenate([m[..., :3, 3], angles], axis=-1)
-
-
-_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 
 
 def pcd_bytes(points: AnyArray) -> bytes:

@@ -81,6 +81,31 @@ the LiDAR frame, `category`, `actor_id` (−100 the agent itself, −1 untracked
 
 An unknown velocity of a box is null three times; `numpy.array(boxes["velocity"], dtype=float)` makes it NaN.
 """
+Frames = Literal["every", "keyframes"]
+_FACTS_BYTES: Final = 20_000
+"""Of a sample's JSON and of the headers of its files, about; shards are divided by it."""
+_IN_SHARDS: Final = (*CAMERAS, LIDAR)
+_TYPES: Final[Mapping[str, Any]] = {
+    **{f"{name}.jpg": "image" for name in CAMERA_NAMES.values()},
+    "lidar.npy": [["float32"]],
+    "json": JSON_TYPES,
+    **dict.fromkeys(("__key__", "__url__"), "string"),
+}
+"""Without these `datasets` guesses by five samples: wrongly if one of them lacks an image or an impact."""
+_BODY: Final = """\
+A sample is one agent at one frame. The names of its files begin with `<type>/<scenario>/<agent>/<NNN>`, in which a dot
+is written as %2E. Samples are ordered by scenario, then frame, then agent: those of one moment follow each other. The
+agents of a scenario are in one shard.
+
+| file | what |
+|---|---|
+| `camera_front.jpg`, … | the six cameras' images, byte by byte those of the release |
+| `lidar.npy` | float32 (N, 4): x, y, z in the LiDAR frame, intensity |
+| `json` | the fields below |
+
+A file that the release at hand lacks is missing in the sample, too.
+
+"""
 
 
 def sample_json(dataset: Dataset, sample: str, sizes: Mapping[str, tuple[int, int]]) -> bytes:
@@ -133,34 +158,6 @@ def _boxes(dataset: Dataset, sample: str) -> dict[str, Any]:
 def _nan_as_null(rows: FloatArray) -> list[list[float | None]]:
     """As lists; JSON has no NaN."""
     return [[None if value != value else value for value in row] for row in rows.tolist()]  # noqa: PLR0124 - NaN
-
-
-Frames = Literal["every", "keyframes"]
-
-_FACTS_BYTES: Final = 20_000
-"""Of a sample's JSON and of the headers of its files, about; shards are divided by it."""
-_IN_SHARDS: Final = (*CAMERAS, LIDAR)
-_TYPES: Final[Mapping[str, Any]] = {
-    **{f"{name}.jpg": "image" for name in CAMERA_NAMES.values()},
-    "lidar.npy": [["float32"]],
-    "json": JSON_TYPES,
-    **dict.fromkeys(("__key__", "__url__"), "string"),
-}
-"""Without these `datasets` guesses by five samples: wrongly if one of them lacks an image or an impact."""
-_BODY: Final = """\
-A sample is one agent at one frame. The names of its files begin with `<type>/<scenario>/<agent>/<NNN>`, in which a dot
-is written as %2E. Samples are ordered by scenario, then frame, then agent: those of one moment follow each other. The
-agents of a scenario are in one shard.
-
-| file | what |
-|---|---|
-| `camera_front.jpg`, … | the six cameras' images, byte by byte those of the release |
-| `lidar.npy` | float32 (N, 4): x, y, z in the LiDAR frame, intensity |
-| `json` | the fields below |
-
-A file that the release at hand lacks is missing in the sample, too.
-
-"""
 
 
 @dataclass(frozen=True, kw_only=True)

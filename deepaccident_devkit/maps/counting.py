@@ -23,6 +23,19 @@ from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE, FRAME_PERIOD
 
+logger = logging.getLogger(__name__)
+GROUND_CLASSES: Final = ("road", "road_line", "sidewalk", "other")
+"""What the ground of a cell can be; `other` is whatever else CARLA has a tag for: grass, buildings, trees, water."""
+HIDING: Final = ("pedestrian", "vehicle")
+"""What moves and hides the ground: a picture says nothing of the cells beneath."""
+_UNLABELLED: Final = 0
+"""CARLA's tag of what has none."""
+_MIDDLE: Final = (BEV_SHAPE[0] - 1) / 2
+"""Row and column of the agent."""
+REACH: Final = BEV_RESOLUTION * BEV_SHAPE[0] / 2
+"""Metres that a picture shows to each side of its agent."""
+Counts = NDArray[np.uint16]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TownMapConfig:
@@ -97,22 +110,6 @@ def chosen_frames(xy: FloatArray, config: TownMapConfig) -> IntArray:
     stretches = np.column_stack([travelled / config.travel, seconds / config.period + 1e-9]).astype(np.int64)
     begins = np.flatnonzero((np.diff(stretches, axis=0) > 0).any(axis=1)) + 1
     return np.unique(np.concatenate([[0], begins, [len(xy) - 1]]))
-
-
-logger = logging.getLogger(__name__)
-
-GROUND_CLASSES: Final = ("road", "road_line", "sidewalk", "other")
-"""What the ground of a cell can be; `other` is whatever else CARLA has a tag for: grass, buildings, trees, water."""
-HIDING: Final = ("pedestrian", "vehicle")
-"""What moves and hides the ground: a picture says nothing of the cells beneath."""
-_UNLABELLED: Final = 0
-"""CARLA's tag of what has none."""
-_MIDDLE: Final = (BEV_SHAPE[0] - 1) / 2
-"""Row and column of the agent."""
-REACH: Final = BEV_RESOLUTION * BEV_SHAPE[0] / 2
-"""Metres that a picture shows to each side of its agent."""
-
-Counts = NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

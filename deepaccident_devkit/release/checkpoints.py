@@ -16,8 +16,8 @@ from typing import Any, Final, NamedTuple, TypeAlias
 from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_member
 from deepaccident_devkit.release._unpickle import Machine, dict_of
 
-FAULTS: Final = (pickle.UnpicklingError, TypeError, AttributeError, IndexError, *DAMAGED_ARCHIVE)
-"""What a file that is no checkpoint, a damaged or a hostile one can raise."""
+FAULTS: Final = (pickle.UnpicklingError, TypeError, AttributeError, IndexError, Warning, *DAMAGED_ARCHIVE)
+"""What a file that is no checkpoint, a damaged or a hostile one can raise; a Warning where warnings are errors."""
 SIZES: Final[Mapping[str, int]] = {
     **dict.fromkeys(("float64", "int64"), 8),
     **dict.fromkeys(("float32", "int32"), 4),

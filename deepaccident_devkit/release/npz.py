@@ -24,8 +24,13 @@ KEY = "data"
 _ENDING = ".npy"
 _BARE_ARRAY = b"\x93NUMPY"
 """How a `.npy` file begins."""
-FAST = 1
-"""Level of compression: a BEV array of 4.3 MB takes 10 ms; zlib's default level takes 20 to 30, for a quarter of it."""
+_FAST = 1
+"""Level of compression: a BEV array of 4.3 MB takes 10 ms; zlib's default level takes 20 to 30, for a quarter of it.
+
+Of a cloud's numbers, of single precision, half of each is zeros; a higher level saves little more.
+"""
+TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 8, "vehicle": 10}
+"""The CARLA semantic tags that the reference renderer uses."""
 
 
 def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
@@ -48,7 +53,7 @@ def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
         raise SensorFileError(f"{path}: {detail}; {REMEDY}") from error
 
 
-def write_npz(path: Path, array: AnyArray, *, level: int = FAST) -> None:
+def write_npz(path: Path, array: AnyArray, *, level: int = _FAST) -> None:
     """Write `array` under `data`, compressed by zlib's `level`, 0 to 9; the same array gives the same bytes."""
     member = io.BytesIO()
     np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
@@ -65,10 +70,6 @@ def _array_member(path: ReleasePath, archive: zipfile.ZipFile) -> zipfile.ZipInf
         found = ", ".join(entry.filename.removesuffix(_ENDING) for entry in entries) or "no array"
         raise SensorFileError(f"{path}: expected an array named '{KEY}', found {shortened(found)}; {REMEDY}")
     return named[0]
-
-
-_LEVEL = 1
-"""Of compression: the numbers have single precision, so half of each is zeros; a higher level saves little more."""
 
 
 @overload
@@ -104,11 +105,7 @@ def write_lidar(path: Path, xyz: ArrayLike, intensity: ArrayLike) -> None:
     """
     points = flip_points(checked("xyz", xyz, (None, 3)))
     values = checked("intensity", intensity, (len(points),))
-    write_npz(path, np.column_stack([points, values]).astype(np.float32).astype(np.float64), level=_LEVEL)
-
-
-TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 8, "vehicle": 10}
-"""The CARLA semantic tags that the reference renderer uses."""
+    write_npz(path, np.column_stack([points, values]).astype(np.float32).astype(np.float64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +157,7 @@ def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
     return BevImage(data[..., 2].copy(), instance)
 
 
-def write_bev(path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = FAST) -> None:
+def write_bev(path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = _FAST) -> None:
     """Write tags and object ids, both (1200, 1200), forward up; `level` is that of `npz.write_npz`."""
     high, low = instance >> 8, instance & 255
     write_npz(path, np.stack([high, low, semantic], axis=-1).astype(np.uint8), level=level)

@@ -31,6 +31,26 @@ Kind = Literal["word", "number", "measure", "flag"]
 STRAIGHT: Final = "straight_straight"
 TURNING: Final = "one_of_the_agents_turning"
 _WEATHER_GROUPS: Final = {"Rain": "Rainy", "Cloudy": "Cloudy", "Clear": "Clear"}
+_OF_MOVING_PAIRS: Final = {
+    "min_ttc": "Least time to collision of moving pairs (s).",
+    "min_pet": "Least post-encroachment time of moving pairs (s).",
+    "min_gap": "Least gap between moving pairs (m).",
+    "max_drac": "The most deceleration that a moving pair needs to avoid a crash (m/s²).",
+}
+_SHORT = {"type": "scenario_type", "length": "num_frames"}
+_WORTH_A_BAR: Final = 32
+"""Scenarios whose interactions take some seconds, if none are kept."""
+_FEW: Final = ("scenario_type", "town")
+"""Columns of words that are not limited, yet few."""
+_KNOWN: dict[str, Sequence[str | int]] = {
+    "town": taxonomy.TOWNS,
+    "weather": taxonomy.WEATHERS,
+    "road_type": taxonomy.ROAD_TYPES,
+    "spawn_side": taxonomy.SPAWN_SIDES,
+    "ego_direction": taxonomy.DIRECTIONS,
+    "other_direction": taxonomy.DIRECTIONS,
+    "accident_type": range(1, 13),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,26 +218,6 @@ _MEASURES: Final[Mapping[str, Callable[[InteractionPairs, BoolArray], float]]] =
     "min_pet": lambda pairs, moving: _least(np.abs(pairs.pet[moving])),
     "min_gap": lambda pairs, moving: _least(pairs.min_gap[moving]),
     "max_drac": lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0)),
-}
-_OF_MOVING_PAIRS: Final = {
-    "min_ttc": "Least time to collision of moving pairs (s).",
-    "min_pet": "Least post-encroachment time of moving pairs (s).",
-    "min_gap": "Least gap between moving pairs (m).",
-    "max_drac": "The most deceleration that a moving pair needs to avoid a crash (m/s²).",
-}
-_SHORT = {"type": "scenario_type", "length": "num_frames"}
-_WORTH_A_BAR: Final = 32
-"""Scenarios whose interactions take some seconds, if none are kept."""
-_FEW: Final = ("scenario_type", "town")
-"""Columns of words that are not limited, yet few."""
-_KNOWN: dict[str, Sequence[str | int]] = {
-    "town": taxonomy.TOWNS,
-    "weather": taxonomy.WEATHERS,
-    "road_type": taxonomy.ROAD_TYPES,
-    "spawn_side": taxonomy.SPAWN_SIDES,
-    "ego_direction": taxonomy.DIRECTIONS,
-    "other_direction": taxonomy.DIRECTIONS,
-    "accident_type": range(1, 13),
 }
 _DERIVED = (
     Field(

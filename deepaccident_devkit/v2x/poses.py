@@ -17,6 +17,9 @@ from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, six_vectors
 from deepaccident_devkit.geometry.se3 import inverses
 
+Poses = Sequence[SE3] | ArrayLike
+"""Poses of several agents or moments: SE3 objects, or an array (K, 4, 4)."""
+
 
 def transform(
     dataset: Dataset,
@@ -46,10 +49,6 @@ def transform(
         )
     world_from_target = dataset.world_from(target_sample, target)
     return world_from_target.inverse() @ dataset.world_from(source_sample, source)
-
-
-Poses = Sequence[SE3] | ArrayLike
-"""Poses of several agents or moments: SE3 objects, or an array (K, 4, 4)."""
 
 
 def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:

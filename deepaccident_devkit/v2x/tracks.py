@@ -13,6 +13,8 @@ from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+_MOVED = ("center", "rotation", "velocity")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trajectory(FrozenArrays):
@@ -144,6 +146,3 @@ def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
     )
     index = columns["frame_row"][rows].astype(np.int64) - first_frame + 1
     return ScenarioTracks(boxes=boxes, index=index, agents=columns["agents"][rows])
-
-
-_MOVED = ("center", "rotation", "velocity")

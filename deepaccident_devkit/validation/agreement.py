@@ -37,6 +37,8 @@ _ITSELF = 3.0
 """Metres around an agent's origin in which others see the agent itself."""
 SAME_PLACE = 0.1
 """Metres within which boxes of two agents are the same thing; different ids then contradict."""
+COLLIDING_NORMAL = ("Town07_type001_subtype0002_scenario00028",)
+"""Scenarios of the release's _normal folders whose meta names a collision."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,10 +189,6 @@ def _ids(subject: Subject) -> Iterator[Finding]:
 def _wrapped(angle: FloatArray) -> FloatArray:
     """Angles in (−π, π]."""
     return np.arctan2(np.sin(angle), np.cos(angle))
-
-
-COLLIDING_NORMAL = ("Town07_type001_subtype0002_scenario00028",)
-"""Scenarios of the release's _normal folders whose meta names a collision."""
 
 
 def check_story(subject: Subject) -> Iterator[Finding]:

@@ -26,6 +26,8 @@ Recording = tuple[str, str]
 
 Inventory = Mapping[Recording, list[int]]
 """Frame numbers of the sensor folders of a scenario that have any."""
+_NAMED = 3
+"""Repeated lines that a finding names at most."""
 
 
 def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Inventory, list[Finding]]:
@@ -97,10 +99,6 @@ def _frame_findings(
             yield make_finding("sensor-empty", scenario.token, str(path), "has no bytes")
         elif irregular and entry.name.endswith(f".{CHANNEL_FORMAT[channel]}"):
             yield make_finding("sensor-irregular", scenario.token, str(path), irregular)
-
-
-_NAMED = 3
-"""Repeated lines that a finding names at most."""
 
 
 def check_splits(layout: ReleaseLayout) -> tuple[ReleaseLayout, list[Finding]]:

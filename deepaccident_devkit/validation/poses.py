@@ -38,6 +38,13 @@ _JUMP = 0.75
 _LAST_FRAMES = 2
 _SPEED_DIFFERENCE = (1.0, 0.2)
 """m/s, and as a share of the speed, between a label's first line and the displacement around it."""
+_ACTOR_OFF = (3, 0.8)
+"""How many boxes of an actor, and which share of them, must not fit for a finding."""
+NEAR = 15.0
+"""Metres within which a vehicle that the agent saw is not too far away to be tracked."""
+_LEAST_BOXES = 2
+"""The number of boxes that must show it: the tracking of a single one comes and goes."""
+_VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
 
 
 def check_poses(subject: Subject) -> Iterator[Finding]:
@@ -164,10 +171,6 @@ def _central(position: FloatArray) -> FloatArray:
 _CHECKS: tuple[Callable[[Subject, int], Iterator[Finding]], ...] = (_intrinsics, _cameras, _mounts, _path, _speed)
 
 
-_ACTOR_OFF = (3, 0.8)
-"""How many boxes of an actor, and which share of them, must not fit for a finding."""
-
-
 def check_velocities(subject: Subject, fit: VelocityFit) -> Iterator[Finding]:
     """Say that another frame than the release's fits, that none does, or which actors' velocities do not fit."""
     if fit.boxes < LEAST_BOXES:
@@ -195,13 +198,6 @@ def _actors_off(subject: Subject, frame: str) -> Iterator[Finding]:
     off = (wrong >= least) & (wrong >= share * count)
     wrong_rows = subject.mask(rows[off[track] & ~fits[frame]])
     yield from subject.label_findings("velocity-off", wrong_rows, "velocities do not fit the displacement")
-
-
-NEAR = 15.0
-"""Metres within which a vehicle that the agent saw is not too far away to be tracked."""
-_LEAST_BOXES = 2
-"""The number of boxes that must show it: the tracking of a single one comes and goes."""
-_VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
 
 
 def check_untracked(subject: Subject) -> Iterator[Finding]:

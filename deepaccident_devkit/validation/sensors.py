@@ -46,6 +46,43 @@ _SHARES = (0.299, 0.587, 0.114)
 """Of red, green and blue in the brightness."""
 _MORE = bytes(range(1, 251)) * 40
 """Data that a decoder of a whole picture does not look at."""
+_KINDS: dict[str, FileKind] = {LIDAR: "lidar", BEV_CAMERA: "bev"}
+LIDAR_RANGE = 75.0
+"""Metres; the real LiDAR ends at 70."""
+POINT_COUNT = (5, 0.25)
+"""Points, and as a share, by which a box's count may be off: label and cloud are not of exactly one instant, and real
+cars are off by up to 12 points, or 24 % of a few."""
+WALKER_POINT_COUNT = (30, 0.25)
+"""The same for pedestrians, whose real boxes change their size between the count and the label."""
+_LARGE_COUNT = (25, 300)
+"""Points by which one box alone may be off, and a pedestrian's: the release has 77 for 55, and 486 for 260."""
+_FRAME_OFF = (2, 0.25)
+"""Boxes of one label, and their share of those with points, that are off if the cloud is not the label's."""
+_AGENT_OFF = (3, 0.15)
+"""The same for all labels of an agent, of whose boxes up to 7.5 % are off in the release."""
+_BEV_HALF = 55.0
+_VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
+_BEV_LEAST_SHARE = 0.5
+_THUMBNAIL = (32, 18)
+_OUT_OF_SEQUENCE = 3.0
+"""The largest ratio of an image's distance from its neighbours in time to their distance from each other."""
+_LEAST_DIFFERENCE = 6.0
+"""Grey levels; below it images are the same to the eye."""
+_BLANK = 40.0
+"""Grey levels between the darkest and the lightest spot of a picture that shows something."""
+_STILL = 0.02
+"""Metres an agent may move while its pictures stay the same."""
+ORIENTATIONS: dict[str, str] = {
+    "forward-up": "as the format says",
+    "mirrored": "left and right exchanged",
+    "backward-up": "turned by half",
+    "mirrored-backward": "front and rear exchanged",
+    "left-up": "turned by a quarter, left up",
+    "right-up": "turned by a quarter, right up",
+    "transposed": "rows and columns exchanged",
+    "anti-transposed": "rows and columns exchanged, and turned by half",
+}
+"""The eight ways in which the BEV camera's picture could lie."""
 
 
 def zero_stretch(content: bytes) -> tuple[int, int] | None:
@@ -94,46 +131,6 @@ def _decoded(content: bytes) -> Any:
             return np.asarray(image.convert("RGB"))
     except (OSError, ValueError, SyntaxError):
         return None
-
-
-_KINDS: dict[str, FileKind] = {LIDAR: "lidar", BEV_CAMERA: "bev"}
-LIDAR_RANGE = 75.0
-"""Metres; the real LiDAR ends at 70."""
-POINT_COUNT = (5, 0.25)
-"""Points, and as a share, by which a box's count may be off: label and cloud are not of exactly one instant, and real
-cars are off by up to 12 points, or 24 % of a few."""
-WALKER_POINT_COUNT = (30, 0.25)
-"""The same for pedestrians, whose real boxes change their size between the count and the label."""
-_LARGE_COUNT = (25, 300)
-"""Points by which one box alone may be off, and a pedestrian's: the release has 77 for 55, and 486 for 260."""
-_FRAME_OFF = (2, 0.25)
-"""Boxes of one label, and their share of those with points, that are off if the cloud is not the label's."""
-_AGENT_OFF = (3, 0.15)
-"""The same for all labels of an agent, of whose boxes up to 7.5 % are off in the release."""
-_BEV_HALF = 55.0
-_VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
-_BEV_LEAST_SHARE = 0.5
-_THUMBNAIL = (32, 18)
-_OUT_OF_SEQUENCE = 3.0
-"""The largest ratio of an image's distance from its neighbours in time to their distance from each other."""
-_LEAST_DIFFERENCE = 6.0
-"""Grey levels; below it images are the same to the eye."""
-_BLANK = 40.0
-"""Grey levels between the darkest and the lightest spot of a picture that shows something."""
-_STILL = 0.02
-"""Metres an agent may move while its pictures stay the same."""
-
-ORIENTATIONS: dict[str, str] = {
-    "forward-up": "as the format says",
-    "mirrored": "left and right exchanged",
-    "backward-up": "turned by half",
-    "mirrored-backward": "front and rear exchanged",
-    "left-up": "turned by a quarter, left up",
-    "right-up": "turned by a quarter, right up",
-    "transposed": "rows and columns exchanged",
-    "anti-transposed": "rows and columns exchanged, and turned by half",
-}
-"""The eight ways in which the BEV camera's picture could lie."""
 
 
 @dataclass(slots=True)

@@ -45,6 +45,23 @@ from deepaccident_devkit.v2x.configurations import Agents, agents_of, cooperatin
 
 _FRAME_NANOSECONDS: Final = 100_000_000
 _SECOND_NANOSECONDS: Final = 1_000_000_000
+COLORED_POINT: Final = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
+)
+"""A point of a rendering; viewers take the colour from the last four fields."""
+_NUMERIC_TYPES: Final = {
+    np.dtype("u1"): PackedElementField.UINT8,
+    np.dtype("<i4"): PackedElementField.INT32,
+    np.dtype("<f4"): PackedElementField.FLOAT32,
+}
+_NO_TURN: Final = np.array([1.0, 0.0, 0.0, 0.0])
+_FACE_ALPHA: Final = 0.4
+_LINE_PIXELS: Final = 2.0
+_TEXT_PIXELS: Final = 14.0
+_TEXT_ABOVE: Final = 0.6
+"""Metres from a box's top to its text."""
+POINT_SPACING: Final = 0.25
+"""Metres between the points of a rendered line."""
 
 
 def frame_nanoseconds(index: int) -> int:
@@ -167,17 +184,6 @@ class Roles:
         return ", ".join([*words, "collides"] if actor in self.pair else words)
 
 
-COLORED_POINT: Final = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
-)
-"""A point of a rendering; viewers take the colour from the last four fields."""
-_NUMERIC_TYPES: Final = {
-    np.dtype("u1"): PackedElementField.UINT8,
-    np.dtype("<i4"): PackedElementField.INT32,
-    np.dtype("<f4"): PackedElementField.FLOAT32,
-}
-
-
 def frame_id(agent: str, frame: str) -> str:
     """The name of a sample's coordinate frame: `world`; for `ego` the agent's name; for a sensor `agent/channel`."""
     if frame == "world":
@@ -243,16 +249,6 @@ def cloud_message(points: AnyArray, frame: str, index: int) -> Any:
         ],
         data=points.tobytes(),
     )
-
-
-_NO_TURN: Final = np.array([1.0, 0.0, 0.0, 0.0])
-_FACE_ALPHA: Final = 0.4
-_LINE_PIXELS: Final = 2.0
-_TEXT_PIXELS: Final = 14.0
-_TEXT_ABOVE: Final = 0.6
-"""Metres from a box's top to its text."""
-POINT_SPACING: Final = 0.25
-"""Metres between the points of a rendered line."""
 
 
 def scene_update(entities: Sequence[Any], index: int) -> Any:

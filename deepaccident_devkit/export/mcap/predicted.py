@@ -49,6 +49,9 @@ FRAME_HEIGHT: Final = 0.2
 """Metres from each future frame up to the next one, so that no frame hides another."""
 _FADING: Final = 0.6
 """The share of its opacity that an instance has lost at the last frame."""
+_MARK: Final = 1.0
+"""Diameter of the spheres where an accident is predicted, metres."""
+_MARK_HEIGHT: Final = 1.0
 
 
 class MotionMaps:
@@ -112,11 +115,6 @@ def cell_points(
 def _colors(names: Sequence[int], chosen: Mapping[int, str]) -> AnyArray:
     colors: Any = [rgb(chosen.get(name, INSTANCE_COLORS[name % len(INSTANCE_COLORS)])) for name in names]
     return np.array(colors, dtype=np.uint8).reshape(-1, 3)
-
-
-_MARK: Final = 1.0
-"""Diameter of the spheres where an accident is predicted, metres."""
-_MARK_HEIGHT: Final = 1.0
 
 
 class PredictedScenes:

@@ -60,6 +60,15 @@ from deepaccident_devkit.v2x import cooperative_view
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
+METADATA: Final = "deepaccident_devkit"
+_LOG_EVERY: Final = 5
+"""Frames (0.1 s) between two lines of the countdown."""
+_SHOWN: Final = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
+LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+TRAIL_FRAMES: Final = 20
+"""How many frames (2 s) an actor's trail goes back, and its path goes ahead."""
+_PATH_ALPHA: Final = 0.5
+
 
 def write_poses(dataset: Dataset, moment: Moment, recording: Recording) -> None:
     """Write world → agent → sensors in one message, and each agent's pose in a message of its own."""
@@ -120,12 +129,6 @@ def _predicted(prediction: Predictions, moments: list[Moment], scenario: str) ->
     return scenes
 
 
-METADATA: Final = "deepaccident_devkit"
-_LOG_EVERY: Final = 5
-"""Frames (0.1 s) between two lines of the countdown."""
-_SHOWN: Final = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
-
-
 def scenario_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:
     """The file's metadata: the devkit's version, the scenario, a hash of its label, meta and calib files."""
     record = dataset.get("scenario", scenario)
@@ -177,9 +180,6 @@ class Story:
 def _log(text: str, index: int, recording: Recording, level: int = Log.INFO) -> None:
     message = Log(timestamp=frame_timestamp(index), level=level, message=text, name=METADATA)
     recording.write("/log", message, index)
-
-
-LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
 
 class Sensors:
@@ -240,11 +240,6 @@ def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str
         R=np.eye(3).ravel().tolist(),
         P=np.column_stack([lens.intrinsic, np.zeros(3)]).ravel().tolist(),
     )
-
-
-TRAIL_FRAMES: Final = 20
-"""How many frames (2 s) an actor's trail goes back, and its path goes ahead."""
-_PATH_ALPHA: Final = 0.5
 
 
 class Actors:

@@ -34,6 +34,16 @@ if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output
 
+_OF_UNITS: Final = (
+    *("log", "scene", "sample", "sample_data", "ego_pose", "calibrated_sensor"),
+    *("instance", "sample_annotation"),
+)
+_ATTRIBUTES: Final = (
+    *("vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider"),
+    *("pedestrian.moving", "pedestrian.standing", "pedestrian.sitting_lying_down"),
+)
+_VISIBILITIES: Final = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
+
 
 @dataclass(frozen=True, kw_only=True)
 class NuScenes(Format):
@@ -89,17 +99,6 @@ class NuScenes(Format):
         return [
             scene for token in unit.scenarios for scene in scenes_of(dataset, token, self.agents, sweeps=self.sweeps)
         ]
-
-
-_OF_UNITS: Final = (
-    *("log", "scene", "sample", "sample_data", "ego_pose", "calibrated_sensor"),
-    *("instance", "sample_annotation"),
-)
-_ATTRIBUTES: Final = (
-    *("vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider"),
-    *("pedestrian.moving", "pedestrian.standing", "pedestrian.sitting_lying_down"),
-)
-_VISIBILITIES: Final = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
 
 
 def write_part(folder: Path, scenes: Sequence[Rows]) -> None:

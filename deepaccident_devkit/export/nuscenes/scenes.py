@@ -46,6 +46,30 @@ ENDINGS: Final = MappingProxyType({**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "pcd.
 _EPOCH: Final = 1_600_000_000_000_000
 _HOUR: Final = 3_600_000_000
 _PERIOD: Final = 100_000
+Row = dict[str, Any]
+Rows = Mapping[str, Sequence[Row]]
+"""Table → rows in their order."""
+Van = Literal["car", "truck"]
+CATEGORIES: Final = MappingProxyType(
+    {
+        "car": "vehicle.car",
+        "truck": "vehicle.truck",
+        "motorcycle": "vehicle.motorcycle",
+        "cyclist": "vehicle.bicycle",
+        "pedestrian": "human.pedestrian.adult",
+    }
+)
+"""Our class → nuScenes' category; vans are said to be one of the first two."""
+_SEEN: Final = MappingProxyType({True: "4", False: "1"})
+"""Whether a camera of the agent sees a box → nuScenes' visibility; the levels between cannot be known."""
+_MOVING: Final = 0.2
+"""m/s, above which an actor moves."""
+LidarAxes = Literal["ego", "nuscenes"]
+TURNS: Final = {
+    "ego": np.eye(3),
+    "nuscenes": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+}
+"""Axes → what turns points with x forward and y left into them; nuScenes' LiDAR has x right and y forward."""
 
 
 def token(kind: str, *parts: object) -> str:
@@ -73,11 +97,6 @@ def sensor_path(scene: str, channel: str, stamp: int, *, key: bool) -> str:
     """The path of a sensor file below the folder; `channel` is ours."""
     name = CHANNEL_NAMES[channel]
     return f"{'samples' if key else 'sweeps'}/{name}/{scene}__{name}__{stamp}.{ENDINGS[channel]}"
-
-
-Row = dict[str, Any]
-Rows = Mapping[str, Sequence[Row]]
-"""Table → rows in their order."""
 
 
 @dataclass(frozen=True)
@@ -201,23 +220,6 @@ def linked(rows: list[Row]) -> list[Row]:
     return rows
 
 
-Van = Literal["car", "truck"]
-CATEGORIES: Final = MappingProxyType(
-    {
-        "car": "vehicle.car",
-        "truck": "vehicle.truck",
-        "motorcycle": "vehicle.motorcycle",
-        "cyclist": "vehicle.bicycle",
-        "pedestrian": "human.pedestrian.adult",
-    }
-)
-"""Our class → nuScenes' category; vans are said to be one of the first two."""
-_SEEN: Final = MappingProxyType({True: "4", False: "1"})
-"""Whether a camera of the agent sees a box → nuScenes' visibility; the levels between cannot be known."""
-_MOVING: Final = 0.2
-"""m/s, above which an actor moves."""
-
-
 def box_rows(scene: Scene, van: Van, output: Output) -> Rows:
     """The rows of `instance` and `sample_annotation`: an actor has an instance of its own in each scene.
 
@@ -298,14 +300,6 @@ def _instance(rows: list[Row], van: Van) -> Row:
         "actor_id": rows[0]["actor_id"],
         "category_deepaccident": category,
     }
-
-
-LidarAxes = Literal["ego", "nuscenes"]
-TURNS: Final = {
-    "ego": np.eye(3),
-    "nuscenes": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-}
-"""Axes → what turns points with x forward and y left into them; nuScenes' LiDAR has x right and y forward."""
 
 
 def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:

@@ -47,6 +47,20 @@ QUESTIONS: Final = "questions.jsonl"
 TRUTH: Final = "truth.jsonl"
 _ID: Final = slice(len('{"id": "'), len('{"id": "') + 16)
 """Where the id stands in a line."""
+_ABSENT: Final = "agents of scenarios that are not in this release"
+_ALONE: Final = "recordings whose observers are not all in this release"
+_SHORT: Final = "recordings that are too short for a window"
+_UNLABELLED: Final = "windows with a moment at which an observer has no label"
+FOLDER: Final = "questions"
+"""Of what may be handed out, in the export's folder."""
+_MISSING: Final = "pictures that are not in this release"
+Pair: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
+"""A question and its truth."""
+_SECOND: Final = round(1 / FRAME_PERIOD)
+_DESIGN: Final = ("accident_type", "signalized", "spawn_side", "ego_direction", "other_direction")
+_CONTACT: Final = ("sides", "speeds", "closing_speed", "impact_angle", "gap")
+Seconds = list[bool | None]
+"""Whether there is an accident in each second ahead; None where the recording does not say."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,19 +183,6 @@ def _names(argument: str, given: str | Sequence[str], words: Sequence[Word]) -> 
     return tuple(name for name in words if name in named)
 
 
-_ABSENT: Final = "agents of scenarios that are not in this release"
-_ALONE: Final = "recordings whose observers are not all in this release"
-_SHORT: Final = "recordings that are too short for a window"
-_UNLABELLED: Final = "windows with a moment at which an observer has no label"
-FOLDER: Final = "questions"
-"""Of what may be handed out, in the export's folder."""
-_MISSING: Final = "pictures that are not in this release"
-
-
-Pair: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
-"""A question and its truth."""
-
-
 def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Output) -> list[Pair]:
     """The questions of a scenario, given by its token; puts the pictures there, and counts what is left out."""
     record = dataset.scenario.get(scenario)
@@ -260,13 +261,6 @@ def _agents_of(dataset: Dataset, scenario: str, ego: AgentName, wanted: str | tu
         return cooperating_agents(dataset, sample_token(scenario, ego, 1), named)
     except NotAvailableError:
         return ()
-
-
-_SECOND: Final = round(1 / FRAME_PERIOD)
-_DESIGN: Final = ("accident_type", "signalized", "spawn_side", "ego_direction", "other_direction")
-_CONTACT: Final = ("sides", "speeds", "closing_speed", "impact_angle", "gap")
-Seconds = list[bool | None]
-"""Whether there is an accident in each second ahead; None where the recording does not say."""
 
 
 def unanswerable(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:

@@ -31,6 +31,14 @@ _STEP = KEY_STEP * FRAME_PERIOD
 RATE: Final = round(1 / _STEP)
 """Moments a second."""
 _SAME = 1e-6
+Seen = Literal["released", "camera", "annotated"]
+_VISIBLE: Final[dict[Seen, Visible | None]] = {"released": "released", "camera": "camera", "annotated": None}
+EGO: Final = "ego"
+_PLACES: Final = 2
+_ANGLES: Final = 3
+"""Decimals of metres and metres a second, and of radians."""
+CONDITIONS: Final = ("weather", "time_of_day", "road_type")
+"""Facts of the meta file that stand in a question: the others say, or hint at, how the recording ends."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,10 +108,6 @@ def _check_steps(name: str, value: float, *, least: int) -> None:
     steps = seconds / _STEP
     if not math.isfinite(steps) or steps < least - _SAME or abs(steps - round(steps)) > _SAME:
         raise ConfigError(f"{name}: expected seconds from {least * _STEP:g} in steps of {_STEP:g}, found {value!r}")
-
-
-Seen = Literal["released", "camera", "annotated"]
-_VISIBLE: Final[dict[Seen, Visible | None]] = {"released": "released", "camera": "camera", "annotated": None}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -225,14 +229,6 @@ class Observations:
 
     def _row(self, agent: AgentName, frame: int) -> int:
         return self.dataset.getind("sample", sample_token(self.scenario, agent, frame))
-
-
-EGO: Final = "ego"
-_PLACES: Final = 2
-_ANGLES: Final = 3
-"""Decimals of metres and metres a second, and of radians."""
-CONDITIONS: Final = ("weather", "time_of_day", "road_type")
-"""Facts of the meta file that stand in a question: the others say, or hint at, how the recording ends."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

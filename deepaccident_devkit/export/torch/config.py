@@ -32,6 +32,12 @@ BoxSource = Literal["sample", "cooperative"]
 AugmentationSource = Augmentation | Callable[[np.random.Generator], Augmentation]
 """One for all items, or a draw for each (`RandomAugmentation`; spawned workers cannot receive a lambda)."""
 _DEFAULT_STEP: Final = 5
+_PARTS: Final = (
+    ("images", ImageConfig, "an ImageConfig, such as ImageConfig(resize=(224, 400))"),
+    ("labels", (MotionLabelConfig, str), "a MotionLabelConfig, or the name of a preset"),
+    ("bev_segmentation", BevGrid, "the BevGrid that it is resampled to, such as BevGrid()"),
+)
+"""Field, its type or types, and the expected value in words for the error."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,14 +133,6 @@ class V2XConfig:
         if not isinstance(drawn, Augmentation):
             raise ConfigError(f"augmentation: its function must return an Augmentation, and returned {drawn!r}")
         return drawn
-
-
-_PARTS: Final = (
-    ("images", ImageConfig, "an ImageConfig, such as ImageConfig(resize=(224, 400))"),
-    ("labels", (MotionLabelConfig, str), "a MotionLabelConfig, or the name of a preset"),
-    ("bev_segmentation", BevGrid, "the BevGrid that it is resampled to, such as BevGrid()"),
-)
-"""Field, its type or types, and the expected value in words for the error."""
 
 
 def _count(name: str, value: object, least: int) -> int:

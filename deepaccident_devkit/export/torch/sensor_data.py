@@ -24,6 +24,8 @@ from deepaccident_devkit.v2x.messages import Message, messages
 _NO_POINTS: Final = np.zeros((0, 4), dtype=np.float32)
 Received = Sequence[Mapping[AgentName, Message]]
 """For each past frame, the present last: sender → its message, for messages that arrived."""
+_MATRICES: Final = {"intrinsics": 3, "ego_from_camera": 4, "image_from_ego": 4}
+"""Name → rows and columns."""
 
 
 def participants(dataset: Dataset, sample: str, agents: Agents) -> tuple[AgentName, ...]:
@@ -209,7 +211,3 @@ def _matrices(
         "ego_from_camera": ego_from_camera,
         "image_from_ego": projection @ np.linalg.inv(ego_from_camera),
     }
-
-
-_MATRICES: Final = {"intrinsics": 3, "ego_from_camera": 4, "image_from_ego": 4}
-"""Name → rows and columns."""

@@ -123,6 +123,7 @@ def test_shards_of_any_size_hold_the_same_samples(
 def test_the_plan_is_about_what_is_written(da: DeepAccident, exported: Exported) -> None:
     told = export_release(da, exported.folder.with_name("none"), WebDataset(), dry_run=True).tally
     assert told.samples == exported.tally.samples == len(da.sample)
+    assert told.files == exported.written  # shards, of several scenarios each
     assert told.bytes == pytest.approx(exported.tally.bytes, rel=0.05)
     assert exported.tally.left_out == {"files of the BEV camera": len(da.sample)}
 

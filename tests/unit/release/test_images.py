@@ -97,6 +97,13 @@ def test_damage_raises_our_error_or_nothing(
     assert image.dtype == np.uint8 if message is None else str(path) in message
 
 
+def test_a_png_is_read_and_the_callers(path: Path, quarters: np.ndarray) -> None:
+    Image.fromarray(quarters).save(path, "PNG")
+    image = read_image(path)
+    np.testing.assert_array_equal(image, quarters)
+    image[0, 0] = 1  # must not raise
+
+
 @pytest.mark.parametrize("kind", ["GIF", "TIFF", "BMP", "EPS", "PPM", "WEBP"])
 def test_other_formats_are_refused_whatever_their_name(path: Path, quarters: np.ndarray, kind: str) -> None:
     """Decoders of some start programs: EPS starts Ghostscript."""

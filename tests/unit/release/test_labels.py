@@ -354,6 +354,16 @@ def test_a_file_of_too_many_lines_is_refused(write, monkeypatch: pytest.MonkeyPa
         monkeypatch.delenv(LIMITS_VARIABLE)
 
 
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+@pytest.mark.parametrize("line", [2, 1000, 1001, 2500, 5001])
+def test_the_first_fault_among_many_boxes_is_named(write, line: int, ends: str) -> None:
+    lines = [HEADER, *[PARKED] * 5000]
+    lines[-1] = "van 1"
+    lines[line - 1] = "bus 1"
+    with pytest.raises(LabelError, match=rf"label\.txt:{line}: expected 13 fields, found 2: 'bus 1'"):
+        read_label(write(ends.join([*lines, "bus 2"])))
+
+
 def test_words_alone_on_a_line_are_told(write) -> None:
     assert read_lone_words(write(REAL)) == []
     text = f"one\n{HEADER}\n\n{PARKED}\n two \n{OWN}\ncar"

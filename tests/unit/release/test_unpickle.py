@@ -490,6 +490,28 @@ def test_all_arrays_are_read_back(arrays: Calibs, protocol: int, *, fortran: boo
         np.testing.assert_array_equal(read[key], array.astype(array.dtype.newbyteorder("=")), strict=True)
 
 
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_opcodes_of_one_layout_are_read_once(
+    raw_calib: Calibs, monkeypatch: pytest.MonkeyPatch, protocol: int
+) -> None:
+    monkeypatch.setattr(pickles, "_layouts", [])
+    load_arrays(pickle.dumps(raw_calib, protocol))
+    monkeypatch.setattr(pickles, "_MOST_OPCODES", 0)  # whatever is read again is now refused
+    changed = {key: array[::-1] * np.pi for key, array in raw_calib.items()}
+    if protocol >= 3:  # before, bytes are text, which may have another length
+        read = load_arrays(pickle.dumps(changed, protocol))
+        np.testing.assert_array_equal(read["ego_to_world"], changed["ego_to_world"])
+    with pytest.raises(pickle.UnpicklingError, match="more than 0 opcodes"):
+        load_arrays(pickle.dumps({**raw_calib, "more": 1}, protocol))
+
+
+def test_only_some_layouts_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pickles, "_layouts", [])
+    for number in range(100):
+        load_arrays(pickle.dumps({f"key {number}": np.zeros(8)}, 4))
+    assert len(pickles._layouts) == 16
+
+
 def outcome_of(content: bytes) -> Calibs | str:
     try:
         return load_arrays(content)

@@ -96,6 +96,12 @@ def test_a_scenario_type_that_is_a_link_to_itself_is_a_note(small: Path) -> None
     assert len(DeepAccident(dataroot=small, workers=1, verbose=False).scenario) == 1
 
 
+def test_a_link_to_a_folder_above_goes_no_deeper(small: Path) -> None:
+    for folder in [small, *small.glob("*/*/*/*")]:
+        (folder / "above").symlink_to("..")
+    assert [one for one in validate_release(small, workers=1).findings if one.severity == "error"] == []
+
+
 def test_loading_a_link_to_itself_names_it(small: Path) -> None:
     dataset = DeepAccident(dataroot=small, workers=1, verbose=False)
     sample = dataset.sample[1]["token"]

@@ -208,6 +208,20 @@ def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
         assert (finding.code, finding.known, finding.severity == "note") == (code, is_known, is_known)
 
 
+def test_what_is_left_aside_is_named(tmp_path: Path) -> None:
+    root = tiny.write_tiny_release(tmp_path / "release")
+    copy, loop = root / f"{tiny.TYPE} (1)", root / tiny.TYPE / "loop"
+    tiny.write_tiny_release(copy.parent, scenario_type=copy.name)
+    loop.symlink_to(root)
+    told = [found for found in validate_release(root, workers=1).findings if found.scenario is None]
+    assert [(found.code, found.severity, found.where) for found in told] == [
+        ("folder-left-aside", "warning", str(copy)),
+        ("link-leads-nowhere", "note", str(loop)),
+    ]
+    assert told[0].what == f"is not read; it looks like {tiny.TYPE}"
+    assert [found for found in validate_release(root, scenarios=[tiny.TOKEN]).findings if not found.scenario] == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("orientation", [name for name in ORIENTATIONS if name != "forward-up"])
 def test_a_turned_bev_camera_is_recognised(release_root: Path, tmp_path: Path, orientation: str) -> None:

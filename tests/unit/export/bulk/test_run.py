@@ -17,10 +17,12 @@ from tiny_format import KilledFormat, TinyFormat
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import (
+    ChoiceError,
     ConfigError,
     ExportError,
     MissingFileError,
     NotAvailableError,
+    SomeFailedError,
     WorkerError,
 )
 from deepaccident_devkit.export.bulk import Exported, Tally, export_release
@@ -388,6 +390,29 @@ class TestSelection:
         with pytest.raises(NotAvailableError, match="no scenario of this release is in that split and matches"):
             self.tokens(small, tmp_path, split="val", where=("length>=3", "designed_accident=false"))
         assert not (tmp_path / "out").exists()
+
+
+def test_wrong_workers_make_no_folder(small: DeepAccident, tmp_path: Path) -> None:
+    with pytest.raises(ChoiceError, match="workers: expected a number of at least 1, or None, found -3"):
+        written(small, tmp_path / "out", workers=-3)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_cannot_be_read_costs_its_scenario(changing: Path, tmp_path: Path) -> None:
+    """Also if it goes after the export is complete: then nothing is written."""
+    dataset = reopened(changing)
+    label = next(changing.glob("*/ego_vehicle/label/*/*_002.txt"))
+    content = label.read_bytes()
+    written(dataset, tmp_path / "whole")
+    label.unlink()
+    label.mkdir()
+    for name in ("out", "whole"):
+        with pytest.raises(SomeFailedError, match=rf"{name}: 1 of 3 failed:\n  \S+: {label}: not a regular file"):
+            written(dataset, tmp_path / name)
+    label.rmdir()
+    label.write_bytes(content)
+    assert [written(dataset, tmp_path / name).written for name in ("whole", "out")] == [0, 1]
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("after", [0, 7, 14])
