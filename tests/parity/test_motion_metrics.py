@@ -67,6 +67,13 @@ def test_vpq_of_a_sequence(golden, name: str) -> None:
 
 @by_range
 @pytest.mark.golden_cases("b_vpq", "sequences")
+def test_panoptic_quality_of_a_sequence_frame_by_frame(golden, name: str) -> None:
+    found = vpq_counts(*instances(golden, name), temporally_consistent=False)
+    assert_quality(vpq([found]), golden.entry[name]["not_temporally_consistent"])
+
+
+@by_range
+@pytest.mark.golden_cases("b_vpq", "sequences")
 def test_iou_of_a_sequence(golden, name: str) -> None:
     found, expected = segmentations(golden, name), golden.entry[name]
     for key in ("true_positive", "false_positive", "false_negative"):

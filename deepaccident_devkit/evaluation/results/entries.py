@@ -20,7 +20,7 @@ from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, checked_prediction
-from deepaccident_devkit.evaluation.results.header import ContentError, at, check_token, decoded, parsed_json
+from deepaccident_devkit.evaluation.results.header import ContentError, at, check_token, decoded
 from deepaccident_devkit.evaluation.results.records import AccidentEntry, BoxEntry
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.reading import shortened
@@ -67,11 +67,7 @@ class Entries:
 
 def read_entries(content: bytes, record: type[Entry]) -> list[Entry]:
     """A sample's entries; raises ContentError that names the number of the entry and the field."""
-    try:
-        return decoded(content, list[record])  # type: ignore[valid-type]  # msgspec wants it so at run time
-    except ContentError:
-        parsed_json(content)  # it says of NaN where it stands
-        raise
+    return decoded(content, list[record])  # type: ignore[valid-type]  # msgspec wants it so at run time
 
 
 def entry_place(token: str, number: int | None = None) -> str:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, TypeVar, get_args
+
+import msgspec
+from msgspec import inspect
 
 from deepaccident_devkit import json_text
 from deepaccident_devkit.arrays import checked_number
@@ -18,7 +21,7 @@ from deepaccident_devkit.errors import DeepAccidentError, ResultsError
 from deepaccident_devkit.evaluation.results.records import WORDS, FormRecord, ResultsTask, Stored
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
-from deepaccident_devkit.reading import fault_text, shortened
+from deepaccident_devkit.reading import MOST_TOLD, fault_text, shortened
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import settle_choices
 
@@ -66,19 +69,57 @@ def parsed_json(content: bytes, levels: int = json_text.MOST_LEVELS) -> Any:
         raise ContentError(str(error)) from error
 
 
-def decoded(content: bytes | memoryview, kind: type[Kind]) -> Kind:
-    """The record that JSON text describes; raises ContentError that names the place of a fault.
+def decoded(content: bytes, kind: type[Kind]) -> Kind:
+    """The record that JSON text describes; raises ContentError that names the place of a fault, and what it found.
 
     A name that stands twice in an object is not noticed.
     """
-    import msgspec
-
     try:
         return msgspec.json.decode(content, type=kind)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        value = parsed_json(content)  # it says of NaN where it stands
         said, _, place = str(error).partition(" - at `$")
         place = place.strip(".`")
-        raise ContentError(f"{place}: " * bool(place) + said[:1].lower() + said[1:]) from error
+        told = _told(shortened(said[:1].lower() + said[1:], MOST_TOLD), value, inspect.type_info(kind), place)
+        raise ContentError(f"{place}: {told}" if place else told) from error
+
+
+def _told(said: str, value: Any, kind: inspect.Type, place: str) -> str:
+    """What msgspec says of a value, with what it found at the place, and what it expected or means there."""
+    kinds, meaning = _single(kind), ""
+    if isinstance(value, dict):
+        kinds = [each for each in kinds if getattr(each, "tag", None) == value.get("task")] or kinds
+    for part in re.findall(r"\w+|\.\.\.", place):
+        if part == "...":  # a name, which msgspec does not tell
+            return said
+        value = value[int(part) if isinstance(value, list) else part]
+        inner = [each for outer in kinds for each in _inner(outer, part)]
+        kinds = [each for whole in inner for each in _single(whole)]
+        notes = [each.extra_json_schema or {} for each in inner if isinstance(each, inspect.Metadata)]
+        meaning = next((f" ({note['description']})" for note in notes if "description" in note), meaning)
+    if said.startswith("object "):  # lacks a field, or has one too many
+        names = [field.encode_name for each in kinds if isinstance(each, inspect.StructType) for field in each.fields]
+        return f"{said} (expected {', '.join(names)})" if "unknown" in said and names else said
+    choices = [str(word) for each in kinds if isinstance(each, inspect.LiteralType) for word in each.values]
+    if choices:
+        return f"expected {'one of ' * (len(choices) > 1)}{', '.join(choices)}, found {shown(value)}"
+    return f"{said.partition(', got ')[0]}, found {shown(value)}{meaning}"
+
+
+def _inner(kind: inspect.Type, part: str) -> Sequence[inspect.Type]:
+    """The kinds that a field or an entry of a value of a kind may have."""
+    if isinstance(kind, inspect.StructType):
+        return [each.type for each in kind.fields if each.encode_name == part] or [inspect.LiteralType((kind.tag,))]
+    if isinstance(kind, inspect.TupleType):
+        return [kind.item_types[int(part)]]
+    return [kind.item_type] if isinstance(kind, inspect.ListType | inspect.VarTupleType) else []
+
+
+def _single(kind: inspect.Type) -> list[inspect.Type]:
+    """The kinds that a kind joins, without notes on them."""
+    if isinstance(kind, inspect.Metadata):
+        return _single(kind.type)
+    return [part for each in kind.types for part in _single(each)] if isinstance(kind, inspect.UnionType) else [kind]
 
 
 RESULTS_NAMES: Final[Mapping[ResultsTask, str]] = MappingProxyType(

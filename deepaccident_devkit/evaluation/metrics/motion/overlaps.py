@@ -94,12 +94,14 @@ class PanopticQuality:
     denominator: float
 
 
-def vpq_counts(prediction: AnyArray, label: AnyArray) -> VpqCounts:
+def vpq_counts(prediction: AnyArray, label: AnyArray, *, temporally_consistent: bool = True) -> VpqCounts:
     """Compare the instances of one sample.
 
     Args:
         prediction: (T, H, W) integers: ids from 1; what is less is background.
         label: the same shape.
+        temporally_consistent: a true instance must keep the predicted id of its last match; False for panoptic quality
+            frame by frame.
 
     Raises:
         GeometryError: other shapes.
@@ -107,7 +109,7 @@ def vpq_counts(prediction: AnyArray, label: AnyArray) -> VpqCounts:
     predicted, true = _checked_maps(prediction, label)
     shared = _shared_cells(predicted, true)
     true_size, predicted_size = shared.sum(axis=2), shared.sum(axis=1)
-    frame, true_id, predicted_id = _matches(shared, true_size, predicted_size)
+    frame, true_id, predicted_id = _matches(shared, true_size, predicted_size, consistent=temporally_consistent)
     inside = shared[frame, true_id, predicted_id]
     overlap = inside / (true_size[frame, true_id] + predicted_size[frame, predicted_id] - inside)
     found = np.bincount(frame, minlength=len(true))
@@ -136,7 +138,7 @@ def vpq_matches(prediction: AnyArray, label: AnyArray) -> IntArray:
         names.append(ids.astype(np.int64))
         ranks.append(rank.reshape(-1)[:-1].reshape(maps.shape))
     shared = _shared_cells(ranks[0], ranks[1])
-    frame, true_id, predicted_id = _matches(shared, shared.sum(axis=2), shared.sum(axis=1))
+    frame, true_id, predicted_id = _matches(shared, shared.sum(axis=2), shared.sum(axis=1), consistent=True)
     return np.stack([frame, names[0][predicted_id], names[1][true_id]], axis=1)
 
 
@@ -184,13 +186,16 @@ def _renumbered(ids: IntArray) -> IntArray:
     return np.asarray(ranks[:-1], dtype=np.int64)
 
 
-def _matches(shared: IntArray, true_size: IntArray, predicted_size: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Frame, true id and predicted id of the pairs that match, by frame, without those under another id than before."""
+def _matches(
+    shared: IntArray, true_size: IntArray, predicted_size: IntArray, *, consistent: bool
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Frame, true id and predicted id of the pairs that match, by frame; or only those under the same id as before."""
     frame, true_id, predicted_id = np.nonzero(shared[:, 1:, 1:])
     true_id, predicted_id = true_id + 1, predicted_id + 1
     inside = shared[frame, true_id, predicted_id]
     match = np.flatnonzero(3 * inside > true_size[frame, true_id] + predicted_size[frame, predicted_id])
-    match = match[_same_partner(true_id[match], predicted_id[match])]
+    if consistent:
+        match = match[_same_partner(true_id[match], predicted_id[match])]
     return frame[match], true_id[match], predicted_id[match]
 
 

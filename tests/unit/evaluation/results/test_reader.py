@@ -40,22 +40,25 @@ def with_entry(kind: str, **changes: Any) -> Document:
 
 
 HEADERS: dict[str, tuple[Document, str]] = {
-    "another format": ({"format": "COCO"}, "format: "),
+    "another format": ({"format": "COCO"}, 'format: expected DeepAccident results, found "COCO"'),
     "no format": ({"format": ...}, 'has no "format" (a nuScenes results file?); put "format"'),
     "no version": ({"version": ...}, "required field `version`"),
     "a newer version": ({"version": 2}, "version: a newer results format (2, this devkit's is 1); update the devkit"),
     "an older version": ({"version": 0}, "version: an older results format (0, this devkit's is 1); write it again"),
-    "a version that is a text": ({"version": "1"}, "version: "),
-    "a version that is true": ({"version": True}, "version: "),
+    "a version that is a text": ({"version": "1"}, 'version: expected 1, found "1"'),
+    "a version that is true": ({"version": True}, "version: expected 1, found true"),
     "no task": ({"task": ...}, "required field `task`"),
-    "an unknown task": ({"task": "tracking"}, "task: "),
-    "a list of tasks": ({"task": ["accident"]}, "task: "),
+    "an unknown task": ({"task": "tracking"}, 'task: expected one of motion, accident, detection, found "tracking"'),
+    "a list of tasks": (
+        {"task": ["accident"]},
+        'task: expected one of motion, accident, detection, found ["accident"]',
+    ),
     "another task": ({"task": "detection"}, f"results of '{FIRST}': [0]: "),
     "no meta": ({"meta": ...}, "required field `meta`"),
     "meta that is a text": ({"meta": "mine"}, "meta: expected a mapping"),
     "no results": ({"results": ...}, "required field `results`"),
-    "an unknown field": ({"result": {}}, "unknown field `result`"),
-    "results in a list": ({"results": []}, "results: expected `object`"),
+    "an unknown field": ({"result": {}}, "unknown field `result` (expected results, format, version, meta)"),
+    "results in a list": ({"results": []}, "results: expected `object`, found [] (Sample token to what"),
     "no sample": ({"results": {}}, "results: expected `object` of length >= 1"),
     "an empty token": ({"results": {"": []}}, "results: expected a sample's token"),
     "a token of a parent": ({"results": {"a/../b": []}}, "results: expected a sample's token, <scenario_type>"),
@@ -112,24 +115,27 @@ def test_what_is_no_json(tmp_path: Path, kind: str) -> None:
 
 ACCIDENTS: dict[str, tuple[dict[str, Any], str]] = {
     "no positions": ({"positions": ...}, ": object missing required field `positions`"),
-    "one position": ({"positions": [[1, 2]]}, ".positions: expected `array` of length 2"),
+    "one position": (
+        {"positions": [[1, 2]]},
+        ".positions: expected `array` of length 2, found [[1, 2]] (Of the two that",
+    ),
     "positions in space": ({"positions": [[1, 2, 0], [3, 4, 0]]}, ".positions[0]: expected `array` of length 2"),
     "positions that are flat": ({"positions": [1, 2, 3, 4]}, ".positions[0]: expected `array`"),
     "a position that is a text": ({"positions": [[1, "2"], [3, 4]]}, ".positions[0][1]: expected `float`"),
     "a position that is true": ({"positions": [[1, True], [3, 4]]}, ".positions[0][1]: expected `float`"),
     "a time that is a text": ({"time": "soon"}, ".time: expected `float`"),
-    "a time of the past": ({"time": -0.5}, ".time: expected `float` >= 0"),
+    "a time of the past": ({"time": -0.5}, ".time: expected `float` >= 0.0, found -0.5 (Seconds after the present.)"),
     "positions whose squares overflow": ({"positions": [[1e200, 0], [0, 0]]}, ".positions[0][0]: expected `float` <="),
     "a time beyond all recordings": ({"time": 1.7e308}, ".time: expected `float` <= 1000000"),
     "no time": ({"time": ...}, ": object missing required field `time`"),
-    "null for a score": ({"score": None}, ".score: expected `float`"),
+    "null for a score": ({"score": None}, ".score: expected `float`, found null (How sure"),
     "a score that is true": ({"score": True}, ".score: expected `float`"),
     "an id that is a float": ({"ids": [1236.0, 1240]}, ".ids[0]: expected `int`"),
     "an id that is true": ({"ids": [True, 1240]}, ".ids[0]: expected `int`"),
     "an id that is a text": ({"ids": ["1236", 1240]}, ".ids[0]: expected `int`"),
     "three ids": ({"ids": [1, 2, 3]}, ".ids: expected `array` of length 2"),
     "an id of 70 bits": ({"ids": [2**70, 1]}, ".ids[0]: expected `int` <="),
-    "a misspelt field": ({"id": [1, 2]}, ": object contains unknown field `id`"),
+    "a misspelt field": ({"id": [1, 2]}, ": object contains unknown field `id` (expected positions, time, score, ids)"),
 }
 
 
@@ -140,6 +146,7 @@ def test_accidents(tmp_path: Path, kind: str) -> None:
     refused(path, f"results of '{FIRST}': [1]{words}", "schema/results/README.md")
 
 
+CLASSES = "expected one of car, cyclist, motorcycle, pedestrian, truck, van"
 BOXES: dict[str, tuple[dict[str, Any], str]] = {
     "another sample's token": (
         {"sample_token": SECOND},
@@ -148,15 +155,18 @@ BOXES: dict[str, tuple[dict[str, Any], str]] = {
     "no token": ({"sample_token": ...}, ": object missing required field `sample_token`"),
     "a translation on the ground": ({"translation": [1, 2]}, ".translation: expected `array` of length 3"),
     "a translation beyond the world": ({"translation": [1e9, 2, 3]}, ".translation[0]: expected `float` <= 1000000"),
-    "a negative size": ({"size": [1, -2, 1]}, ".size[1]: expected `float` >= 0"),
-    "a yaw": ({"rotation": 0.3}, ".rotation: expected `array`"),
+    "a negative size": (
+        {"size": [1, -2, 1]},
+        ".size[1]: expected `float` >= 0.0, found -2 (WIDTH, LENGTH, HEIGHT, metres",
+    ),
+    "a yaw": ({"rotation": 0.3}, ".rotation: expected `array`, found 0.3 (Unit quaternion w, x, y, z"),
     "a quaternion of length 2": ({"rotation": [2, 0, 0, 0]}, ".rotation: expected a unit quaternion [w, x, y, z]"),
     "a quaternion beyond floats": ({"rotation": [1e300, 0, 0, 0]}, ".rotation: expected a unit quaternion"),
     "null in a velocity": ({"velocity": [None, None]}, ".velocity[0]: expected `float`"),
     "a velocity in space": ({"velocity": [1, 2, 0]}, ".velocity: expected `array` of length 2"),
-    "an unknown category": ({"detection_name": "bus"}, ".detection_name: invalid enum value 'bus'"),
-    "a category's number": ({"detection_name": 0}, ".detection_name: expected `str`"),
-    "a list of categories": ({"detection_name": ["car"]}, ".detection_name: expected `str`"),
+    "an unknown category": ({"detection_name": "bus"}, f'.detection_name: {CLASSES}, found "bus"'),
+    "a category's number": ({"detection_name": 0}, f".detection_name: {CLASSES}, found 0"),
+    "a list of categories": ({"detection_name": ["car"]}, f'.detection_name: {CLASSES}, found ["car"]'),
     "a score that is a text": ({"detection_score": "0.9"}, ".detection_score: expected `float`"),
     "an unknown field": ({"tracking_id": "3"}, ": object contains unknown field `tracking_id`"),
 }
@@ -240,13 +250,22 @@ MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
             "more than memory holds",
         ),
     ),
-    "an unknown store": (lambda told: told["form"].update(stored="logits"), ("form.stored: ",)),
-    "an unknown orientation": (lambda told: told["form"].update(orientation="north"), ("form.orientation: ",)),
-    "unknown labels": (lambda told: told["form"].update(labels="mine"), ("form.labels: ",)),
+    "an unknown store": (
+        lambda told: told["form"].update(stored="logits"),
+        ("form.stored: expected one of heads, inst",),
+    ),
+    "an unknown orientation": (
+        lambda told: told["form"].update(orientation="north"),
+        ("form.orientation: expected one of",),
+    ),
+    "unknown labels": (lambda told: told["form"].update(labels="mine"), ('released, found "mine"',)),
     "an axis of two numbers": (lambda told: told["form"].update(x=[-2, 2]), ("form.x: expected `array` of length 3",)),
     "an axis of texts": (lambda told: told["form"].update(y=["a", "b", "c"]), ("form.y[0]: expected `float`",)),
     "an axis of half cells": (lambda told: told["form"].update(x=[-2, 2, 0.3]), ("form: x: ", "whole number of cells")),
-    "an unknown field": (lambda told: told["form"].update(z=1), ("form: object contains unknown field `z`",)),
+    "an unknown field": (
+        lambda told: told["form"].update(z=1),
+        ("form: object contains unknown field `z` (expected stored, x,",),
+    ),
     "no shards": (lambda told: told.update(shards=[]), ("shards: expected `array` of length >= 1",)),
     "a shard that is a text": (lambda told: told["shards"].append("a.npz"), ("shards[2]: expected `object`",)),
     "no checksum": (

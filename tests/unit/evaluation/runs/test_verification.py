@@ -191,11 +191,28 @@ class TestNamed:
         assert found(verify(bundle, da_b))[0] == "files.json"
 
     def test_another_protocol_claimed(self, bundle: Path, da_b: DeepAccident) -> None:
+        """With a smaller danger distance the pairs that pass close by in the normal scenario are no accidents."""
         changed(
             bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.danger_distance": 0.5})
         )
-        changes = ["files.json: metrics_summary.json", "metrics_summary.json: settings/choices/reading/danger_distance"]
-        assert set(changes) <= set(found(verify(bundle, da_b)))
+        groups = {
+            "all/groups": 1,
+            "all/without_infrastructure": 1,
+            "agent/groups": 3,
+            "agent/without_infrastructure": 2,
+        }
+        parts = ["", *(f"breakdowns/{group}/{row}/" for group, rows in groups.items() for row in range(rows))]
+        samples = sorted(
+            token for token in json.loads((bundle / "counts.json").read_text())["counts"] if "_normal" in token
+        )
+        assert len(samples) == 3
+        assert found(verify(bundle, da_b)) == [
+            SUMMARY_CHANGED,
+            "metrics_summary.json: settings/choices/reading/danger_distance",
+            *(f"metrics_summary.json: {part}metrics/truths/{kind}" for part in parts for kind in ("another", "none")),
+            *(f"counts.json: {token}/named" for token in samples),
+            *(f"samples.parquet: {token}/truth" for token in samples),
+        ]
 
     def test_many_are_counted(self) -> None:
         many = tuple(Difference(where=str(index), stored=0, found=1) for index in range(22))
