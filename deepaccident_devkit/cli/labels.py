@@ -107,5 +107,5 @@ def _switched(rules: LabelProtocol, texts: tuple[str, ...]) -> LabelProtocol:
     for name, value in switches.items():
         if name not in slip_names() or not isinstance(value, bool):
             names = ", ".join(slip_names())
-            raise click.BadParameter(f"--switch: expected yes or no for one of {names}; found {name}={value}")
+            raise click.BadParameter(f"--switch: expected yes or no for one of {names}; found {', '.join(texts)}")
     return replace(rules, **switches)

@@ -75,7 +75,7 @@ channels_parameter = click.option(
     "--channels",
     multiple=True,
     metavar="NAME[,NAME…]",
-    help="Only these sensors, such as Camera_Front or lidar01.  [default: all]",
+    help="Only these sensors, such as Camera_Front,Camera_Back.  [default: all]",
 )
 model_parameters = together(
     click.option(

@@ -259,8 +259,7 @@ def render() -> None:
 
 
 def _verb(name: str, picture: _Picture) -> click.Command:
-    table = picture.of.replace("_", " ")
-    text = f"{picture.help}\n\nTOKEN is a row of the table {table}."
+    text = f"{picture.help}\n\nTOKEN is a row of the table {picture.of}."
     if picture.of != "scenario":
         text += " A scenario's token stands for the moment one second before its end."
     own = f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}]; " if picture.styles else ""
@@ -306,8 +305,8 @@ def _verb(name: str, picture: _Picture) -> click.Command:
             tokens = read_results(choices["results"]).tokens[:1]
         dataset = DeepAccident(**release)
         rows = rows_to_draw(dataset, picture.of, tokens, frames)
-        for word in set(styles).intersection(picture.styles):
-            choices["style"] = word
+        for word in styles:
+            choices |= {"style": word} if word in picture.styles else {}  # the last one, as of places
         places = [cast(StyleName, word) for word in styles if word not in picture.styles]
         with style(places[-1]) if places else nullcontext():
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):

@@ -144,5 +144,5 @@ def field_text(config: type[Any], field: str) -> str:
     """The first sentence of what a class says of one of its attributes."""
     pattern = rf"^    {field}: (.+?)(?=\n    \w|\n\n|\Z)"
     found = re.search(pattern, inspect.getdoc(config) or "", re.DOTALL | re.MULTILINE)
-    sentence = re.split(r"(?<=\.)\s+(?=[A-Z])", " ".join(found[1].split()))[0] if found else ""
+    sentence = re.split(r"(?<=\.)\s+(?=[A-Z`])", " ".join(found[1].split()))[0] if found else ""
     return sentence[:1].upper() + sentence[1:]

@@ -1,4 +1,4 @@
-"""The choices of a protocol by their names, such as `reading.outline`, and protocols with some of them changed."""
+"""The choices of a protocol by their names, such as `reading.danger_distance`, and protocols with some changed."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ POSTERIOR_IGNORES: Final[tuple[PosteriorIgnore, ...]] = ("keep", "zero")
 
 
 class MotionTargets(NamedTuple):
-    """A batch's motion labels, all frames warped to the present (`TorchConfig(to_present="nearest")`).
+    """A batch's motion labels, all frames warped to the present (`V2XConfig(to_present="nearest")`).
 
     Attributes:
         segmentation: (N, T, H, W) int64, 1 on instances.

@@ -239,6 +239,12 @@ def test_the_pages_may_ask_for_all(served: Served, site: str) -> None:
     assert asked(served, "/", ("Sec-Fetch-Site", site), *image).status == 200
 
 
+def test_a_link_with_the_token_may_come_from_a_mail(served: Served) -> None:
+    cross = ("Sec-Fetch-Site", "cross-site")
+    assert ask(served.port, f"/?token={served.token}", cross, NAVIGATE, DOCUMENT).status == 303
+    assert ask(served.port, f"/?token={served.token}", cross).status == 403
+
+
 @pytest.mark.parametrize(
     ("target", "headers", "method", "status"),
     [

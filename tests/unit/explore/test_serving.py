@@ -214,6 +214,13 @@ def test_pages_that_cannot_start_are_an_error(caplog: pytest.LogCaptureFixture) 
     assert "no index" in caplog.text
 
 
+def test_a_server_that_fails_later_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(TinyApp(), port=0) as served:
+        monkeypatch.setattr(served._running._server, "on_tick", Mock(side_effect=MemoryError))
+        with pytest.raises(RuntimeError, match="the explorer's server failed"):
+            served.wait()
+
+
 def lines_of(*, host: str = "127.0.0.1", bound: str = "127.0.0.1", root: str = "") -> list[str]:
     """What a server there would say."""
     access = Access(port=9000, root=RootPath.parse(root), token="secret")  # noqa: S106
@@ -278,6 +285,20 @@ def test_a_browser_is_not_opened_behind_a_proxy_or_if_it_is_not_wanted(
     monkeypatch: pytest.MonkeyPatch, arguments: dict[str, Any]
 ) -> None:
     assert opened(monkeypatch, **arguments)[1] == []
+
+
+@pytest.mark.parametrize(
+    ("environment", "likely"),
+    [
+        ({"DISPLAY": ":0"}, True),
+        ({"WAYLAND_DISPLAY": "wayland-0"}, True),
+        ({}, sys.platform == "darwin"),
+        ({"DISPLAY": "localhost:10.0", "SSH_CONNECTION": "x"}, False),
+        ({"BROWSER": "helper", "SSH_CONNECTION": "x"}, True),
+    ],
+)
+def test_a_browser_is_opened_where_the_reader_sits(environment: dict[str, str], likely: bool) -> None:
+    assert module._is_display_likely(environment) is likely
 
 
 def test_a_browser_that_fails_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,13 @@ def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAc
     assert_allclose(center, da.world_from(approach, "ego").translation[:2])
 
 
+def test_several_agents_boxes_are_drawn_once_an_actor(da: DeepAccident, approach: str) -> None:
+    ax = render_bev(da, approach, agents=("ego_vehicle", "infrastructure"), layers=["boxes"], ax=new_axes())
+    union = cooperative_boxes(da, approach, agents=("ego_vehicle", "infrastructure"), frame="ego")
+    near = union.select((np.abs(union.center[:, :2]) < 55).all(axis=1))
+    assert set(outlines(ax)) == {tuple(np.round(one[:, :2].ravel(), 6)) for one in near.bottom_corners()}
+
+
 def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAccident, approach: str) -> None:
     both = ("ego_vehicle", "infrastructure")
     link = Link(pose_noise=PoseNoise(mean=3.0, std=0.0))

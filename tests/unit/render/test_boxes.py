@@ -14,6 +14,7 @@ from deepaccident_devkit.geometry import SE3, Box, Boxes, PinholeCamera
 from deepaccident_devkit.render import draw_box
 from deepaccident_devkit.render.boxes import (
     NEAREST_DRAWN,
+    bounds_in_image,
     draw_boxes_from_above,
     draw_boxes_in_image,
     draw_ids_from_above,
@@ -201,3 +202,15 @@ def test_velocities_in_an_image_lead_to_where_the_centre_would_be() -> None:
     draw_velocities_in_image(boxes().transform(OPTICAL_FROM_EGO, "Camera_Front"), CAMERA, ax, [RED] * 3)
     places = OPTICAL_FROM_EGO.apply(np.array([[12.0, -2, 0], [15, -1, 0]]))
     assert_allclose(ax.collections[0].get_segments(), [CAMERA.project(places)[0]])
+
+
+def test_a_box_beside_the_camera_is_cut_off_at_the_camera() -> None:
+    # 2 m to the right, from 4 m behind the camera to 4 m before it; its front looks at the camera
+    standing = Boxes.from_arrays([[0.0, -3, 0], [-9, -3, 0]], [[2.0, 8, 1]] * 2, [np.pi / 2] * 2, frame="ego")
+    both = standing.transform(OPTICAL_FROM_EGO, "Camera_Front")
+    assert_allclose(bounds_in_image(both, CAMERA)[0], [200 + 200 * 2 / 4, 0, 400, 300])
+    ax = new_axes()
+    assert draw_boxes_in_image(both, CAMERA, ax, [RED, RED]).tolist() == [True, False]
+    (front,) = next(each for each in ax.collections if isinstance(each, PolyCollection)).get_paths()
+    reach = front.vertices[:, 0].min(), front.vertices[:, 0].max()
+    assert reach == pytest.approx((300, 200 + 200 * 2 / NEAREST_DRAWN))

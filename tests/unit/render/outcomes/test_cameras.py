@@ -159,6 +159,17 @@ def test_the_box_around_the_cameras_is_left_out(da: DeepAccident, approach: str)
         assert gaps(pixels, lines).min() > 0.1
 
 
+def test_the_nearest_detections_are_on_top(da: DeepAccident, approach: str) -> None:
+    ax = draw_outcome_in_camera(da, sample_verdict(da, approach, perfect(da, approach)), "Camera_Front", ax=new_axes())
+    boxes = da.boxes(approach, "Camera_Front")
+    pixels, _ = camera_of(da, f"{approach}/Camera_Front").project(boxes.corners().reshape(-1, 3))
+    first = np.array([line[0] for line in lines_in(ax, OUTCOME_COLORS["right"])])
+    apart = np.linalg.norm(first[:, None] - np.nan_to_num(pixels, nan=np.inf), axis=-1)
+    depth = boxes.center[apart.argmin(axis=1)[apart.min(axis=1) < 1e-6] // 8, 2]
+    assert len(np.unique(depth)) > 2
+    assert (np.diff(depth) < 1e-9).all()
+
+
 def test_cells_are_polygons_on_the_ground(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
     verdict = sample_verdict(da_motion, sample, blocks(labels, AHEAD, AHEAD, (20.0, 22.0, 3.0, 4.0)), label=labels)
     lens = camera_of(da_motion, f"{sample}/Camera_Front")
@@ -177,6 +188,24 @@ def test_cells_are_polygons_on_the_ground(da_motion: DeepAccident, sample: str, 
         ]
         assert filled.get_paths()[0].contains_point(corners.mean(axis=0))
         assert not lines_in(ax, OUTCOME_COLORS["right"])
+
+
+def test_cells_behind_the_camera_are_cut_off(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+    around = (-5.0, 12.0, -1.0, 1.0)
+    verdict = sample_verdict(da_motion, sample, blocks(labels, around, around), label=labels)
+    lens = camera_of(da_motion, f"{sample}/Camera_Front")
+    ax = draw_outcome_in_camera(da_motion, verdict, "Camera_Front", ax=new_axes())
+    (line,) = lines_in(ax, OUTCOME_COLORS["false"])
+    assert np.isfinite(line).all()
+    optical = on_the_ground(da_motion, sample, "Camera_Front", corners_of(around))
+    near, far = optical[:2], optical[2:]
+    assert (near[:, 2] < 0).all()
+    share = (NEAREST_DRAWN - near[:, 2]) / (far[:, 2] - near[:, 2])
+    cut = near + share[:, None] * (far - near)
+    pixels, depth = lens.project(np.concatenate([cut, far]))
+    assert_allclose(depth[:2], NEAREST_DRAWN)
+    assert gaps(pixels, [line]).max() < 1e-6
+    assert pixels[:2, 1].min() > 5 * lens.height
 
 
 def test_missed_instances_are_dashed_around_their_cells(
