@@ -1,6 +1,5 @@
 """`Browser`: a page opened in chromium without a window; what it says, asks for, and looks like."""
 
-import base64
 import json
 import time
 from pathlib import Path
@@ -70,10 +69,3 @@ class Browser:
         """`dark` if the page has light letters, else `light`."""
         ink = self.script("return getComputedStyle(document.body).color")
         return "dark" if sum(map(int, ink[4:-1].split(","))) > 3 * 128 else "light"
-
-    def screenshot(self, path: Path) -> Path:
-        """A picture of the whole page, as long as it is."""
-        shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True})
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(base64.b64decode(shot["data"]))
-        return path

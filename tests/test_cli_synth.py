@@ -34,6 +34,7 @@ def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
     assert result.exit_code == 0, result.output
     assert f"deepaccident info {out}" in result.output
     assert f"{out}: 1 scenario of 1 frame with five agents, layout B" in result.output
+    assert "slow" not in result.stderr
     assert find_release(out).layout == "B"
 
 
@@ -86,6 +87,13 @@ def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
     result = CliRunner().invoke(synth, [str(tmp_path)])
     assert made == [SynthConfig(frames=None)]
     assert f"{tmp_path}: 4 scenarios with five agents, layout A" in result.output
+
+
+def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
+    monkeypatch.setattr(sys.modules[synth.callback.__module__], "has_embree", lambda: False)
+    result = CliRunner().invoke(synth, [str(tmp_path), "--sensors", "none"])
+    assert "slow without the package embreex; in a checkout: pip install '.[synth]'" in result.stderr
+    assert made == [SynthConfig(frames=None, sensors=False)]
 
 
 @pytest.mark.parametrize(

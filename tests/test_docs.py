@@ -89,12 +89,6 @@ NO_CALLS = (
 )
 
 
-def python_blocks(page: Path) -> str:
-    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    assert blocks, f"{page}: no code"
-    return "\n".join(blocks)
-
-
 def run_page(page: Path) -> dict[str, Any]:
     """Run the page's Python and shell blocks, as they stand and in their order, in the working folder."""
     names: dict[str, Any] = {}

@@ -9,6 +9,7 @@ from deepaccident_devkit.cli.options import PATH, engine_of, engine_parameters, 
 from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
+from deepaccident_devkit.synth.sensors.caster import has_embree
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, read_spec
 
 _EXAMPLES = """\b
@@ -93,6 +94,8 @@ def synth(out: Path, *, designs: dict[str, Any], **options: Any) -> None:
     if options["spec"] is not None or options["view"] == "hidden":
         refuse_unused("with a scenario file or --view hidden, which ask for one certain accident", "unplanned")
     config = SynthConfig(**options)
+    if config.sensors == "none" and not has_embree():
+        click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
     made = make_release(out, config, progress=True, **how)
     scenarios = f"{config.scenarios} scenario{'s' if config.scenarios > 1 else ''}"
     frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"

@@ -173,7 +173,7 @@ def predict_results(
 
     Raises:
         ResultsError: results are there already, or cannot be written.
-        DeepAccidentError: as of `predicting.predictions`.
+        DeepAccidentError: as of `predictions`.
     """
     config = config or PredictConfig()
     folder = writable_folder(out)

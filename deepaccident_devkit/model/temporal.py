@@ -1,6 +1,7 @@
 """Temporal models: one agent's BEV maps of the past and the present → one map of the present, before any fusion.
 
-The released TemporalBlock, which it has from FIERY. Attributes have the names of the released state dict.
+The released TemporalBlock and Bottleneck3D, which it has from FIERY. The sequence is frames in the temporal model and
+agents in the released fusion's unused part. Attributes have the names of the released state dict.
 
 Both take the same arguments; `temporal_model` makes the one that a config names.
 """
@@ -105,6 +106,22 @@ class TemporalBlock(nn.Module):
         """(B, C, T, H, W) → (B, C', T, H, W)."""
         paths = [path(x) for path in self.convolution_paths]
         return self.projection(x) + self.aggregation(torch.cat([*paths, self.pyramid_pooling(x)], 1))
+
+
+class Bottleneck3d(nn.Module):
+    """1×1×1 to half the channels, 1×3×3, 1×1×1 back, added to the input."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        half = channels // 2
+        self.layers = nn.Sequential()
+        self.layers.add_module("conv_down_project", ConvBnRelu3d(channels, half))
+        self.layers.add_module("conv", ConvBnRelu3d(half, half, (1, 3, 3)))
+        self.layers.add_module("conv_up_project", ConvBnRelu3d(half, channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T, H, W) → the same shape."""
+        return x + self.layers(x)
 
 
 EGOMOTION = 6

@@ -11,14 +11,14 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 | maps | cells and centres → `MotionLabels` | `drawing.label_maps`, `labels` |
 | all frames in the present ego frame | `MotionLabels` → the same, warped | `warps.to_present` |
 | to another code, to disk | `MotionLabels` → batches; files | `batch_names`; `label_files` |
-| a prediction | arrays → `MotionHeads` | `postprocessing.heads` |
+| a prediction | arrays → `MotionHeads` | `postprocessing.grouping` |
 | instances of a frame | heads → centres, and cells by centre | `postprocessing.grouping` |
-| the same id in all frames | instances → `LinkedInstances` | `postprocessing.linking`, `postprocessing.predict` |
-| boxes along the paths | linked instances → their redrawn maps | `postprocessing.redrawing` |
+| the same id in all frames | instances → `LinkedInstances` | `postprocessing.grouping`, `postprocessing.predict` |
+| boxes along the paths | linked instances → their redrawn maps | `postprocessing.contours` |
 
 A `MotionLabelConfig` (`config`) says what is rasterised, a `LabelProtocol` how (`protocols`: every quirk of the
-released code is a switch), and a grid's orientation how cells lie (`orientations`). `warps.feature_warps` warps a
-model's own maps as labels are warped.
+released code is a switch), and a grid's orientation how cells lie (`orientations`). `warps.to_present` also warps
+a model's own maps as labels are warped.
 """
 
 from deepaccident_devkit.motion.augmentation import Augmentation

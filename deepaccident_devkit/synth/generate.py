@@ -214,14 +214,15 @@ def make_release(
             configuration is there; the scenario file cannot be read or simulated; or something cannot be written.
         OutputFolderError: a link in the hidden folder leads out of it; nothing is written there.
         ChoiceError: `workers` is less than 1.
-        MissingExtraError: the package embreex is not installed.
+        MissingExtraError: files of sensors are wanted and the package embreex is not installed.
         SomeFailedError: some parts cannot be recorded; the others are, and the same call continues.
         WorkerError: a worker was killed, or cannot do the work.
     """
     wanted = config or SynthConfig()
     out = path_of(out)
     check_free(out)
-    require_embree()
+    if wanted.sensors != "none":
+        require_embree()
     plans = plan_scenarios(wanted)
     if not is_writable_folder(out.parent):
         raise ConfigError(f"{out.parent}: cannot be written; choose another folder")

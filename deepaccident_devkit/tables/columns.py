@@ -1,7 +1,7 @@
 """Columns of tables: how they are stored in Arrow, how a record shows them, and what they mean.
 
 A record's fields are declared once, in `records.py`, as annotated types; everything else (the Arrow schema, the JSON
-Schemas, the records themselves) is derived from there, in `specs.py`, through the classes of this module.
+Schemas, the records themselves) is derived from there, through the classes of this module.
 
 Null is stored twice: as Arrow's null, for readers of the table, and as a value beneath it (−1 or NaN) that the
 devkit reads through plain numpy views without looking at a bitmap.

@@ -57,6 +57,17 @@ class Place(ScenarioEditor):
             if content != self.before[path]
         }
 
+    def take_next(self, agent: str, kind: str, frame: int) -> str:
+        """Replace an agent's file of a kind (`ENDINGS`) by the next frame's; says what was done."""
+        self.write(self.file(agent, kind, frame), self.file(agent, kind, frame + 1).read_bytes())
+        return f"{agent} {frame}"
+
+    def one_frame_early(self, agent: str, kind: str) -> str:
+        """Replace all of an agent's files of a kind but the last by the next frame's; says what was done."""
+        for frame in self.frames[:-1]:
+            self.take_next(agent, kind, frame)
+        return agent
+
     # ---- victims; call these before changing anything
 
     def any_agent(self, rng: np.random.Generator) -> str:

@@ -18,7 +18,7 @@ import torch
 from golden_model import GoldenModel, check_close
 
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.handedness import flip_pose, flip_six_vector
+from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.model import warps
 from deepaccident_devkit.model.bev import BevEncode, BevEncodeConfig, crop
 from deepaccident_devkit.model.checkpoint import Weights, load_weights
@@ -40,6 +40,8 @@ from deepaccident_devkit.model.detection import (
 from deepaccident_devkit.model.detection.targets import peak_radius
 from deepaccident_devkit.model.entry import ModelInputs
 from deepaccident_devkit.model.fusion import (
+    Agent3D,
+    Agent3DConfig,
     CobevtConfig,
     DiscoNetConfig,
     ReleasedFusionConfig,
@@ -273,6 +275,16 @@ def test_released_fusion_equals_the_released_one(golden_model: Golden) -> None:
     check_close(fused, expected["fused"])
     (fused * given["loss_weight"]).sum().backward()
     check_close(x.grad, expected["grad_x"], 1e-3)
+
+
+def test_the_released_fusion_s_unreached_layers_equal_its_own(golden_model: Golden) -> None:
+    """The layers behind the early return, called in the order of the lines that are never reached."""
+    golden = golden_model("fusion_agent3d_dead")
+    given, expected = golden.inputs(), golden.outputs()
+    model = Agent3D(Agent3DConfig(channels=golden.config["in_channels"], agents=golden.config["num_agents"])).eval()
+    model.load_state_dict(golden.state("v2x_fusion."))
+    check_close(model.over_agents(given["warped"], given["relative_pose"]), expected["after_model"])
+    check_close(model(given["warped"], given["relative_pose"]), expected["compressed"])
 
 
 def test_disconet_equals_the_original(golden_model: Golden) -> None:
@@ -600,22 +612,7 @@ def released_labels(golden: GoldenModel, sample: int) -> MotionLabels:
         orientation="released",
         augmentation=augmentation_of(golden.inputs()["aug_transform"][sample].numpy()),
     )
-    return released_record(given | {"future_egomotions": given["future_egomotion"]}, config)
-
-
-def released_record(batch: dict[str, np.ndarray], config: MotionLabelConfig) -> MotionLabels:
-    """A sample of the released loader as our record, in the same orientation."""
-    return MotionLabels(
-        config=config,
-        segmentation=batch["motion_segmentation"].astype(np.uint8),
-        instance=batch["motion_instance"].astype(np.int32),
-        centerness=batch["instance_centerness"],
-        offset=batch["instance_offset"],
-        flow=batch["instance_flow"],
-        future_egomotion=flip_six_vector(batch["future_egomotions"]).astype(np.float32),
-        valid=batch["img_is_valid"].astype(bool),
-        id_map={},
-    )
+    return MotionLabels.from_batch(given | {"future_egomotions": given["future_egomotion"]}, config, "deepaccident")
 
 
 def augmentation_of(matrix: np.ndarray) -> Augmentation:
@@ -838,7 +835,7 @@ def test_losses_and_gradients_of_a_step_are_the_released_ones(golden_model) -> N
     batch = {name: given[name][0].numpy() for name in names}
     batch |= {"future_egomotions": given["agent0.egomotion"][0].numpy()}
     batch |= {"img_is_valid": given["agent0.img_is_valid"][0].numpy()}
-    labels = released_record(batch, config(golden).labels).to_present("nearest")
+    labels = MotionLabels.from_batch(batch, config(golden).labels, "deepaccident").to_present("nearest")
     maps = [torch.tensor(getattr(labels, name))[None] for name in ("segmentation", "centerness", "offset", "flow")]
     valid = torch.tensor(labels.valid)[None]
     motion = MotionTargets(maps[0].long(), *maps[1:], frame_mask(valid[:, PAST:], valid[:, :PAST]))
@@ -863,12 +860,17 @@ def test_losses_and_gradients_of_a_step_are_the_released_ones(golden_model) -> N
             assert float((found - gradient).abs().max()) <= 1e-2 * float(gradient.abs().max())
 
 
-@pytest.mark.parametrize("name", ["DeepAccident_tiny", "DeepAccident_tiny_v2x"])
-def test_names_and_shapes_are_those_of_the_released_configs(request: pytest.FixtureRequest, name: str) -> None:
-    """Of the whole state dict, without the V2X config's layers that no forward pass of the release reaches."""
+@pytest.mark.parametrize(
+    ("name", "unused"), [("DeepAccident_tiny", None), ("DeepAccident_tiny_v2x", Agent3DConfig(channels=64))]
+)
+def test_names_and_shapes_are_those_of_the_released_configs(
+    request: pytest.FixtureRequest, name: str, unused: Agent3DConfig | None
+) -> None:
+    """Of the whole state dict; the V2X config also has the layers that no forward pass of the release reaches."""
     path = request.config.getoption("golden") / "model" / f"released_keys_{name}.txt"
     with torch.device("meta"):
-        state = V2XFormer(released()).state_dict()
+        whole = released()
+        model = V2XFormer(replace(whole, fusion=replace(whole.fusion, agent3d=unused)))
+    state = model.state_dict()
     found = [f"{key} {tuple(each.shape)} {str(each.dtype).removeprefix('torch.')}" for key, each in state.items()]
-    stored = path.read_text(encoding="utf-8").splitlines()
-    assert sorted(found) == sorted(line for line in stored if not line.startswith("v2x_fusion."))
+    assert sorted(found) == sorted(path.read_text(encoding="utf-8").splitlines())

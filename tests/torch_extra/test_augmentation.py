@@ -171,6 +171,21 @@ def test_draws_depend_on_seed_epoch_and_index_alone(da: DeepAccident, tokens: li
     assert not torch.equal(other[3]["augmentation"], drawn[3])
 
 
+def test_random_augmentations_stay_in_their_ranges() -> None:
+    draw, generator = RandomAugmentation(rotation=0.2, scale=(0.9, 1.3), flip=0.25), np.random.default_rng(0)
+    drawn = [draw(generator) for _ in range(2000)]
+    for values, low, high in (([one.rotation for one in drawn], -0.2, 0.2), ([one.scale for one in drawn], 0.9, 1.3)):
+        assert low <= min(values) < low + 0.01
+        assert high - 0.01 < max(values) <= high
+    assert 0.2 < np.mean([one.flip for one in drawn]) < 0.3
+
+
+def test_a_function_that_draws_something_else(da: DeepAccident, sample: str) -> None:
+    data = V2XDataset(da, [sample], V2XConfig(points=False, augmentation=lambda _: 3))
+    with pytest.raises(ConfigError, match="augmentation: its function must return an Augmentation, and returned 3"):
+        data[0]
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

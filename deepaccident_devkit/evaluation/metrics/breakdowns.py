@@ -143,7 +143,7 @@ class Group(FrozenMappings, Generic[Result]):
         result: of these samples alone.
         samples: how many.
         scenarios: how many they are of.
-        clusters: how many these are, where an accident and its twin are one (`attributes.cluster_of`).
+        clusters: how many these are, where an accident and its twin are one (`cluster_of`).
         intervals: number of the result, by its path (`ranges/30x30/iou`) → (low, high); those without one, NaN and all
             of fewer than 6 clusters among them, are not there.
         notes: sentences that say why numbers have no interval.
@@ -188,7 +188,7 @@ def breakdown(
     Args:
         evaluator: with all samples counted.
         attributes: of its samples, from `sample_attributes`; those of other samples are ignored.
-        by: one of `attributes.ATTRIBUTES`; `all` for one group.
+        by: one of `ATTRIBUTES`; `all` for one group.
         resampling: how to make intervals; None for the defaults.
 
     Raises:

@@ -1,6 +1,6 @@
 """Intervals of any evaluator's numbers, from how much each changes when one cluster is left out (the jackknife).
 
-A cluster is an accident with its twin (`attributes.cluster_of`): its samples show the same junction and traffic, so
+A cluster is an accident with its twin (`breakdowns.cluster_of`): its samples show the same junction and traffic, so
 the number of clusters, not of samples, says how sure a number is. docs/statistics.md has the formulas and
 their measured coverage.
 """

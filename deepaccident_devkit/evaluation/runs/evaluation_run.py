@@ -208,7 +208,7 @@ class EvaluationRun:
         """The same run with results by these attributes, in place of those it has.
 
         Args:
-            by: of `attributes.ATTRIBUTES`; one that is given twice counts once. None for `breakdowns_of` the task.
+            by: of `breakdowns.ATTRIBUTES`; one that is given twice counts once. None for `breakdowns_of` the task.
             resampling: how intervals are made; None for the defaults.
             **how: `workers` (1 if not given), `executor` and `progress`, as `parallel.Engine` says.
 

@@ -11,6 +11,8 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.fusion.cobevt import CobevtConfig, CobevtFusion
 from deepaccident_devkit.model.fusion.simple import (
     RELEASED_EGO_CHANNELS,
+    Agent3D,
+    Agent3DConfig,
     DiscoNetConfig,
     DiscoNetFusion,
     Fusion,
@@ -40,6 +42,8 @@ def fusion(config: FusionConfig) -> Fusion:
 
 __all__ = [
     "RELEASED_EGO_CHANNELS",
+    "Agent3D",
+    "Agent3DConfig",
     "CobevtConfig",
     "CobevtFusion",
     "DiscoNetConfig",

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.model.temporal import Bottleneck3d, TemporalBlock
 from deepaccident_devkit.text import settle_choices
 
 
@@ -53,6 +54,68 @@ def visible(x: Tensor, mask: Tensor) -> Tensor:
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Mean (B, C, H, W) of the agents that a mask (B, A, H, W) does not hide, of maps (B, A, C, H, W)."""
     return visible(x, mask).sum(1) / mask.sum(1)[:, None].to(x.dtype)
+
+
+POSE = 6
+"""Channels that a relative pose takes: a 6-vector, the same in all cells."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agent3DConfig:
+    """The unreached layers.
+
+    Attributes:
+        channels: C.
+        agents: A, the ego and its partners.
+        bottlenecks: after each block.
+    """
+
+    channels: int
+    agents: int = 5
+    bottlenecks: int = 2
+
+    def __post_init__(self) -> None:
+        """Check the number of agents; raises ConfigError."""
+        if self.agents < 2:
+            raise ConfigError(f"agents: expected at least 2, found {self.agents}; one agent has nothing to fuse")
+
+
+class Agent3D(nn.Module):
+    """A − 1 blocks over the sequence of agents, then one 3×3 convolution over all their channels.
+
+    State-dict keys are the released ones (`v2x_fusion.` and these). The order of the partners matters, and nothing was
+    published that was trained through these layers.
+    """
+
+    def __init__(self, config: Agent3DConfig) -> None:
+        super().__init__()
+        width = config.channels
+        layers: list[nn.Module] = []
+        for block in range(config.agents - 1):
+            layers.append(TemporalBlock(width + POSE if block == 0 else width, width))
+            layers.extend(Bottleneck3d(width) for _ in range(config.bottlenecks))
+        self.model = nn.Sequential(*layers)
+        self.compression = nn.Sequential(
+            nn.Conv2d(config.agents * width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width), nn.ReLU()
+        )
+
+    def forward(self, x: Tensor, relative_pose: Tensor) -> Tensor:
+        """Fuse maps that are already in the ego's frame.
+
+        Args:
+            x: (B, A, C, H, W); slot 0 is the ego.
+            relative_pose: (B, A, 6) 6-vectors `ego_from_agent`; slot 0 is not used.
+
+        Returns:
+            (B, C, H, W).
+        """
+        return self.compression(self.over_agents(x, relative_pose).flatten(1, 2))
+
+    def over_agents(self, x: Tensor, relative_pose: Tensor) -> Tensor:
+        """(B, A, C, H, W) after the 3D convolutions; arguments as `forward`."""
+        pose = torch.cat([torch.zeros_like(relative_pose[:, :1]), relative_pose[:, 1:]], 1).to(x.dtype)
+        maps = torch.cat([x, pose[..., None, None].expand(-1, -1, -1, *x.shape[-2:])], 2)
+        return self.model(maps.transpose(1, 2)).transpose(1, 2)
 
 
 RELEASED_EGO_CHANNELS: Final = (31, 41, 42, 43, 44, 53, 57, 60)
@@ -96,11 +159,13 @@ class ReleasedFusionConfig:
         channels: C.
         ego_channels: channels that are the ego's own, not the mean; none gives a plain mean of filled maps.
         fill_below: a partner's cell whose channels' mean absolute value is smaller is filled with the ego's.
+        agent3d: the released code's unused layers, so that all keys of its checkpoints have a place; None for none.
     """
 
     channels: int
     ego_channels: tuple[int, ...] = RELEASED_EGO_CHANNELS
     fill_below: float = 0.001
+    agent3d: Agent3DConfig | None = None
 
     def __post_init__(self) -> None:
         """Check the channels' numbers; raises ConfigError."""
@@ -120,7 +185,7 @@ class ReleasedFusion(Fusion):
     (`hides_outside`). Masked cells are filled, too, and count; an agent that is masked everywhere is not there, and not
     in the mean. The release is right for batches of one sample alone; here each sample of a batch is treated so.
 
-    The released layers behind that return, which nothing reaches, are left out; `load_weights` tells that they are.
+    With `agent3d` there are the released unused layers as well; no gradient is asked of them.
     """
 
     hides_outside = False
@@ -132,6 +197,9 @@ class ReleasedFusion(Fusion):
         own = torch.zeros(config.channels, dtype=torch.bool)
         own[list(config.ego_channels)] = True
         self.register_buffer("from_ego", own, persistent=False)
+        if config.agent3d is not None:
+            unused = Agent3D(config.agent3d).requires_grad_(requires_grad=False)
+            self.model, self.compression = unused.model, unused.compression
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
         """As `Fusion.forward`; kinds of agents and delays do not count."""

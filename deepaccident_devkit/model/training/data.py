@@ -79,7 +79,7 @@ def batches(moments: Moments, numbers: Iterable[int], config: TrainConfig, *, wo
 
     Args:
         moments: the moments.
-        numbers: `schedule.positions`.
+        numbers: `step.positions`.
         config: how many a batch has.
         workers: processes that read; 0 for this one.
     """
@@ -119,7 +119,7 @@ def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config:
         config: who cooperates.
 
     Raises:
-        DeepAccidentError: as of `predicting.predictions`.
+        DeepAccidentError: as of `results.predictions`.
     """
     labels, rules = model.config.labels, DETECTION_PROTOCOLS["paper"]
     counted = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)

@@ -1,9 +1,8 @@
 """From the maps of a model's heads to instances: cells grouped around centres, and instances linked over time.
 
 The rules are the released ones (docs/released_code.md, Post-processing), FIERY's: everything in float32, cells in
-row-major order, and of equals the first one counts. Arrays here are in the orientation of `PostProcessing.scan`.
-
-The rules are the released ones (docs/released_code.md, Post-processing), FIERY's with another distance.
+row-major order, and of equals the first one counts; frames are linked with another distance than FIERY's. Arrays here
+are in the orientation of `PostProcessing.scan`.
 """
 
 from __future__ import annotations

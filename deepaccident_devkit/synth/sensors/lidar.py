@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from deepaccident_devkit.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray, readonly
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.sensors.agents import Agent
-from deepaccident_devkit.synth.sensors.caster import NOTHING, Caster
+from deepaccident_devkit.synth.sensors.caster import NOTHING, make_caster
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.synth.solids import FACES_A_SOLID
@@ -194,7 +194,7 @@ def make_lidar(setting: Setting, agent: Agent) -> Lidar:
     place = (agent.box_from_ego @ agent.ego_from_lidar).translation
     body = rays_through(setting.actors.all[agent.row].size, place)
     solids = np.flatnonzero(setting.moving_owner == agent.row)
-    caster = Caster(setting.moving_shapes.corners[solids])
+    caster = make_caster(setting.moving_shapes.corners[solids])
     distance, face = caster.cast(place, turned_rays(np.eye(3), body))
     first = setting.faces + FACES_A_SOLID * int(solids[0])
     return Lidar(row=agent.row, body=body, distance=distance, face=np.where(face >= 0, face + first, face))

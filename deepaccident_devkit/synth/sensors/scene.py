@@ -10,7 +10,7 @@ from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.synth.actors import Actors, Snapshot
 from deepaccident_devkit.synth.roads import Terrain
-from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, Caster, plane_distance
+from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, Caster, make_caster, plane_distance
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.synth.solids import FACES_A_SOLID, Solids, concatenate, face_corners, face_planes
 from deepaccident_devkit.synth.stage import World
@@ -147,8 +147,8 @@ class Setting:
         self.moving, self.parked = np.flatnonzero(~parked), np.flatnonzero(parked)
         self.moving_shapes = actors.solids.select(np.flatnonzero(~solid_parked))
         self.moving_owner = actors.solid_actor[~solid_parked]
-        self.caster = Caster(self.still.corners, self.terrain)
-        self._fence = Caster(_endless(self.still.corners))
+        self.caster = make_caster(self.still.corners, self.terrain)
+        self._fence: Caster = make_caster(_endless(self.still.corners))
         self._kept: dict[bytes, tuple[AnyArray, AnyArray]] = {}
 
     @property
@@ -305,4 +305,4 @@ def make_scene(setting: Setting, time: float) -> Scene:
     frames = setting.frames(snapshot.poses)
     corners = moved(setting.moving_shapes.corners, frames[setting.moving_owner])
     movers = Surfaces(setting.moving_shapes, corners, setting.moving_owner)
-    return Scene(setting, snapshot, frames, movers, Caster(corners))
+    return Scene(setting, snapshot, frames, movers, make_caster(corners))

@@ -34,7 +34,7 @@ class Approach:
 
     Attributes:
         user: who drives, as at the start of the drive.
-        along: (S,) metres of its box's centre along its path, one value every `kinematics.PERIOD`.
+        along: (S,) metres of its box's centre along its path, one value every `driving.PERIOD`.
         speed: (S,) m/s.
     """
 

@@ -150,7 +150,7 @@ class Simulation(FrozenArrays):
     """Where everyone was; arrays are read-only.
 
     Attributes:
-        time: (S,) seconds, in steps of `kinematics.PERIOD`.
+        time: (S,) seconds, in steps of `driving.PERIOD`.
         states: (S, A, 5) x, y (metres), yaw (radians), speed (m/s) and steering angle (radians); x and y are of the
             box's centre, speed and yaw of the rear axle, which does not slide.
         velocities: (S, A, 2) velocities of the box's centre, m/s.

@@ -7,7 +7,7 @@ from pathlib import Path
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import ScenarioFolder, find_release
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
-from deepaccident_devkit.testing.breakages import files, folders, legal
+from deepaccident_devkit.testing.breakages import files, folders, legal, sensors
 from deepaccident_devkit.testing.breakages.kinds import Breakage, BrokenRelease, Victim
 from deepaccident_devkit.testing.editing import ScenarioEditor
 from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
@@ -20,9 +20,9 @@ _GROUPS = (
     files.CALIB_MEANING,
     files.META_FORM,
     files.META_MEANING,
-    folders.SENSOR_FORM,
-    folders.SENSOR_MISSING,
-    folders.SENSOR_MEANING,
+    sensors.FORM,
+    sensors.MISSING,
+    sensors.MEANING,
     folders.BROKEN,
     folders.ODD,
     folders.SPLIT_FILES,
@@ -52,13 +52,13 @@ def break_release(root: Path, name: str) -> BrokenRelease:
         path = breakage.apply(victim)
     except (FileNotFoundError, LookupError, ValueError) as error:
         raise ConfigError(
-            f"{root}: {name!r} cannot break {editor.token}, which lacks a part: {error}; choose a complete scenario, "
-            "or a release such as SmallRelease()"
+            f"{root}: {name!r} cannot break {editor.token}, which lacks a part: {error}; choose a complete release, "
+            "such as one of SmallRelease()"
         ) from error
     if not editor.has_changed():
         raise ConfigError(
-            f"{root}: {name!r} changes nothing in {editor.token}; choose a scenario that has the part that it breaks, "
-            "or a release such as SmallRelease()"
+            f"{root}: {name!r} changes nothing in {editor.token}; choose a release that has the part that it breaks, "
+            "such as one of SmallRelease()"
         )
     return BrokenRelease(
         root=root,

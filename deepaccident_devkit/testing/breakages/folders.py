@@ -1,13 +1,10 @@
-"""Breakages of folders and of sensors' files."""
+"""Missing, odd and exchanged files and folders, and split files."""
 
 from pathlib import Path
 
-import numpy as np
-
-from deepaccident_devkit.errors import BrokenReleaseError, MissingFileError, SensorFileError, SplitFileError
-from deepaccident_devkit.release import read_image, write_image
+from deepaccident_devkit.errors import BrokenReleaseError, SplitFileError
 from deepaccident_devkit.release.store import real_path
-from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, SPLITS
+from deepaccident_devkit.taxonomy import SPLITS
 from deepaccident_devkit.testing.breakages.kinds import Group, Victim
 from deepaccident_devkit.testing.editing import ENDINGS
 
@@ -119,95 +116,3 @@ def split_line_twice(victim: Victim) -> Path:
     path = max(files, key=lambda path: path.stat().st_size)  # files of splits that were not made are empty
     victim.editor.write(path, path.read_bytes() * 2)
     return path
-
-
-SENSOR_FORM = Group("sensor", reading=SensorFileError, deep=True)
-SENSOR_MEANING = Group("sensor", deep=True)
-SENSOR_MISSING = Group("sensor", reading=MissingFileError)
-CAMERA = "Camera_Front"
-
-
-def _half(content: bytes) -> bytes:
-    return content[: len(content) // 2]
-
-
-@SENSOR_FORM.enter("sensor-unreadable", channel=CAMERA)
-def image_cut(victim: Victim) -> Path:
-    """An image file ends in the middle."""
-    return victim.replace(CAMERA, _half)
-
-
-@SENSOR_FORM.enter("sensor-empty", "sensor-unreadable", channel=CAMERA)
-def image_empty(victim: Victim) -> Path:
-    """An image file has no bytes."""
-    return victim.replace(CAMERA, lambda _: b"")
-
-
-@SENSOR_MISSING.enter("sensor-frames-missing", channel=CAMERA)
-def image_missing(victim: Victim) -> Path:
-    """An image file is missing."""
-    victim.editor.remove(victim.file(CAMERA))
-    return victim.file(CAMERA)
-
-
-@SENSOR_MEANING.enter("image-size", channel=CAMERA)
-def image_wrong_size(victim: Victim) -> Path:
-    """An image is twice as large as its K says."""
-    path = victim.file(CAMERA)
-    image = read_image(path)
-    victim.editor.changing(path)
-    write_image(path, np.ascontiguousarray(image.repeat(2, axis=0).repeat(2, axis=1)))
-    return path
-
-
-@SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
-def lidar_cut(victim: Victim) -> Path:
-    """An npz file of points ends in the middle."""
-    return victim.replace(LIDAR, _half)
-
-
-@SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
-def lidar_three_columns(victim: Victim) -> Path:
-    """A point cloud lacks the intensity."""
-    points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points[:, :3])
-    return victim.file(LIDAR)
-
-
-@SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
-def lidar_objects(victim: Victim) -> Path:
-    """A point cloud is an array of Python objects, which only a pickle can load."""
-    points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points.astype(object))
-    return victim.file(LIDAR)
-
-
-@SENSOR_MEANING.enter("points-differ", channel=LIDAR)
-def lidar_right_handed(victim: Victim) -> Path:
-    """A point cloud has the other handedness."""
-    points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points * np.array([1, -1, 1, 1], dtype=np.float32))
-    return victim.file(LIDAR)
-
-
-@SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
-def bev_cut(victim: Victim) -> Path:
-    """An npz file of the BEV camera ends in the middle."""
-    return victim.replace(BEV_CAMERA, _half)
-
-
-@SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
-def bev_half_size(victim: Victim) -> Path:
-    """A BEV array has 600 rows and columns."""
-    picture = victim.editor.array(victim.agent, BEV_CAMERA, victim.frame)
-    victim.editor.write_array(victim.agent, BEV_CAMERA, victim.frame, picture[::2, ::2])
-    return victim.file(BEV_CAMERA)
-
-
-@SENSOR_MEANING.enter("bev-orientation", channel=BEV_CAMERA)
-def bev_mirrored(victim: Victim) -> Path:
-    """An agent's BEV arrays are mirrored, left to right."""
-    for frame in victim.editor.frames:
-        picture = victim.editor.array(victim.agent, BEV_CAMERA, frame)
-        victim.editor.write_array(victim.agent, BEV_CAMERA, frame, picture[:, ::-1])
-    return victim.editor.folder(victim.agent, BEV_CAMERA)

@@ -227,18 +227,13 @@ def lidar_height_in_a_frame(place: Place, rng: np.random.Generator) -> str:
 def calib_of_next_frame(place: Place, rng: np.random.Generator) -> str:
     """A moving agent's calib file is replaced by the next frame's."""
     frame = int(rng.choice(place.frames[:-1]))
-    agent = place.moving_agent(rng, frame)
-    place.write(place.file(agent, "calib", frame), place.file(agent, "calib", frame + 1).read_bytes())
-    return f"{agent} {frame}"
+    return place.take_next(place.moving_agent(rng, frame), "calib", frame)
 
 
 @POSES.kind()
 def calibs_shifted(place: Place, rng: np.random.Generator) -> str:
     """All calib files of a moving agent are one frame early; the last one is there twice."""
-    agent = place.moving_agent(rng)
-    for frame in place.frames[:-1]:
-        place.write(place.file(agent, "calib", frame), place.file(agent, "calib", frame + 1).read_bytes())
-    return agent
+    return place.one_frame_early(place.moving_agent(rng), "calib")
 
 
 @POSES.kind()

@@ -252,27 +252,19 @@ def class_against_size(place: Place, rng: np.random.Generator) -> str:
 def label_of_next_frame(place: Place, rng: np.random.Generator) -> str:
     """A moving agent's label file is replaced by the next frame's."""
     frame = int(rng.choice(place.frames[:-1]))
-    agent = place.moving_agent(rng, frame)
-    place.write(place.file(agent, "label", frame), place.file(agent, "label", frame + 1).read_bytes())
-    return f"{agent} {frame}"
+    return place.take_next(place.moving_agent(rng, frame), "label", frame)
 
 
 @GROUP.kind()
 def labels_shifted(place: Place, rng: np.random.Generator) -> str:
     """All labels of a moving agent are one frame early; the last one is there twice."""
-    agent = place.moving_agent(rng)
-    for frame in place.frames[:-1]:
-        place.write(place.file(agent, "label", frame), place.file(agent, "label", frame + 1).read_bytes())
-    return agent
+    return place.one_frame_early(place.moving_agent(rng), "label")
 
 
 @GROUP.kind()
 def labels_shifted_on_the_pole(place: Place, rng: np.random.Generator) -> str:
     """All labels of the standing infrastructure are one frame early; the last one is there twice."""
-    for frame in place.frames[:-1]:
-        content = place.file("infrastructure", "label", frame + 1).read_bytes()
-        place.write(place.file("infrastructure", "label", frame), content)
-    return "infrastructure"
+    return place.one_frame_early("infrastructure", "label")
 
 
 @GROUP.kind()

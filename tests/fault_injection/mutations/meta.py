@@ -26,11 +26,6 @@ def _set_entry(place: Place, key: str, value: str) -> str:
     return f"{key}: {value}"
 
 
-def _colliding_ids(place: Place) -> list[int]:
-    words = place.meta_lines()[0].split()
-    return [int(words[1]), int(words[3])]
-
-
 @GROUP.kind()
 def meta_removed(place: Place, rng: np.random.Generator) -> str:
     """A labelled scenario has no meta file."""

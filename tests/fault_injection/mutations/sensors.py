@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR
-from fault_injection.kinds import Group, cut, garbage
+from fault_injection.kinds import Apply, Group, cut, garbage
 from fault_injection.place import Place
 
 IMAGES = Group("images", deep=True)
@@ -22,19 +22,33 @@ def _camera(rng: np.random.Generator) -> str:
     return str(rng.choice(CAMERAS))
 
 
-def _replace_file(place: Place, rng: np.random.Generator, channel: str, change: Callable[[bytes], bytes]) -> str:
-    agent, frame = place.any_agent(rng), place.any_frame(rng)
-    path = place.file(agent, channel, frame)
-    place.write(path, change(path.read_bytes()))
-    return f"{agent} {channel} {frame}: {path.stat().st_size} bytes"
+def _in_file(channel: str | None, change: Callable[[bytes, np.random.Generator], bytes]) -> Apply:
+    """Change the bytes of a file; channel None stands for any camera."""
+
+    def apply(place: Place, rng: np.random.Generator) -> str:
+        name = channel or _camera(rng)
+        agent, frame = place.any_agent(rng), place.any_frame(rng)
+        path = place.file(agent, name, frame)
+        place.write(path, change(path.read_bytes(), rng))
+        return f"{agent} {name} {frame}: {path.stat().st_size} bytes"
+
+    return apply
 
 
-def _replace_array(
-    place: Place, rng: np.random.Generator, channel: str, change: Callable[[np.ndarray], np.ndarray]
-) -> str:
-    agent, frame = place.any_agent(rng), place.any_frame(rng)
-    place.write_array(agent, channel, frame, change(place.array(agent, channel, frame)))
-    return f"{agent} {channel} {frame}"
+def _in_image(change: Callable[[np.ndarray], np.ndarray]) -> Apply:
+    """Change the pixels of an image of any camera."""
+    return _in_file(None, lambda content, _: _jpeg(change(_pixels(content))))
+
+
+def _in_array(channel: str, change: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Apply:
+    """Change the array of a point cloud or BEV file."""
+
+    def apply(place: Place, rng: np.random.Generator) -> str:
+        agent, frame = place.any_agent(rng), place.any_frame(rng)
+        place.write_array(agent, channel, frame, change(place.array(agent, channel, frame), rng))
+        return f"{agent} {channel} {frame}"
+
+    return apply
 
 
 def _of_agent(place: Place, rng: np.random.Generator, channel: str) -> str:
@@ -85,62 +99,41 @@ def _pixels(content: bytes) -> np.ndarray:
     return np.array(Image.open(io.BytesIO(content)))
 
 
-@IMAGES.kind()
-def image_cut(place: Place, rng: np.random.Generator) -> str:
-    """An image file ends at a random byte."""
-    return _replace_file(place, rng, _camera(rng), lambda content: cut(content, rng))
+def _ends_early(content: bytes, rng: np.random.Generator) -> bytes:
+    start = content.index(b"\xff\xda") + 14
+    return content[: rng.integers(start, start + (len(content) - start) * 9 // 10)] + b"\xff\xd9"
 
 
-@IMAGES.kind()
-def image_ends_early(place: Place, rng: np.random.Generator) -> str:
-    """A part of an image's coded data before its end marker is gone; decoders do not report this."""
-
-    def change(content: bytes) -> bytes:
-        start = content.index(b"\xff\xda") + 14
-        return content[: rng.integers(start, start + (len(content) - start) * 9 // 10)] + b"\xff\xd9"
-
-    return _replace_file(place, rng, _camera(rng), change)
-
-
-@IMAGES.kind()
-def image_emptied(place: Place, rng: np.random.Generator) -> str:
-    """An image file is empty."""
-    return _replace_file(place, rng, _camera(rng), lambda _: b"")
-
-
-@IMAGES.kind()
-def image_zeros(place: Place, rng: np.random.Generator) -> str:
-    """A part of an image's coded data is zero bytes; decoders do not report this."""
-
-    def change(content: bytes) -> bytes:
-        start = content.index(b"\xff\xda") + 14
-        length = min(512, (len(content) - start) // 2)
-        start = int(rng.integers(start, len(content) - length))
-        return content[:start] + bytes(length) + content[start + length :]
-
-    return _replace_file(place, rng, _camera(rng), change)
+def _zeros(content: bytes, rng: np.random.Generator) -> bytes:
+    start = content.index(b"\xff\xda") + 14
+    length = min(512, (len(content) - start) // 2)
+    start = int(rng.integers(start, len(content) - length))
+    return content[:start] + bytes(length) + content[start + length :]
 
 
 IMAGES.add(
     {
+        "image_cut": ("An image file ends at a random byte.", _in_file(None, cut)),
+        "image_ends_early": (
+            "A part of an image's coded data before its end marker is gone; decoders do not report this.",
+            _in_file(None, _ends_early),
+        ),
+        "image_emptied": ("An image file is empty.", _in_file(None, lambda *_: b"")),
+        "image_zeros": (
+            "A part of an image's coded data is zero bytes; decoders do not report this.",
+            _in_file(None, _zeros),
+        ),
         "image_garbage": (
             "An image file holds random bytes.",
-            lambda place, rng: _replace_file(place, rng, _camera(rng), lambda content: garbage(rng, len(content))),
+            _in_file(None, lambda content, rng: garbage(rng, len(content))),
         ),
-        "image_size": (
-            "An image has half the size of the others.",
-            lambda place, rng: _replace_file(
-                place, rng, _camera(rng), lambda content: _jpeg(_pixels(content)[::2, ::2])
-            ),
-        ),
+        "image_size": ("An image has half the size of the others.", _in_image(lambda pixels: pixels[::2, ::2])),
     },
 )
-
-
-@IMAGES.kind(beyond=_WALL)
-def image_grey(place: Place, rng: np.random.Generator) -> str:
-    """All of an image has one grey."""
-    return _replace_file(place, rng, _camera(rng), lambda content: _jpeg(np.full_like(_pixels(content), 128)))
+IMAGES.add(
+    {"image_grey": ("All of an image has one grey.", _in_image(lambda pixels: np.full_like(pixels, 128)))},
+    beyond=_WALL,
+)
 
 
 @IMAGES.kind()
@@ -204,73 +197,44 @@ IMAGES.add(
             "All images of one camera of two agents are exchanged.",
             lambda place, rng: _exchange_agents(place, rng, _camera(rng)),
         ),
-        "image_mirrored": (
-            "An image is mirrored.",
-            lambda place, rng: _replace_file(
-                place, rng, _camera(rng), lambda content: _jpeg(_pixels(content)[:, ::-1])
-            ),
-        ),
+        "image_mirrored": ("An image is mirrored.", _in_image(lambda pixels: pixels[:, ::-1])),
     },
     beyond=_LOOK,
 )
 
 
+def _bit_flipped(content: bytes, rng: np.random.Generator) -> bytes:
+    middle = int(rng.integers(len(content) // 4, 3 * len(content) // 4))
+    return content[:middle] + bytes([content[middle] ^ 0x10]) + content[middle + 1 :]
+
+
+def _with_nan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    broken = points.copy()
+    broken[rng.choice(len(points), size=100, replace=False), :3] = np.nan
+    return broken
+
+
 LIDARS.add(
     {
-        "lidar_cut": (
-            "A point cloud's file ends at a random byte.",
-            lambda place, rng: _replace_file(place, rng, LIDAR, lambda content: cut(content, rng)),
-        ),
+        "lidar_cut": ("A point cloud's file ends at a random byte.", _in_file(LIDAR, cut)),
         "lidar_with_more_bytes": (
             "Bytes follow the end of a point cloud's file.",
-            lambda place, rng: _replace_file(place, rng, LIDAR, lambda content: content + garbage(rng, 100)),
+            _in_file(LIDAR, lambda content, rng: content + garbage(rng, 100)),
         ),
-        "lidar_emptied": (
-            "A point cloud's file is empty.",
-            lambda place, rng: _replace_file(place, rng, LIDAR, lambda _: b""),
+        "lidar_emptied": ("A point cloud's file is empty.", _in_file(LIDAR, lambda *_: b"")),
+        "lidar_bit_flipped": (
+            "A byte in the middle of a point cloud's file is wrong.",
+            _in_file(LIDAR, _bit_flipped),
         ),
-    },
-)
-
-
-@LIDARS.kind()
-def lidar_bit_flipped(place: Place, rng: np.random.Generator) -> str:
-    """A byte in the middle of a point cloud's file is wrong."""
-
-    def change(content: bytes) -> bytes:
-        middle = int(rng.integers(len(content) // 4, 3 * len(content) // 4))
-        return content[:middle] + bytes([content[middle] ^ 0x10]) + content[middle + 1 :]
-
-    return _replace_file(place, rng, LIDAR, change)
-
-
-@LIDARS.kind()
-def lidar_wrong_shape(place: Place, rng: np.random.Generator) -> str:
-    """A point cloud lacks the intensity."""
-    return _replace_array(place, rng, LIDAR, lambda points: points[:, :3])
-
-
-@LIDARS.kind()
-def lidar_nan(place: Place, rng: np.random.Generator) -> str:
-    """A hundred points of a cloud are NaN."""
-
-    def change(points: np.ndarray) -> np.ndarray:
-        broken = points.copy()
-        broken[rng.choice(len(points), size=100, replace=False), :3] = np.nan
-        return broken
-
-    return _replace_array(place, rng, LIDAR, change)
-
-
-LIDARS.add(
-    {
-        "lidar_without_points": (
-            "A cloud has no points.",
-            lambda place, rng: _replace_array(place, rng, LIDAR, lambda points: points[:0]),
+        "lidar_wrong_shape": (
+            "A point cloud lacks the intensity.",
+            _in_array(LIDAR, lambda points, _: points[:, :3]),
         ),
+        "lidar_nan": ("A hundred points of a cloud are NaN.", _in_array(LIDAR, _with_nan)),
+        "lidar_without_points": ("A cloud has no points.", _in_array(LIDAR, lambda points, _: points[:0])),
         "lidar_halved": (
             "Half of a cloud's points are missing.",
-            lambda place, rng: _replace_array(place, rng, LIDAR, lambda points: points[: len(points) // 2]),
+            _in_array(LIDAR, lambda points, _: points[: len(points) // 2]),
         ),
         "lidar_of_agent": (
             "A point cloud is another agent's of the same frame.",
@@ -280,21 +244,10 @@ LIDARS.add(
             "A moving agent's point cloud is that of another frame.",
             lambda place, rng: _of_frame(place, rng, LIDAR),
         ),
-    },
-)
-
-
-@LIDARS.kind()
-def lidars_shifted(place: Place, rng: np.random.Generator) -> str:
-    """All point clouds of a moving agent are one frame early; the last one is there twice."""
-    agent = place.moving_agent(rng)
-    for frame in place.frames[:-1]:
-        place.write(place.file(agent, LIDAR, frame), place.file(agent, LIDAR, frame + 1).read_bytes())
-    return agent
-
-
-LIDARS.add(
-    {
+        "lidars_shifted": (
+            "All point clouds of a moving agent are one frame early; the last one is there twice.",
+            lambda place, rng: place.one_frame_early(place.moving_agent(rng), LIDAR),
+        ),
         "lidars_of_two_frames_exchanged": (
             "Two point clouds of a moving agent are exchanged.",
             lambda place, rng: _exchange_frames(place, rng, LIDAR),
@@ -305,56 +258,21 @@ LIDARS.add(
         ),
         "lidar_y_flipped": (
             "A cloud's y has the other sign.",
-            lambda place, rng: _replace_array(place, rng, LIDAR, lambda points: points * np.float32([1, -1, 1, 1])),
+            _in_array(LIDAR, lambda points, _: points * np.float32([1, -1, 1, 1])),
         ),
         "lidar_scaled": (
             "A cloud is 10 % too large.",
-            lambda place, rng: _replace_array(
-                place, rng, LIDAR, lambda points: points * np.float32([1.1, 1.1, 1.1, 1])
-            ),
+            _in_array(LIDAR, lambda points, _: points * np.float32([1.1, 1.1, 1.1, 1])),
         ),
         "lidar_turned": (
             "A cloud is turned by 90°.",
-            lambda place, rng: _replace_array(
-                place, rng, LIDAR, lambda points: points[:, [1, 0, 2, 3]] * np.float32([-1, 1, 1, 1])
-            ),
+            _in_array(LIDAR, lambda points, _: points[:, [1, 0, 2, 3]] * np.float32([-1, 1, 1, 1])),
         ),
     },
 )
 
 
-BEVS.add(
-    {
-        "bev_cut": (
-            "A BEV file ends at a random byte.",
-            lambda place, rng: _replace_file(place, rng, BEV_CAMERA, lambda content: cut(content, rng)),
-        ),
-        "bev_wrong_shape": (
-            "A BEV array has half the rows.",
-            lambda place, rng: _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[::2]),
-        ),
-        "bev_channels_reversed": (
-            "A BEV array's channels are in the reverse order.",
-            lambda place, rng: _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[..., ::-1]),
-        ),
-        "bev_flipped": (
-            "A BEV array is flipped left to right.",
-            lambda place, rng: _replace_array(place, rng, BEV_CAMERA, lambda picture: picture[:, ::-1]),
-        ),
-    },
-)
-
-
-@BEVS.kind()
-def bev_turned(place: Place, rng: np.random.Generator) -> str:
-    """A BEV array is turned by 90° or 180°."""
-    turns = int(rng.choice([1, 2, 3]))
-    return _replace_array(place, rng, BEV_CAMERA, lambda picture: np.rot90(picture, turns))
-
-
-@BEVS.kind()
-def bevs_flipped(place: Place, rng: np.random.Generator) -> str:
-    """All BEV arrays of an agent are flipped left to right."""
+def _all_flipped(place: Place, rng: np.random.Generator) -> str:
     agent = place.any_agent(rng)
     for frame in place.frames:
         place.write_array(agent, BEV_CAMERA, frame, place.array(agent, BEV_CAMERA, frame)[:, ::-1])
@@ -363,11 +281,24 @@ def bevs_flipped(place: Place, rng: np.random.Generator) -> str:
 
 BEVS.add(
     {
+        "bev_cut": ("A BEV file ends at a random byte.", _in_file(BEV_CAMERA, cut)),
+        "bev_wrong_shape": ("A BEV array has half the rows.", _in_array(BEV_CAMERA, lambda picture, _: picture[::2])),
+        "bev_channels_reversed": (
+            "A BEV array's channels are in the reverse order.",
+            _in_array(BEV_CAMERA, lambda picture, _: picture[..., ::-1]),
+        ),
+        "bev_flipped": (
+            "A BEV array is flipped left to right.",
+            _in_array(BEV_CAMERA, lambda picture, _: picture[:, ::-1]),
+        ),
+        "bev_turned": (
+            "A BEV array is turned by 90° or 180°.",
+            _in_array(BEV_CAMERA, lambda picture, rng: np.rot90(picture, rng.choice([1, 2, 3]))),
+        ),
+        "bevs_flipped": ("All BEV arrays of an agent are flipped left to right.", _all_flipped),
         "bev_zoomed": (
             "A BEV array shows 30 m instead of 60 m to each side.",
-            lambda place, rng: _replace_array(
-                place, rng, BEV_CAMERA, lambda picture: picture[300:900, 300:900].repeat(2, axis=0).repeat(2, axis=1)
-            ),
+            _in_array(BEV_CAMERA, lambda picture, _: picture[300:900, 300:900].repeat(2, axis=0).repeat(2, axis=1)),
         ),
         "bev_of_agent": (
             "A BEV array is another agent's of the same frame.",

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch_extra.model.small_model import small, small_released
 
 from deepaccident_devkit.errors import ConfigError
@@ -262,6 +263,20 @@ def test_files_without_named_tensors_are_refused(tmp_path: Path, content: Any) -
     path = tmp_path / "weights.pth"
     torch.save(content, path)
     assert_refused(path, "holds no tensors by name")
+
+
+@pytest.mark.parametrize("noted", ["{", "tiny", "[1]", '"tiny"', "3"])
+def test_notes_that_are_no_json_object_are_refused(tmp_path: Path, noted: str) -> None:
+    path = tmp_path / "weights.safetensors"
+    save_file({"img_neck.weight": torch.zeros(1)}, path, metadata={"deepaccident": noted})
+    assert_refused(path, "is no file of weights")
+
+
+@pytest.mark.parametrize("metadata", [None, {"format": "pt"}])
+def test_safetensors_of_others_have_no_notes(tmp_path: Path, metadata: dict[str, str] | None) -> None:
+    path = tmp_path / "weights.safetensors"
+    save_file({"img_neck.weight": torch.ones(1)}, path, metadata=metadata)
+    assert read_weights(path).meta == {}
 
 
 def test_absent_files_are_refused(tmp_path: Path) -> None:

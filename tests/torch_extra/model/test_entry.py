@@ -1,6 +1,6 @@
 """The model's door: its frame, frames that did not arrive, and egomotion."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -163,3 +163,10 @@ def test_egos_have_their_own_places(da: DeepAccident, moment: list[str], given: 
     for name in ("ego_rows", "ego_from_agent", "partners"):
         assert torch.equal(getattr(some, name), getattr(inputs, name)[[2, 0]])
     assert some.images is inputs.images
+
+
+def test_all_tensors_go_to_a_device(batch: dict[str, Any]) -> None:
+    moved = model_inputs(batch).to("meta")
+    tensors = [getattr(moved, each.name) for each in fields(moved) if each.name != "cameras"]
+    tensors += [getattr(moved.cameras, each.name) for each in fields(moved.cameras)]
+    assert {str(each.device) for each in tensors} == {"meta"}

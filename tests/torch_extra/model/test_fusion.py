@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.fusion import (
+    Agent3D,
+    Agent3DConfig,
     CobevtConfig,
     DiscoNetConfig,
     Fusion,
@@ -145,6 +147,25 @@ def test_released_fusion_fills_near_empty_and_masked_cells_and_keeps_channels_of
     assert changed.nonzero().tolist() == [[1, 1]]
 
 
+def test_released_fusion_can_hold_its_unused_layers() -> None:
+    plain, holding = (module(replace(RELEASED, agent3d=unused)) for unused in (None, Agent3DConfig(channels=C)))
+    assert not plain.state_dict()
+    assert {key.split(".")[0] for key in holding.state_dict()} == {"model", "compression"}
+    assert torch.equal(holding(*batch()), plain(*batch()))
+
+
+def test_unreached_layers_fuse_all_agents_and_poses() -> None:
+    model = Agent3D(Agent3DConfig(channels=C, agents=3, bottlenecks=1)).train()
+    x, pose = torch.randn(2, 3, C, 7, 9, requires_grad=True), torch.randn(2, 3, 6, requires_grad=True)
+    fused = model(x, pose)
+    assert fused.shape == (2, C, 7, 9)
+    (fused**2).sum().backward()
+    assert all(weight.grad.ne(0).any() for weight in model.parameters())
+    assert x.grad.flatten(2).ne(0).any(2).all()
+    assert not pose.grad[:, 0].any()
+    assert pose.grad[:, 1:].ne(0).any(2).all()
+
+
 def test_disconet_s_weights_are_shares() -> None:
     x, mask, *_ = batch()
     for config in (DISCONET, replace(DISCONET, last_relu=True)):
@@ -222,5 +243,7 @@ def test_wrong_configs_say_so() -> None:
         replace(V2XVIT, window_heads=(2,))
     with pytest.raises(ConfigError, match="by: expected one of mean, max, found 'sum'"):
         PoolFusionConfig(by="sum")
+    with pytest.raises(ConfigError, match="agents: expected at least 2, found 1"):
+        Agent3DConfig(channels=C, agents=1)
     with pytest.raises(ConfigError, match="the config of a fusion module, found 'mean'"):
         fusion("mean")

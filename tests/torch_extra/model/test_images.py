@@ -114,3 +114,20 @@ def test_converted_weights_merge_patches_as_the_official_model():
         {name[len("stages.0.downsample.") :]: each for name, each in from_official(official).items()}
     )
     torch.testing.assert_close(merging(features), reduction(norm(torch.cat(tokens, -1))))
+
+
+def test_checkpointing_computes_blocks_again_in_training_alone():
+    network = Swin(SwinConfig(**SMALL_SWIN, checkpointing=True))
+    calls = []
+    network.stages[0].blocks[1].norm1.register_forward_hook(lambda *_: calls.append(1))
+    network.eval()(noise(1, 3, 32, 32))[1].sum().backward()
+    assert len(calls) == 1
+    network.train()(noise(1, 3, 32, 32))[1].sum().backward()
+    assert len(calls) == 3
+
+
+def test_maps_of_odd_sizes_are_filled_to_be_halved():
+    merging = PatchMerging(2)
+    features = noise(1, 3, 5, 2)
+    filled = nn.functional.pad(features, (0, 0, 0, 1, 0, 1))
+    torch.testing.assert_close(merging(features), merging(filled))

@@ -81,6 +81,17 @@ def test_the_rate_rises_and_falls_to_nothing(steps: int, warm_up: float) -> None
     assert learning_rate(steps, config) == pytest.approx(0.0 if rising < steps else 0.5, abs=1e-12)
 
 
+def test_the_rate_falls_as_a_cosine() -> None:
+    config = TrainConfig(steps=120, warm_up=0.1, learning_rate=1.0)
+    assert [learning_rate(12 + after, config) for after in (36, 54, 72)] == pytest.approx([0.75, 0.5, 0.25])
+
+
+def test_epochs_have_orders_of_their_own() -> None:
+    order = [number % 50 for number in islice(positions(50, TrainConfig(), first=0), 100)]
+    assert order[:50] != order[50:]
+    assert order[:50] != list(range(50))
+
+
 @given(st.integers(1, 12), st.integers(1, 4), st.integers(0, 30), st.integers(0, 5))
 def test_processes_share_each_epoch_and_go_on_in_its_middle(count: int, ranks: int, first: int, seed: int) -> None:
     config = TrainConfig(seed=seed)
@@ -142,6 +153,9 @@ def test_partners_are_dropped_but_never_the_ego(inputs: ModelInputs) -> None:
     assert partners.all(2).float().mean() == pytest.approx(0.8 * 0.7**4, abs=0.02)
     everyone = with_dropped_partners(inputs, replace(config, partner_dropout=0, alone=0), generator_of(0))
     assert torch.equal(everyone.partners, inputs.partners)
+    absent = replace(inputs, partners=inputs.partners & (torch.arange(5) != 2))
+    kept = with_dropped_partners(absent, replace(config, partner_dropout=0, alone=0), generator_of(0))
+    assert torch.equal(kept.partners, absent.partners)
     for nobody in ({"partner_dropout": 1, "alone": 0}, {"partner_dropout": 0, "alone": 1}):
         assert torch.equal(with_dropped_partners(inputs, replace(config, **nobody), generator_of(0)).partners, egos)
 

@@ -256,6 +256,7 @@ def test_missing_frames_are_empty_or_ignored() -> None:
     clean = labels(frames, protocol="clean")
     for name in ("segmentation", "instance", "centerness", "offset", "flow"):
         assert (getattr(clean, name)[3:] == 255).all()
+        assert (getattr(clean.to_present(), name)[3:] == 255).all()
     for made in (released, clean):
         assert (made.flow[2] == 255).all()
         assert made.flow[1].min() == 0

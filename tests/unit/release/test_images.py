@@ -45,6 +45,17 @@ def test_a_grey_image_is_grey_when_raw_and_rgb_else(path: Path) -> None:
 
 
 @pytest.mark.parametrize("raw", [False, True])
+def test_what_is_read_is_the_callers(path: Path, quarters: np.ndarray, raw: bool) -> None:
+    write_image(path, quarters)
+    read_image(path, raw=raw)[0, 0] = 1  # must not raise
+
+
+def test_a_png_is_read(path: Path, quarters: np.ndarray) -> None:
+    Image.fromarray(quarters).save(path, "PNG")
+    np.testing.assert_array_equal(read_image(path), quarters)
+
+
+@pytest.mark.parametrize("raw", [False, True])
 def test_truncated_garbage_empty_and_missing(path: Path, quarters: np.ndarray, raw: bool) -> None:
     with pytest.raises(MissingFileError, match=r"image\.jpg: no such file; unpack the archive that holds it"):
         read_image(path, raw=raw)

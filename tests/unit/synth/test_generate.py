@@ -92,6 +92,12 @@ def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, digests):
     assert one == two == three
 
 
+def test_one_scenario_gives_work_to_several_processes():
+    assert recording.parts_of(SynthConfig(frames=None)) == recording.parts_of(SynthConfig(frames=60)) >= 4
+    assert recording.parts_of(SynthConfig(frames=2)) == 2
+    assert recording.parts_of(SynthConfig(frames=60, sensors="none")) == 1
+
+
 @pytest.fixture
 def break_off(monkeypatch):
     """Makes a release until the disk is full, at the second frame of the second scenario."""

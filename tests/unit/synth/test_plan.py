@@ -6,7 +6,7 @@ import pytest
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.splits import split_records
 from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.plan import plan_scenarios, plan_splits
+from deepaccident_devkit.synth.plan import _mini, plan_scenarios, plan_splits
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.taxonomy import TOWNS
 
@@ -107,6 +107,13 @@ def test_minis_are_whole_pairs_a_fifth_at_most_and_never_empty(scenarios):
         assert set(mini) == {token for token in whole if pair_of[token] in pairs}
         assert len(pairs) == 1 or 5 * len(mini) <= len(whole)
         assert bool(mini) == bool(whole)
+
+
+def test_a_lone_accident_is_the_smallest_unit():
+    """Of a pair and a lone accident in train."""
+    plans = plans_of(scenarios=3)
+    tokens = [plan.token for plan in plans]
+    assert _mini(plans, tokens, tokens) == (tokens[2],)
 
 
 @pytest.mark.parametrize("scenarios", [22, 24, 25, 40])

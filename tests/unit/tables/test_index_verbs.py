@@ -108,6 +108,18 @@ def test_clear_leaves_another_manifest(root: Path, tmp_path: Path) -> None:
     assert (tmp_path / "v1" / MANIFEST_FILE).exists()
 
 
+def test_clear_follows_no_symbolic_link(root: Path, tmp_path: Path) -> None:
+    run(root)
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "one.arrow").touch()
+    (root / INDEX / "tables-linked").symlink_to(precious)
+    with pytest.raises(IndexStoreError, match="no part of an index: tables-linked"):
+        clear_index(root)
+    assert (precious / "one.arrow").exists()
+    assert (root / INDEX / MANIFEST_FILE).exists()
+
+
 def test_an_index_on_another_disk_is_cleared_there(root: Path, tmp_path: Path) -> None:
     run(root)
     (root / INDEX).rename(tmp_path / "v1")

@@ -159,14 +159,14 @@ class PreventionCurve(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreventedResult(FrozenMappings):
-    """Prevented accidents, by group of recordings (`drives.GROUPS`); accidents of pedestrians are groups of their own.
+    """Prevented accidents, by group (`recordings.GROUPS`); accidents of pedestrians are groups of their own.
 
     Attributes:
         operating_by: `given` threshold, or `budget`: at most one braking second a minute on these very recordings.
         alarms: `right` or `any_alarm`: which of these the headline and the curves are of.
         groups: group → figures of the predictions.
-        references: predictor (of `drives.PREDICTORS` but the given one; a random one also at its own `quiet_braking`)
-            → the same; empty for resamples.
+        references: predictor (of `recordings.PREDICTORS` but the given one; a random one also at its own
+            `quiet_braking`) → the same; empty for resamples.
         curves: group → curve of the predictions; empty for resamples.
         dropped: accidents that no braking is judged of, and why: their labels do not show the two near each other.
         skipped: accidents whose motion is not known, and why.

@@ -75,6 +75,14 @@ def test_what_is_no_token(token: Any) -> None:
         Sums().add(token, {"value": 1.0})
 
 
+def test_a_fresh_one_has_the_settings_alone() -> None:
+    one = filled("abc").merge(filled("b"))
+    fresh = one.fresh()
+    fresh.merge(filled("a")).merge(filled("a"))
+    assert (fresh.settings, fresh.tokens, fresh.repeated) == (one.settings, {"a"}, {"a"})
+    assert (one.tokens, one.repeated) == ({"a", "b", "c"}, {"b"})
+
+
 def test_a_broken_off_run_goes_on(tmp_path: Path) -> None:
     path = filled("abc").merge(filled("b")).save(tmp_path / "state.json")
     resumed = Sums().resume(path)

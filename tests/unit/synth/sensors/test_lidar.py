@@ -144,3 +144,10 @@ def test_intensity_is_that_of_the_distance_before_the_noise(world, rig_of):
     assert off.std() == pytest.approx(RANGE_NOISE, rel=0.05)
     assert abs(off.mean()) < 0.002
     assert (intensity(points, RAIN) < bright).all()
+
+
+def test_noise_is_the_seeds_alone(world, rig_of):
+    rig = rig_of(world, sensors="none")
+    first, again, other = (scan_of(rig, seed=seed)[2].xyz for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert first.shape != other.shape or (first != other).any()

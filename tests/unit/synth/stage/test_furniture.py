@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.synth.roads import SIDEWALK, Junction, RoadSpec
-from deepaccident_devkit.synth.stage.props import traffic_light, yield_sign
+from deepaccident_devkit.synth.stage.props import lanterns, traffic_light, yield_sign
 
 
 def middle(prop):
@@ -26,3 +26,11 @@ def test_it_stands_on_the_sidewalk_at_the_right_of_the_line(make, spec):
         along_right = (place - left_end) @ right
         assert spec.road_edge < along_right < spec.road_edge + 0.6
         assert 0 < (place - left_end) @ inward < 1.5
+
+
+def test_lanterns_stand_behind_the_kerb_on_both_sides():
+    spec = RoadSpec(lanes=2)
+    places = np.array([middle(each) for each in lanterns(spec)])
+    assert (Junction(spec).ground_map().at(places) == SIDEWALK).all()
+    east = places[places[:, 0] > 30]
+    assert set(np.sign(east[:, 1])) == {-1, 1}

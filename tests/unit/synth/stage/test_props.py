@@ -11,6 +11,7 @@ HIGH = Prop(21, (Block((3.0, 5.0), (0.0, 2.0), (-0.2, 3.0), (1, 2, 3)), Block((5
 
 
 def test_who_stands_on_the_same_ground_overlaps():
+    assert HIGH.footprint == (3.0, 6.0, -1.0, 2.0)
     far = Prop(22, (Block((6.5, 7.0), (0.0, 2.0), (0, 1), (0, 0, 0)),))
     assert overlap(LOW, HIGH)
     assert not overlap(HIGH, far)

@@ -31,6 +31,13 @@ def test_a_slow_one_is_driven_on_until_it_is_at_the_place(driver):
     assert len(drive_alone(quick, to=quick.route.enter_s).along) == len(drive_alone(quick).along)
 
 
+def test_before_its_start_it_waits_or_comes_from_farther_back(driver):
+    standing, moving = driver(speed=0.0), driver(speed=5.0)
+    waiting = drive_alone(standing).at(-2.0)
+    assert (waiting.delay, waiting.start, waiting.start_speed) == (2.0, standing.start, 0.0)
+    assert drive_alone(moving).at(-2.0).start == pytest.approx(moving.start - 10.0)
+
+
 SPEC = ScenarioSpec(
     road=RoadSpec(signalized=False),
     actors=(

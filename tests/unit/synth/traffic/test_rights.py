@@ -109,3 +109,20 @@ def test_it_does_not_wait_for_one_whom_a_red_light_holds(driver):
     users = [driver("south", before=10.0), driver("west", before=25.0)]
     assert np.isfinite(gap_of_the_first(users))
     assert np.isinf(gap_of_the_first(users, held=True))
+
+
+@pytest.mark.parametrize(("fastest", "waits"), [(1.2, False), (5.0, True)])
+def test_it_knows_how_fast_the_other_can_get_there(driver, walker, fastest, waits):
+    """One who walks sets off 8 m away while a standing car has 10 m to go: it is out of the way in time."""
+    users = [
+        driver("west", before=1.0, speed=2.0),
+        walker(start=(-11.0, 9.0), yaw=-np.pi / 2, length=18.0, start_speed=0.0, max_speed=fastest),
+    ]
+    assert np.isfinite(gap_of_the_first(users)) == waits
+
+
+@pytest.mark.parametrize(("speed", "waits"), [(1.0, True), (10.0, False)])
+def test_it_counts_on_the_other_s_present_speed(driver, speed, waits):
+    """One who creeps through the crossing is not gone soon, though it might speed up."""
+    users = [driver("south", before=30.0, speed=6.0), driver("west", before=-6.0, speed=speed)]
+    assert np.isfinite(gap_of_the_first(users)) == waits

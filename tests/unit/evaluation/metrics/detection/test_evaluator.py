@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,6 +51,14 @@ def two_samples(protocol: str = "released") -> DetectionEvaluator:
     first = found_at((10, 0, 0.9), (20, 0, 0.5)), truth_at((10.3, 0), (20.2, 0))
     second = found_at((10, 0, 0.8), (-20, 0, 0.7)), truth_at((10.2, 0))
     return evaluated(protocol, first, second)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_saved_counts_go_on(protocol: str, tmp_path: Path) -> None:
+    whole = two_samples(protocol)
+    again = DetectionEvaluator(protocol).resume(whole.save(tmp_path / "counts.json"))
+    assert again.counts == whole.counts
+    assert again.merge(whole).repeated == whole.tokens
 
 
 @pytest.mark.parametrize("protocol", ["paper", "opencood"])

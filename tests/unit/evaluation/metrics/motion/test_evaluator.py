@@ -146,6 +146,13 @@ def test_frames_beyond_the_recording_do_not_count() -> None:
     assert result.ranges["100x100"].pq == 100.0
 
 
+def test_large_ids_are_numbered_anew() -> None:
+    small = np.stack([boxes(_1=100, _2=60, _3=20)] * 3)
+    large = np.array([0, 7, 10**9, 2 * 10**9])[small]
+    assert vpq_counts(large, small).true_positive[:, 1].tolist() == [3, 3, 3]
+    assert vpq_counts(large, large).iou[:, 1].tolist() == [3, 3, 3]
+
+
 def test_an_id_that_changes_is_a_miss_and_a_false_alarm() -> None:
     label = boxes_label(*[boxes(_1=100)] * 5)
     maps = instances_of(np.stack([boxes(_1=100), boxes(_1=100), *[boxes(_2=100)] * 3]), CONFIG.grid)
