@@ -50,11 +50,6 @@ def test_what_is_read_is_the_callers(path: Path, quarters: np.ndarray, raw: bool
     read_image(path, raw=raw)[0, 0] = 1  # must not raise
 
 
-def test_a_png_is_read(path: Path, quarters: np.ndarray) -> None:
-    Image.fromarray(quarters).save(path, "PNG")
-    np.testing.assert_array_equal(read_image(path), quarters)
-
-
 @pytest.mark.parametrize("raw", [False, True])
 def test_truncated_garbage_empty_and_missing(path: Path, quarters: np.ndarray, raw: bool) -> None:
     with pytest.raises(MissingFileError, match=r"image\.jpg: no such file; unpack the archive that holds it"):
@@ -108,7 +103,7 @@ def test_damage_raises_our_error_or_nothing(
     assert image.dtype == np.uint8 if message is None else str(path) in message
 
 
-def test_a_png_is_read_and_the_callers(path: Path, quarters: np.ndarray) -> None:
+def test_a_png_is_read_and_is_the_callers(path: Path, quarters: np.ndarray) -> None:
     Image.fromarray(quarters).save(path, "PNG")
     image = read_image(path)
     np.testing.assert_array_equal(image, quarters)
