@@ -134,6 +134,12 @@ def test_any_executor_writes_the_same(
         assert written(small, tmp_path / "out", executor=executor).kept == SCENARIOS
 
 
+def test_a_callers_bar_gets_all_of_the_work_once(small: DeepAccident, tmp_path: Path) -> None:
+    shares: list[float] = []
+    written(small, tmp_path / "out", progress=shares.append)
+    assert shares == pytest.approx([1 / SCENARIOS] * SCENARIOS)
+
+
 def test_a_killed_worker_is_told_and_leaves_nothing_half_written(small: DeepAccident, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(WorkerError, match="was killed"):
