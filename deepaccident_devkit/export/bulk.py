@@ -214,8 +214,11 @@ def export_release(
     if absent := [token for token in scenarios if token not in folders]:
         raise MissingFileError(f"{dataset.dataroot}: scenario {absent[0]} is gone; open the release again")
     groups = [[folders[token] for token in unit.scenarios] for unit in units]
+    comparing: Engine = {**how, "progress": how.get("progress") is True}  # a caller's bar is for what is written
     # also if nothing is there yet: workers that cannot do the work say so before a folder is made
-    states = run_batch(Tried(export.states), groups, label="comparing", places=Places(reads=dataset.places), **how)
+    states = run_batch(
+        Tried(export.states), groups, label="comparing", places=Places(reads=dataset.places), **comparing
+    )
     jobs = {unit.name: (unit, found) for unit, found in zip(units, states, strict=True)}
     if manifest.release:
         check_failures(zip(jobs, states, strict=True), str(root))

@@ -20,6 +20,7 @@ from deepaccident_devkit.errors import (
     MissingExtraError,
     NotAvailableError,
     SensorFileError,
+    TokenError,
 )
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
@@ -40,6 +41,12 @@ def exported(da: DeepAccident, scenario: str, folder: Path, **choices: Any) -> A
     """A small file: one agent, one frame, no sensors unless asked for."""
     small = {"agents": ["ego_vehicle"], "channels": [], "frames": [2], **choices}
     return read_mcap(export_mcap(da, scenario, folder / "small.mcap", **small))
+
+
+def test_an_unknown_scenario_is_refused(da: DeepAccident, tmp_path: Path) -> None:
+    with pytest.raises(TokenError, match="no token 'nowhere/nothing'"):
+        export_mcap(da, "nowhere/nothing", tmp_path / "a.mcap")
+    assert not list(tmp_path.iterdir())
 
 
 def test_agents_channels_and_frames_can_be_chosen(da: DeepAccident, scenario: str, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -25,6 +26,7 @@ from deepaccident_devkit.errors import (
     SomeFailedError,
     WorkerError,
 )
+from deepaccident_devkit.export import bulk
 from deepaccident_devkit.export.bulk import Exported, Tally, export_release
 from deepaccident_devkit.files import temporary_of, temporary_path
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
@@ -130,6 +132,12 @@ def test_any_executor_writes_the_same(
     with kind() as executor:
         assert contents(written(small, tmp_path / "out", executor=executor).folder) == contents(whole)
         assert written(small, tmp_path / "out", executor=executor).kept == SCENARIOS
+
+
+def test_a_callers_bar_gets_all_of_the_work_once(small: DeepAccident, tmp_path: Path) -> None:
+    shares: list[float] = []
+    written(small, tmp_path / "out", progress=shares.append)
+    assert shares == pytest.approx([1 / SCENARIOS] * SCENARIOS)
 
 
 def test_a_killed_worker_is_told_and_leaves_nothing_half_written(small: DeepAccident, tmp_path: Path) -> None:
@@ -390,6 +398,11 @@ class TestSelection:
         with pytest.raises(NotAvailableError, match="no scenario of this release is in that split and matches"):
             self.tokens(small, tmp_path, split="val", where=("length>=3", "designed_accident=false"))
         assert not (tmp_path / "out").exists()
+
+
+def test_what_goes_to_workers_is_small(small: DeepAccident, tmp_path: Path) -> None:
+    """A release has 691 scenarios, and each job has it all."""
+    assert len(pickle.dumps(bulk._Export(small, TinyFormat(), tmp_path).write)) < 3000
 
 
 def test_wrong_workers_make_no_folder(small: DeepAccident, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingFileError, NotAvailableError, SomeFailedError
 from deepaccident_devkit.reading import RefusedFileError
+from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.store import open_dataroot
 from deepaccident_devkit.release.store.cache import FileCache
 from deepaccident_devkit.release.store.sources import LocalSource, UrlSource
@@ -60,6 +61,13 @@ def test_a_release_in_a_store_is_valid_and_whole(
     counts, of_folder = (release_completeness(each, workers=1) for each in (root, places["folder"]))
     assert counts.total == of_folder.total
     assert counts.splits == of_folder.splits
+
+
+@pytest.mark.parametrize("kind", STORES)
+def test_the_truth_has_the_same_hashes(opened: dict[str, DeepAccident], kind: str) -> None:
+    tokens = [record["token"] for record in opened["folder"].scenario[:2]]
+    of_folder, of_store = (scenario_hashes(opened[each], tokens, workers=1) for each in ("folder", kind))
+    assert of_folder == of_store
 
 
 @pytest.mark.parametrize("kind", STORES)
