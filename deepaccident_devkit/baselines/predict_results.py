@@ -28,7 +28,9 @@ from deepaccident_devkit.text import choice, settle_choices
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link, cooperating_agents
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
 
@@ -89,10 +91,7 @@ def predict_results(
     tokens: Sequence[str],
     out: str | os.PathLike[str],
     baseline: Baseline | None = None,
-    *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> Path:
     """Write a baseline's predictions of samples to a results file (of motion, a folder); returns its path.
 
@@ -106,9 +105,7 @@ def predict_results(
         tokens: of the samples.
         out: the file or folder to write.
         baseline: None for a single vehicle and constant velocity.
-        workers: processes; None takes what the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
         ChoiceError: no such task.
@@ -130,7 +127,6 @@ def predict_results(
         cooperating_agents(dataset, own[0], work.baseline.agents)  # fails now, and not in every worker
     jobs = {scenario: _Job(work, own, store, f"{name}/{scenario}") for scenario, own in scenarios.items()}
     places = Places(reads=dataset.places, writes=(store.folder,))
-    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
     with store.shared() as turn:
         if not work.is_done(path, tokens):  # by another process meanwhile
             store.run(_predict, jobs, label=work.task, places=places, **how)

@@ -35,8 +35,9 @@ from deepaccident_devkit.statistics.results import (
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, OWN_ACTOR_ID, STATIC_ACTOR_ID
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from typing_extensions import Unpack
 
+    from deepaccident_devkit.parallel import Engine
     from deepaccident_devkit.tables.records import AgentRecord, CollisionRecord, ScenarioRecord
 
 Chosen = RowArgument | Iterable[RowArgument] | None
@@ -68,9 +69,7 @@ def dataset_statistics(
     scenarios: Chosen = None,
     *,
     interactions: bool = False,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    progress: bool = False,
+    **how: Unpack[Engine],
 ) -> DatasetStatistics:
     """Compute the paper's statistics on the tables' columns: no record of an annotation is made.
 
@@ -83,9 +82,7 @@ def dataset_statistics(
             all.
         interactions: whether to add how soon moving pairs would collide (`da.interactions`); where these are not kept
             yet, a tenth of a second a scenario.
-        workers: processes for these; None chooses by the amount of work.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
+        **how: `workers`, `executor` and `progress` of these, as `parallel.Engine` says.
 
     Raises:
         TokenError: something is no scenario of the release.
@@ -101,7 +98,7 @@ def dataset_statistics(
         quantiles.append(table)
     histograms += pair_histograms
     if interactions:
-        histograms += _interactions(chosen, workers=workers, executor=executor, progress=progress)
+        histograms += _interactions(chosen, **how)
     counts = [*_scenario_counts(chosen), *_actor_counts(chosen)]
     return DatasetStatistics(
         dataroot=str(dataset.dataroot),
@@ -393,7 +390,7 @@ def _distribution(
     return _histogram(names, counted, values, groups, edges, left_out), quantiles
 
 
-def _interactions(chosen: _Chosen, **how: Any) -> list[Histogram]:
+def _interactions(chosen: _Chosen, **how: Unpack[Engine]) -> list[Histogram]:
     """The least time to collision of pairs of which each moves at some frame, and of scenarios."""
     found = interactions_of(chosen.dataset, list(chosen.scenarios.values()), **how)
     pairs: list[FloatArray] = [each.pairs.min_ttc[each.pairs.moving] for each in found]

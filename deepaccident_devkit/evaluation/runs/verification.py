@@ -182,7 +182,7 @@ def verify_bundle(
         here = run.summary()["environment"]
         for name, stored, now in differing(bundle.summary["environment"], here):
             notes.append(f"evaluated with {name} {stored}, verified with {now}")
-    if any(each.where.startswith(SCENARIOS_FILE) for each in found):
+    if any(each.where.startswith(f"{SCENARIOS_FILE}: ") for each in found):
         notes.append(
             "numbers are made of the index, which does not see that a file was edited in place; bring it up to date "
             "with: deepaccident index DATAROOT --check"
@@ -253,7 +253,8 @@ def _compared(name: str, read: Callable[[], Any], again: Callable[[Any], Any]) -
     try:
         stored = read()
     except ResultsError as error:
-        yield Difference(where=name, stored="readable", found=str(error))
+        reason = str(error).split(f"{name}: ", 1)[-1]  # without the folder, which would fill a line
+        yield Difference(where=name, stored="readable", found=reason)
         return
     for where, one, other in differing(stored, again(stored)):
         yield Difference(where=f"{name}: {where}", stored=one, found=other)

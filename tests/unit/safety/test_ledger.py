@@ -2,8 +2,10 @@ import csv
 import json
 import math
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,16 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.safety import COALITIONS, PARTNERS, LeadTimes, ObservationRule, lead_time_ledger, lead_times
+from deepaccident_devkit.safety import (
+    COALITIONS,
+    PARTNERS,
+    LeadTimes,
+    ObservationRule,
+    avoidability_report,
+    lead_time_ledger,
+    lead_times,
+    twin_report,
+)
 from deepaccident_devkit.safety.lead_times import CAVEAT, mean_times
 from deepaccident_devkit.safety.observation import observed_actors
 from deepaccident_devkit.synth import SynthConfig, make_release
@@ -127,8 +138,9 @@ def test_scenarios_are_counted_and_a_chosen_few_looked_at(da_b: DeepAccident) ->
 
 
 @pytest.mark.slow
-def test_two_workers_find_the_same(da_b: DeepAccident) -> None:
-    assert lead_time_ledger(da_b, workers=2).to_json() == lead_time_ledger(da_b, workers=1).to_json()
+@pytest.mark.parametrize("report", [lead_time_ledger, avoidability_report, twin_report])
+def test_two_workers_find_the_same(da_b: DeepAccident, report: Callable[..., Any]) -> None:
+    assert report(da_b, workers=2).to_json() == report(da_b, workers=1).to_json()
 
 
 @pytest.mark.slow

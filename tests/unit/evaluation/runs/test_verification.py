@@ -183,10 +183,13 @@ class TestNamed:
         (bundle / "counts.json").unlink()
         (bundle / "samples.parquet").write_bytes(b"PAR1")
         (bundle / "scenarios.json").write_text("{}")
-        assert found(verify(bundle, da_b)) == [
+        verification = verify(bundle, da_b)
+        assert found(verification) == [
             *("files.json: counts.json", "files.json: samples.parquet", "files.json: scenarios.json"),
             *("files.json: mine.txt", "scenarios.json", "counts.json", "samples.parquet"),
         ]
+        assert verification.notes == ()
+        assert "  counts.json: stored 'readable', found 'is missing; give a folder" in verification.to_text()
         (bundle / "files.json").write_text("")
         assert found(verify(bundle, da_b))[0] == "files.json"
 
