@@ -96,7 +96,10 @@ def field_of(name: str) -> Field:
     field = FIELDS.get(full_name(name))
     if field is None:
         possible = possible_text(name, [*FIELDS, *_SHORT])
-        raise FieldError(f"scenarios cannot be found by '{name}'; the fields are {possible}")
+        raise FieldError(
+            f"scenarios cannot be found by '{name}'; the fields are {possible}; `deepaccident info --fields` says what "
+            "each is"
+        )
     return field
 
 

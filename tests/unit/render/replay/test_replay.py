@@ -4,6 +4,7 @@ import base64
 import hashlib
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,15 @@ from deepaccident_devkit.render.replay.replay import replay_page
 def test_the_same_call_gives_the_same_bytes(da: DeepAccident, page: Path, tmp_path: Path) -> None:
     again = render_replay(da, da.get("scenario", accident(da)), str(tmp_path / "again.html"), progress=True)
     assert again.read_bytes() == page.read_bytes()
+
+
+def test_a_page_keeps_its_limit(da: DeepAccident, page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    whole = page.stat().st_size
+    limit = whole - 100_000
+    monkeypatch.setattr(sys.modules[render_replay.__module__], "SIZE_LIMIT", limit)
+    kept = render_replay(da, None, tmp_path / "small.html").stat().st_size
+    assert whole < 15_000_000
+    assert limit - 100_000 < kept <= limit
 
 
 def test_the_policy_allows_this_script_and_style_alone(page: Path) -> None:
