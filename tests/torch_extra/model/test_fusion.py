@@ -152,6 +152,7 @@ def test_released_fusion_can_hold_its_unused_layers() -> None:
     assert not plain.state_dict()
     assert {key.split(".")[0] for key in holding.state_dict()} == {"model", "compression"}
     assert torch.equal(holding(*batch()), plain(*batch()))
+    assert not any(weight.requires_grad for weight in holding.parameters())
 
 
 def test_unreached_layers_fuse_all_agents_and_poses() -> None:

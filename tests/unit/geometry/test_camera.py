@@ -56,6 +56,7 @@ def test_in_image_by_depth_and_margin() -> None:
     assert_array_equal(
         camera.in_image(pixels, [3, 1, 3, 3, 3, -3], min_depth=1), [True, False, True, False, True, False]
     )
+    assert_array_equal(camera.in_image(pixels, [3, 1, 3, 3, 3, -3]), [True, True, True, False, True, False])
     assert_array_equal(camera.in_image(pixels, margin=1), [True, True, True, False, True, False])
     assert_array_equal(camera.in_image(pixels, margin=-1), [True] * 6)
     top_and_bottom = [[50, 0.5], [50, 1], [50, 48.5], [50, 49]]

@@ -42,14 +42,15 @@ def test_what_lies_ahead_on_the_left_is_there_in_every_orientation(orientation: 
 
 def test_wide_classes_need_half_a_cell_and_thin_ones_a_pixel() -> None:
     # the cell of x 0…0.5, y 0…0.5 covers rows 595…599 and columns 595…599
-    few = _image((ROAD, slice(595, 600), slice(595, 597)), (LANE_LINE, slice(599, 600), slice(599, 600)))
+    columns, line = (ROAD, slice(595, 600), slice(595, 597)), (LANE_LINE, slice(599, 600), slice(599, 600))
+    few = _image(columns, (ROAD, slice(595, 597), slice(597, 598)), line)  # 12 of 25 pixels
     grid = BevGrid()
     (cell,), _ = grid.index_of([[0.25, 0.25]])
     targets = segmentation_of(few, grid)
     assert not targets.mask("road")[tuple(cell)]
     assert targets.mask("lane_line")[tuple(cell)]
     assert targets.mask("lane_line").sum() == 1
-    more = segmentation_of(_image((ROAD, slice(595, 600), slice(595, 598))), grid)
+    more = segmentation_of(_image(columns, (ROAD, slice(595, 598), slice(597, 598))), grid)
     assert more.mask("road")[tuple(cell)]
 
 
