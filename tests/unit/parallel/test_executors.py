@@ -20,6 +20,7 @@ def test_none_without_a_scheduler() -> None:
 
 
 def test_a_dead_scheduler() -> None:
+    import distributed  # noqa: F401 - sets its own settings, which have to be there before one is changed
     from dask import config
 
     message = r"^tcp://127\.0\.0\.1:1: no dask scheduler answers \(.*\); start one with `dask scheduler`, and give its"
@@ -50,6 +51,7 @@ def test_a_dead_scheduler() -> None:
     ],
 )
 def test_a_wrong_scheduler_file(tmp_path: Path, content: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    import distributed  # noqa: F401 - as above
     from dask import config
 
     monkeypatch.setattr("deepaccident_devkit.parallel.scheduler_file._SECONDS", 0.2)
