@@ -43,6 +43,10 @@ def test_drivers_wait_for_walkers_but_not_the_reverse(driver, walker):
     assert (rights.waits[0, 1], rights.waits[1, 0]) == (True, False)
 
 
+def test_those_who_walk_pass_each_other(walker):
+    assert np.isinf(find_rights([walker(), walker()]).zones.enter).all()
+
+
 def test_a_rule_that_is_ignored_does_not_count(driver, walker):
     users = [driver("south", ignores=("priority",)), driver("west"), walker()]
     rights = find_rights(users, minor=("south", "north"))
