@@ -1,6 +1,5 @@
 """`deepaccident evaluate verify|compare`: repeat an evaluation, or compare two."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.render.evaluation import render_comparison
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, save_picture
+from deepaccident_devkit.reports import write_csv
 from deepaccident_devkit.tables import place_outside
 from deepaccident_devkit.taxonomy import OnError
 
@@ -66,7 +66,7 @@ def verify(
     place = index_dir or place_outside(layout)
     dataset = DeepAccident(layout.version, layout.root, place, on_error=on_error, **engine)
     verification = verify_bundle(folder, dataset, results=results, split=split, progress=True, **engine)
-    click.echo(json.dumps(verification.as_dict(), indent=1) if as_json else verification.to_text())
+    click.echo(verification.to_json() if as_json else verification.to_text())
     if not verification.is_same:
         sys.exit(_FINDINGS_STATUS)
 
@@ -90,10 +90,10 @@ def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...
         if path.suffix.lower() not in _KINDS:
             raise click.BadParameter(f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}")
     comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
-    as_text = json.dumps(comparison.as_dict(), indent=1)
+    as_text = comparison.to_json()
     for path in out:
         if path.suffix.lower() == ".csv":
-            comparison.to_csv(path)
+            write_csv(path, comparison.named_tables()["numbers"])
         elif path.suffix.lower() == ".json":
             write_bytes(path, as_text.encode())
         else:

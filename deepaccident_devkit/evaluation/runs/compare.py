@@ -28,7 +28,7 @@ from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.evaluation.runs.verification import differing
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.reading import shortened
-from deepaccident_devkit.reports import write_csv
+from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.text import columns_text
 
 Family = Literal["main", "headlines", "other"]
@@ -77,7 +77,7 @@ _COLUMNS: Final = tuple(ComparedNumber.__dataclass_fields__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison(ShortRepr):
+class Comparison(Report):
     """Two evaluations by the same rules.
 
     Attributes:
@@ -145,14 +145,14 @@ class Comparison(ShortRepr):
             *([explored] if others else []),
         ]
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""
         made: dict[str, Any] = plain(asdict(self) | {"a": os.fspath(self.a), "b": os.fspath(self.b)})
         return made | {"notes": self.notes()}
 
-    def to_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write a line a number; returns the file's path."""
-        return write_csv(path, [_COLUMNS, *([getattr(each, name) for name in _COLUMNS] for each in self.numbers)])
+    def named_tables(self) -> dict[str, list[Row]]:
+        """A line a number."""
+        return {"numbers": [_COLUMNS, *([getattr(each, name) for name in _COLUMNS] for each in self.numbers)]}
 
 
 def _text_row(each: ComparedNumber) -> tuple[str, ...]:

@@ -30,6 +30,7 @@ from deepaccident_devkit.evaluation.runs.prevention import with_prevented
 from deepaccident_devkit.evaluation.runs.rows import sample_rows
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.reading import shortened
+from deepaccident_devkit.reports import Report, Row
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -96,6 +97,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
+_COLUMNS: Final = tuple(Difference.__dataclass_fields__)
 _SHOWN: Final = 20
 """Differences that the text lists."""
 _NOT_COMPARED: Final = ("environment", "sanity", "release/dataroot", "results/path")
@@ -103,7 +105,7 @@ _NOT_COMPARED: Final = ("environment", "sanity", "release/dataroot", "results/pa
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verification(ShortRepr):
+class Verification(Report):
     """A bundle against its evaluation made again.
 
     Attributes:
@@ -132,7 +134,7 @@ class Verification(ShortRepr):
         lines += [f"  and {len(self.differences) - _SHOWN} more"] * (len(self.differences) > _SHOWN)
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""
         return {
             "folder": os.fspath(self.folder),
@@ -141,6 +143,10 @@ class Verification(ShortRepr):
             "differences": [asdict(each) for each in self.differences],
             "notes": list(self.notes),
         }
+
+    def named_tables(self) -> dict[str, list[Row]]:
+        """A line a difference."""
+        return {"differences": [_COLUMNS, *([getattr(each, name) for name in _COLUMNS] for each in self.differences)]}
 
 
 def verify_bundle(

@@ -197,8 +197,9 @@ class TestForms:
 
     def test_json_and_csv_have_every_number(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
         comparison = compare_bundles(*motion_bundles, FEW)
-        stated = json.loads(json.dumps(comparison.as_dict()))
-        with comparison.to_csv(tmp_path / "new" / "numbers.csv").open(encoding="utf-8", newline="") as file:
+        stated = json.loads(json.dumps(comparison.to_dict()))
+        (path,) = comparison.to_csv(tmp_path / "new")
+        with path.open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         assert len(rows) == len(stated["numbers"]) == len(comparison.numbers)
         assert float(rows[0]["a"]) == stated["numbers"][0]["a"] == comparison.numbers[0].a

@@ -57,7 +57,7 @@ class TestSame:
         verification = verify(bundle, da_b)
         assert (verification.is_same, verification.samples, verification.notes) == (True, 6, ())
         assert verification.to_text() == f"{bundle}: the same; 6 samples evaluated again, all numbers are equal"
-        assert verification.as_dict()["same"] is True
+        assert verification.to_dict()["same"] is True
 
     def test_with_results_inside_and_elsewhere(self, run: EvaluationRun, tmp_path: Path, own_release: Path) -> None:
         bundle = save_run(run, tmp_path / "bundle", include_results=True)
@@ -88,7 +88,7 @@ class TestNamed:
         changed(bundle / "metrics_summary.json", lambda summary: summary["metrics"].update(apa=0.99))
         verification = verify(bundle, da_b)
         assert verification.to_text().splitlines()[2] == "  metrics_summary.json: metrics/apa: stored 0.99, found 1.0"
-        assert verification.as_dict()["differences"][1] == {
+        assert verification.to_dict()["differences"][1] == {
             "where": "metrics_summary.json: metrics/apa",
             "stored": 0.99,
             "found": 1.0,
