@@ -83,7 +83,9 @@ def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
     lost.join()
     again.join()
     written(small, tmp_path / "whole")
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    found = contents(tmp_path / "out")
+    locks = {name for name in found if name.startswith(".deepaccident-parts/locks/")}  # of the lost one's next units
+    assert {name: found[name] for name in found.keys() - locks} == contents(tmp_path / "whole")
 
 
 def test_what_another_host_left_of_a_unit_is_removed(small: DeepAccident, tmp_path: Path) -> None:
