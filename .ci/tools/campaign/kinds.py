@@ -274,7 +274,7 @@ def _checksum(path: Path) -> str:
 
 def _compare(room: Room) -> Any:
     comparison = compare_bundles(room.tree, room.home / "kept" / "bundles" / room.tree.name)
-    return comparison.to_text(), comparison.as_dict()
+    return comparison.to_text(), comparison.to_dict()
 
 
 _BUNDLE = (
