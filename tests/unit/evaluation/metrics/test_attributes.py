@@ -48,17 +48,11 @@ def test_attributes_of_a_releases_samples(da_motion: DeepAccident) -> None:
 
 
 def test_the_attributes_of_a_sample_are_those_of_its_record(da_motion: DeepAccident) -> None:
-    tokens, steps = [sample["token"] for sample in da_motion.sample], set()
-    for token, each in sample_attributes(da_motion, tokens).items():
+    for token, each in sample_attributes(da_motion, [sample["token"] for sample in da_motion.sample]).items():
         sample = da_motion.sample.get(token)
-        if sample["time_to_impact"] is None:
-            assert each.time_to_impact == each.impact_step == NO_IMPACT
-        else:
-            tenths = round(10 * sample["time_to_impact"])
-            assert each.time_to_impact == f"{math.ceil(tenths / 10)} s"
-            assert each.impact_step == f"{math.ceil(tenths / 5) / 2:g} s"
-            steps.add(each.impact_step)
-        assert (each.scenario, each.agent) == (sample["scenario_token"], sample["agent"])
-        assert each.time_to_end == format(sample["time_to_end"], ".1f")
-        assert (each.value("agent"), each.value("all"), each.value("town")) == (each.agent, "all", each.story["town"])
-    assert {"0.5 s", "1 s", "1.5 s"} <= steps
+        tenths = round(10 * (sample["time_to_impact"] or 0))
+        bins = f"{math.ceil(tenths / 10)} s", f"{math.ceil(tenths / 5) / 2:g} s"
+        assert (each.time_to_impact, each.impact_step) == (
+            (NO_IMPACT, NO_IMPACT) if sample["time_to_impact"] is None else bins
+        )
+        assert (each.value("agent"), each.value("all")) == (sample["agent"], "all")

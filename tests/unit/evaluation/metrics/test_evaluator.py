@@ -99,13 +99,6 @@ def test_any_order_of_samples_and_parts_is_saved_as_the_same_bytes(tmp_path: Pat
     assert one.read_bytes() == other.read_bytes()
 
 
-def test_what_came_again_is_saved_in_order(tmp_path: Path) -> None:
-    evaluator, names = Sums(), [f"{number:02d}" for number in range(30)]
-    for name in names * 2:
-        evaluator.add(name, {"value": 1.0})
-    assert json.loads(evaluator.save(tmp_path / "state.json").read_bytes())["repeated"] == names
-
-
 def test_a_run_of_other_settings_does_not_go_on(tmp_path: Path) -> None:
     path = filled("a").save(tmp_path / "state.json")
     with pytest.raises(EvaluationError, match="was saved with other settings"):

@@ -1,6 +1,5 @@
 """Accidents that instance maps show."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,13 +8,7 @@ from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.accident import AccidentReading
-from deepaccident_devkit.evaluation.metrics.alarms.raised import (
-    foreseen_accident,
-    named_alarms,
-    nearest_two,
-    position_difference,
-    within_horizon,
-)
+from deepaccident_devkit.evaluation.metrics.alarms.raised import foreseen_accident, named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.truth import BoxTruth
 from deepaccident_devkit.evaluation.metrics.predictions import Accident
 
@@ -87,12 +80,6 @@ def test_explicit_alarms_are_sorted_by_sureness_time_place_and_ids_and_those_bel
         assert [each for each, _ in raised(*mixed, alarm(score=-0.001), alarm(score=-0.5))] == ordered
 
 
-def test_an_alarm_within_half_a_frame_of_the_horizon_counts() -> None:
-    found = raised(*(alarm(time=time) for time in (1.0, 2.0, 2.05, 2.0501, 2.1)))
-    assert [each.time for each, _ in within_horizon(found, replace(NOBODY, horizon=2.0))] == [1.0, 2.0, 2.05]
-    assert len(within_horizon(found, NOBODY)) == 5
-
-
 @pytest.mark.parametrize(
     ("time", "names"), [(0.3, (4, 7)), (0.26, (4, 7)), (0.34, (4, 7)), (0.24, (None, 4)), (9.9, (7, 4))]
 )
@@ -104,22 +91,3 @@ def test_an_alarm_names_who_is_there_at_the_nearest_recorded_frame(time: float, 
     footprint[5, :, :2] = (4.0, 0.0), (0.0, 0.0)
     truth = BoxTruth(time=np.arange(6) / 10, actor_id=np.array([4, 7]), footprint=footprint, accident=None)
     assert [named for _, named in raised(alarm(time=time), truth=truth)] == [names]
-
-
-def test_two_are_named_up_to_a_gate_and_the_difference_of_two_pairs_is_of_the_better_order() -> None:
-    positions, center = np.array([[0.0, 0.0], [10.0, 0.0]]), np.array([[10.0, 3.0], [0.0, 4.0], [np.nan, np.nan]])
-    assert nearest_two(positions, np.array([3, 5, 8]), center, 4.0) == (5, 3)
-    assert nearest_two(positions, np.array([3, 5, 8]), center, 3.99) == (None, 3)
-    assert nearest_two(positions, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), 4.0) == (None, None)
-    assert position_difference(positions, center[:2]) == 7.0
-    assert position_difference(positions, center[1::-1]) == 7.0
-
-
-@pytest.mark.parametrize(("aside", "named"), [(4.0, (5, 9)), (4.5, (None, None))])
-def test_alarms_of_maps_name_those_within_4_metres(aside: float, named: tuple[int | None, ...]) -> None:
-    footprint = np.full((21, 2, 5), np.nan)
-    for frame, (one, other) in enumerate(zip(LATE[5], LATE[9], strict=True)):
-        footprint[5 * frame, :, :2] = np.add([one, other], (0.0, aside))
-    truth = BoxTruth(time=np.arange(21) / 10, actor_id=np.array([5, 9]), footprint=footprint, accident=None)
-    [(_, names)] = named_alarms(as_maps(scene(LATE)), None, truth, AccidentReading())
-    assert names == named

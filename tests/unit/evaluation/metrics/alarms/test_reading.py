@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.hulls import convex_hulls
 from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     AccidentReading,
@@ -59,30 +58,9 @@ def test_a_metre_across_is_no_accident_either() -> None:
     assert accident_of(maps, BevGrid(), RELEASED, AccidentReading()).contact is None
 
 
-def test_the_distance_that_is_not_given_is_the_papers_and_others_are_checked() -> None:
-    assert AccidentReading().danger_distance == 1.0
-    for distance in (0, -1, math.inf, math.nan):
-        with pytest.raises(ConfigError, match="danger_distance: expected metres above 0, found"):
-            AccidentReading(danger_distance=distance)
-
-
 def test_the_distance_of_two_paths_is_the_mean_over_the_moments_at_which_both_are_there() -> None:
     gone = (math.nan, math.nan)
     predicted = InstanceTracks(identity=np.array([1, 2]), center=np.array([[(0, 0), (9, 9)], [(0, 8), gone]]))
     truth = InstanceTracks(identity=np.array([7, 8]), center=np.array([[(0, 0), gone], [(0, 0), (9, 9)]]))
     assert match_tracks(predicted, truth, 4.0) == {1: 7}
     assert match_tracks(predicted, truth, 3.99) == {}
-    assert match_tracks(predicted, truth, 4.0 - 1e-10) == {1: 7}
-
-
-def test_positions_are_of_the_cells_own_sizes_in_metres() -> None:
-    grid = BevGrid((0.0, 10.0, 0.5), (-4.0, 4.0, 0.25))
-    maps = np.zeros((2, *grid.shape), dtype=np.int32)
-    maps[1, 10, 4:6], maps[1, 12, 5], maps[0, 0, 0] = 3, 8, 5
-    found = accident_of(maps, grid, None, AccidentReading(danger_distance=0.6))
-    assert (found.contact.frame, found.contact.ids, found.contact.distance) == (1, (3, 8), 0.5)
-    np.testing.assert_allclose(found.positions, [[2.5, -1.375], [2.75, -0.875]])
-    assert found.tracks.identity.tolist() == [3, 5, 8]
-    assert np.isnan(found.tracks.center[0, [0, 2]]).all()
-    np.testing.assert_allclose(found.tracks.center[0, 1], [0.25, -3.875])
-    assert accident_of(maps, grid, None, AccidentReading(danger_distance=0.5)).contact is None

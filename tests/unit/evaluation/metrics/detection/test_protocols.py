@@ -147,11 +147,3 @@ def test_the_edges_of_what_can_be() -> None:
     for name in ("truth", "measure", "matching", "area_of"):
         with pytest.raises(ChoiceError, match=f"{name}: expected one of"):
             detection_protocol("paper", **{name: "other"})
-
-
-def test_small_classes_have_thresholds_of_their_own() -> None:
-    rules, paper = DETECTION_PROTOCOLS["released_iou"], DETECTION_PROTOCOLS["paper"]
-    small = {name for name in CATEGORIES if rules.limits(name) == (0.2, 0.1)}
-    assert small == {"cyclist", "motorcycle", "pedestrian"}
-    assert {rules.limits(name) for name in set(CATEGORIES) - small} == {(0.3, 0.15)}
-    assert {paper.limits(name) for name in CATEGORIES} == {(1.0, 2.0, 4.0)}
