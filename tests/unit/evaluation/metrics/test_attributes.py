@@ -1,5 +1,7 @@
 """What is known of samples and their scenarios."""
 
+import math
+
 import pytest
 
 from deepaccident_devkit import DeepAccident
@@ -43,3 +45,14 @@ def test_attributes_of_a_releases_samples(da_motion: DeepAccident) -> None:
         da_motion, [f"{record['token']}/infrastructure/005" for record in da_motion.scenario]
     )
     assert set(tokens_by_value(everywhere, "impact_step")) == {"3 s", NO_IMPACT}
+
+
+def test_the_attributes_of_a_sample_are_those_of_its_record(da_motion: DeepAccident) -> None:
+    for token, each in sample_attributes(da_motion, [sample["token"] for sample in da_motion.sample]).items():
+        sample = da_motion.sample.get(token)
+        tenths = round(10 * (sample["time_to_impact"] or 0))
+        bins = f"{math.ceil(tenths / 10)} s", f"{math.ceil(tenths / 5) / 2:g} s"
+        assert (each.time_to_impact, each.impact_step) == (
+            (NO_IMPACT, NO_IMPACT) if sample["time_to_impact"] is None else bins
+        )
+        assert (each.value("agent"), each.value("all")) == (sample["agent"], "all")

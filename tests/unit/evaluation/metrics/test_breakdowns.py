@@ -13,6 +13,7 @@ from deepaccident_devkit.evaluation.metrics.breakdowns import (
     NO_IMPACT,
     SampleAttributes,
     breakdown,
+    cluster_of,
     sample_attributes,
 )
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
@@ -127,6 +128,19 @@ def test_times_are_in_order_and_what_is_unknown_comes_last() -> None:
     assert values == ["0 s", "0.5 s", "1 s", "1.5 s", "2 s", "2.5 s", "3 s", "3.5 s", "4 s", "4.5 s", NO_IMPACT]
     assert by_step.groups[-1].samples == 2
     assert not by_step.groups[0].intervals
+
+
+@pytest.mark.parametrize(
+    ("scenario", "cluster"),
+    [
+        ("type1_subtype1_accident/Town03_1", "type1_subtype1/Town03_1"),
+        ("type1_subtype1_normal/Town03_1", "type1_subtype1/Town03_1"),
+        ("other/Town03_1", "other/Town03_1"),
+        ("other", "other"),
+    ],
+)
+def test_a_cluster_has_no_ending(scenario: str, cluster: str) -> None:
+    assert cluster_of(scenario) == cluster
 
 
 def test_the_pole_is_left_out_beside() -> None:

@@ -18,6 +18,10 @@ def test_the_cells_of_a_range(orientation) -> None:
         found = np.zeros(grid.shape, dtype=bool)
         found[cells_within(grid, extent)] = True
         np.testing.assert_array_equal(found, expected)
+    inside = (grid.centers() >= -30.5 / 2) & (grid.centers() < 30.5 / 2)  # a centre on the edge is in on one side
+    found = np.zeros(grid.shape, dtype=bool)
+    found[cells_within(grid, 30.5)] = True
+    np.testing.assert_array_equal(found, inside.all(axis=-1))
     away = BevGrid((20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation)
     assert not np.zeros(away.shape)[cells_within(away, 30.0)].size
 

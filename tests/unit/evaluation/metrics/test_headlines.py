@@ -49,6 +49,13 @@ def test_texts(value: float | None, unit: str, signed: bool, text: str) -> None:
     assert signed or value_text(value, unit) == text
 
 
+def test_the_text_of_a_result_is_its_first_headlines() -> None:
+    result = MotionEvaluator("released").compute()
+    first = "iou 30x30 0.00 %, iou 100x100 0.00 %, vpq 30x30 0.00 %, vpq 100x100 0.00 %"
+    assert repr(result) == f"MotionResult(0 samples: {first}, …)"
+    assert result._repr_html_().count("<tr") == 8
+
+
 def test_an_unknown_task_is_refused() -> None:
     with pytest.raises(ChoiceError, match="task: expected one of motion, accident, detection, warning, found 'maps'"):
         headlines("maps", None)

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.metrics.intervals import (
     LEAST_CLUSTERS,
     Intervals,
     Resampling,
     _notes,
+    difference_intervals,
+    few_clusters,
     interval_ends,
     intervals_of,
     parts_of,
@@ -133,6 +136,7 @@ def test_many_clusters_are_joined() -> None:
     assert len(parts_of(clusters, Resampling(resamples=40))) == 40
     assert len(parts_of(clusters, Resampling(resamples=2))) == LEAST_CLUSTERS
     assert parts_of(clusters[:100], Resampling()) == clusters[:100]
+    assert len(parts_of(clusters[:101], Resampling())) == 100
 
 
 def test_intervals_of_joined_clusters_are_nearly_the_same() -> None:
@@ -164,3 +168,48 @@ def test_at_the_least_number_of_clusters_it_is_that_they_are_alike() -> None:
     few, alike = _notes({"few": LEAST_CLUSTERS - 1, "alike": LEAST_CLUSTERS})
     assert few.startswith("no interval of few: fewer than")
     assert alike == f"no interval of alike: fewer than {LEAST_CLUSTERS} clusters change it"
+    (four,) = _notes(dict.fromkeys("abcd", 0))
+    (three,) = _notes(dict.fromkeys("abc", 0))
+    assert (four[:32], three[:27]) == ("no interval of a, b, c and 1 oth", "no interval of a, b, c: few")
+
+
+def test_how_few_clusters_there_are_is_said_in_good_words() -> None:
+    assert few_clusters(1) == "of 1 cluster (an accident and its twin are one); at least 6 are needed"
+
+
+def test_settings_and_their_edges() -> None:
+    assert Resampling() == Resampling(resamples=1000, confidence=0.95, seed=0)
+    assert Resampling(resamples=100_000, confidence=0.001).seed == 0
+    for settings, words in (
+        ({"resamples": 100_001}, "resamples: expected a whole number from 0 to 100,000, found 100001"),
+        ({"resamples": -1}, "resamples"),
+        ({"resamples": True}, "resamples"),
+        ({"resamples": 10.0}, "resamples"),
+        ({"seed": -1}, "seed: expected a whole number from 0, found -1"),
+        ({"seed": 1.0}, "seed"),
+        ({"confidence": 0}, "confidence: expected a share between 0 and 1, such as 0.95, found 0"),
+        ({"confidence": 1}, "confidence"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            Resampling(**settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("changing", [1, 5, 6, 10])
+def test_a_number_that_few_parts_change_has_no_interval(changing: int) -> None:
+    left_out = 1.0 + 0.1 * (np.arange(20) < changing)[:, None] * (-1) ** np.arange(20)[:, None]
+    low, high = interval_ends(np.ones(1), left_out, np.array([[-math.inf, math.inf]]), 0.95)
+    assert (np.isnan(low[0]), np.isnan(high[0])) == (changing < LEAST_CLUSTERS,) * 2
+
+
+def test_the_difference_of_two_runs_has_its_own_interval() -> None:
+    first, second = ([[{"above": hit, "below": 1.0}] for hit in run] for run in ([0.5] * 20, [-0.5, 3.5] * 10))
+    made = difference_intervals(Ratios(), (first, second), {"ratio": 1.0, "median_of_all": 0.0}, Resampling())
+    error = 2 / math.sqrt(19)
+    assert_allclose(made, [[1 - 2.0930 * error, math.nan], [1 + 2.0930 * error, math.nan], [error, 0]], atol=1e-3)
+
+
+def test_a_share_that_hangs_on_one_part_is_no_less_sure_than_as_many_draws_as_parts() -> None:
+    """With a degree of freedom t is 12.7, and the interval would be much wider."""
+    left_out = np.array([0.55, *[0.5 + 1e-7, 0.5 - 1e-7] * 9, 0.5 + 1e-7])[:, None]
+    ends = interval_ends(np.array([0.5]), left_out, np.array([[0, 1]]), 0.95)
+    assert np.ravel(ends) == pytest.approx(wilson(0.5, 20, 2.0930), abs=1e-4)

@@ -40,6 +40,9 @@ def test_the_numbers_of_a_result() -> None:
         ("mean_errors/ATE", (0, math.inf)),
         ("episodes_per_minute", (0, math.inf)),
         ("lateness", (-math.inf, math.inf)),
+        ("beside/time/lateness", (-math.inf, math.inf)),
+        ("groups/all/tta0_after/2", (0, math.inf)),
+        ("precision_at_5", (0, 1)),
     ],
 )
 def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, float]) -> None:
@@ -53,6 +56,9 @@ def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, flo
         ([0.0, 1.5], (0, math.inf)),
         ([-0.1, 0.5], (-math.inf, math.inf)),
         ([math.nan], (0, 1)),
+        ([0.2, math.inf], (0, 1)),
+        ([1.001], (0, math.inf)),
+        ([-0.001, 3.0], (-math.inf, math.inf)),
     ],
 )
 def test_a_number_of_others_is_what_its_clusters_are(alone: list[float], expected: tuple[float, float]) -> None:

@@ -9,7 +9,9 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import Accident, MotionOutput, instances_of
-from deepaccident_devkit.evaluation.metrics.predictions import checked_prediction
+from deepaccident_devkit.evaluation.metrics.predictions import (
+    checked_prediction,
+)
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.motion import MotionHeads
 
@@ -111,8 +113,17 @@ class TestMotionOutput:
             with pytest.raises(GeometryError, match=words):
                 refused()
 
+    def test_its_text_says_how_many_predictions_of_which_form(self) -> None:
+        three, one = MotionOutput.from_arrays(*stacked(), grid=GRID), instances_of(np.zeros((4, *GRID.shape)), GRID)
+        assert repr(three) == f"MotionOutput(3 predictions of 5 frames, {GRID.text}, heads)"
+        assert repr(one) == f"MotionOutput(1 prediction of 4 frames, {GRID.text}, instances)"
+
 
 class TestAccident:
+    def test_what_is_not_given(self) -> None:
+        now = Accident(positions=np.zeros((2, 2)), time=0.0)
+        assert (now.time, now.score, now.ids) == (0.0, 1.0, None)
+
     def test_its_positions_and_the_maps_of_an_output_are_read_only(self) -> None:
         positions, maps = np.zeros((2, 2)), np.zeros((1, 5, *GRID.shape), dtype=np.int32)
         accident, output = Accident(positions=positions, time=1.0), instances_of(maps, GRID)
@@ -146,6 +157,7 @@ class TestAccident:
             ({"ids": "ab"}, "accident ids: expected two actor ids"),
             ({"positions": np.full((2, 2), np.nan)}, "not all numbers are finite"),
             ({"positions": np.zeros(2)}, "accident positions: expected shape"),
+            ({"time": float("inf")}, "accident: time inf and score 1.0 must be finite"),
         ],
     )
     def test_what_is_no_accident(self, changes: dict[str, Any], message: str) -> None:

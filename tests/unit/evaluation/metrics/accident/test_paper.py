@@ -142,6 +142,25 @@ def test_which_of_several_predictions_is_compared() -> None:
     assert made.beside["sample_choice=best"].position_error == 2
 
 
+@pytest.mark.parametrize("seen", range(4))
+def test_the_mean_or_else_the_first_is_compared_wherever_it_is(seen: int) -> None:
+    """One of four predictions has an accident; or two, of which the later one is farther off."""
+    label, calm = scene(HIT), scene(CALM)
+    near, far = scene(moved(HIT, y=1)), scene(moved(HIT, y=3))
+    samples = [far if at == seen else calm for at in range(4)]
+    assert PAPER.counts(as_maps(*samples), label, AccidentContext())["mean_first"]["position"] == 6
+    both = [near if at < seen else far if at == seen else calm for at in range(4)]
+    made = PAPER.counts(as_maps(*both), label, AccidentContext())
+    assert (made["mean_first"]["position"], made["best"]["position"]) == (2 if 0 < seen < 3 else 6, 2 if seen else 6)
+
+
+@pytest.mark.parametrize(("time", "error"), [(1.74, 0), (1.75, 0), (1.2, 1), (1.26, 0)])
+def test_an_explicit_accident_names_who_is_there_at_the_nearest_frame(time: float, error: int) -> None:
+    """Of four frames the last one is the nearest up to the end of their time; before, another was there."""
+    label = scene({1: standing(20, 10), 2: follower(20, 20, 20, 0.5), 3: follower(1.5, 1.5, 1.5, 20)}, frames=4)
+    assert PAPER.counts([alarm(time=time, ids=None)], label, AccidentContext())["best"]["id"] == error
+
+
 def test_time_error_and_each_sides_own_time() -> None:
     """Predicted half a second early, while the follower is 1 m behind where it will be."""
     label = scene(HIT)

@@ -202,6 +202,13 @@ def test_whom_the_truth_names() -> None:
     assert name(ego, pair=(2, 77), known=True) == "unknown"
 
 
+def test_whom_the_truth_names_among_others() -> None:
+    """A third car, drawn first, is none of the two."""
+    label = scene({9: standing(-20, -20), 8: standing(-20, 20), **HIT})
+    found = counts(as_heads(label), label, AccidentContext(pair=(1, 2), known=True))
+    assert (found["positive"], found["named"]) == (True, "meta")
+
+
 def test_the_truth_names_who_is_there_at_the_present() -> None:
     """A frame later a third car is where one of the two was."""
     there, passing = (4, 13), (4, 10.5)

@@ -16,7 +16,10 @@ from deepaccident_devkit.evaluation.metrics.accident import (
     BoxTruth,
     PaperAccidents,
 )
-from deepaccident_devkit.evaluation.metrics.accident.scoring import actor_of
+from deepaccident_devkit.evaluation.metrics.accident.scoring import (
+    actor_of,
+    exact_parts,
+)
 from deepaccident_devkit.evaluation.metrics.alarms.reading import accident_of
 from deepaccident_devkit.geometry import BevGrid
 
@@ -101,3 +104,14 @@ def test_alarms_exactly_at_the_distance_miss_and_their_order_counts_nothing() ->
         alone = AccidentEvaluator(protocol="boxes")
         alone.update("one", [off], None, AccidentContext(truth=truth))
         assert [each.tp for each in alone.compute().within.values()] == [0, 1, 1]
+
+
+def test_of_equally_many_cells_the_actor_drawn_first_counts() -> None:
+    drawn = np.array([[[9, 7, 9, 7, 0, 0, 0]]])
+    label = SimpleNamespace(instance=drawn, id_map={90: 9, 70: 7, -101: 3})
+    assert actor_of(np.ones((1, 7), dtype=bool), 0, label, AccidentContext()) == 70
+
+
+def test_parts_have_the_exact_sum() -> None:
+    given = [[[1e16, 1.0], [], [-1e16]], [[0.0]], [[math.inf, 1.0]]]
+    assert [exact_parts(each) for each in given] == [[1.0], [], [math.inf]]

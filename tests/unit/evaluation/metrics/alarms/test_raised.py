@@ -1,5 +1,7 @@
 """Accidents that instance maps show."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
@@ -8,6 +10,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.accident import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.raised import foreseen_accident, named_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.truth import BoxTruth
+from deepaccident_devkit.evaluation.metrics.predictions import Accident
 
 NOBODY = BoxTruth(
     time=np.arange(0, 2.1, 0.1), actor_id=np.zeros(0, np.int64), footprint=np.zeros((21, 0, 5)), accident=None
@@ -54,3 +57,37 @@ def test_a_foreseen_accident_follows_the_labels() -> None:
     with pytest.raises(ChoiceError, match="labels"):
         foreseen_accident(output, labels="none")
     assert len(output.instances[0]) == FRAMES
+
+
+def alarm(x: float = 0.0, **columns: Any) -> Accident:
+    return Accident(positions=np.array([[x, 0.0], [x + 4, 0.0]]), **{"time": 1.0, **columns})
+
+
+def raised(*alarms: Accident, truth: BoxTruth = NOBODY) -> list[Any]:
+    return named_alarms([*alarms], None, truth, AccidentReading())
+
+
+def test_explicit_alarms_are_sorted_by_sureness_time_place_and_ids_and_those_below_0_left_out() -> None:
+    ordered = [
+        alarm(3, score=0.9, time=2.0),
+        alarm(9, score=0.5, time=0.5),
+        alarm(-1, score=0.5),
+        alarm(1, score=0.5, ids=(1, 2)),
+        alarm(1, score=0.5, ids=(1, 3)),
+        alarm(0, score=0.0),
+    ]
+    for mixed in (ordered, ordered[::-1]):
+        assert [each for each, _ in raised(*mixed, alarm(score=-0.001), alarm(score=-0.5))] == ordered
+
+
+@pytest.mark.parametrize(
+    ("time", "names"), [(0.3, (4, 7)), (0.26, (4, 7)), (0.34, (4, 7)), (0.24, (None, 4)), (9.9, (7, 4))]
+)
+def test_an_alarm_names_who_is_there_at_the_nearest_recorded_frame(time: float, names: tuple[int, ...]) -> None:
+    """Only at the third frame the two are where the alarm is; at the last one they have changed places."""
+    footprint = np.full((6, 2, 5), np.nan)
+    footprint[:, :, :2] = (4.0, 0.0), (90.0, 0.0)
+    footprint[3, :, :2] = (0.0, 0.0), (4.0, 0.0)
+    footprint[5, :, :2] = (4.0, 0.0), (0.0, 0.0)
+    truth = BoxTruth(time=np.arange(6) / 10, actor_id=np.array([4, 7]), footprint=footprint, accident=None)
+    assert [named for _, named in raised(alarm(time=time), truth=truth)] == [names]

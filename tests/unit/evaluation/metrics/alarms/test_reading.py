@@ -56,3 +56,11 @@ def test_a_metre_across_is_no_accident_either() -> None:
     found = accident_of(maps, BevGrid(), RELEASED, AccidentReading(danger_distance=1.01))
     assert found.contact.distance == 1
     assert accident_of(maps, BevGrid(), RELEASED, AccidentReading()).contact is None
+
+
+def test_the_distance_of_two_paths_is_the_mean_over_the_moments_at_which_both_are_there() -> None:
+    gone = (math.nan, math.nan)
+    predicted = InstanceTracks(identity=np.array([1, 2]), center=np.array([[(0, 0), (9, 9)], [(0, 8), gone]]))
+    truth = InstanceTracks(identity=np.array([7, 8]), center=np.array([[(0, 0), gone], [(0, 0), (9, 9)]]))
+    assert match_tracks(predicted, truth, 4.0) == {1: 7}
+    assert match_tracks(predicted, truth, 3.99) == {}

@@ -164,6 +164,12 @@ def test_the_released_heading_error_is_not_wrapped_and_its_scale_error_not_align
     assert reached[3] * 36 / 35 == pytest.approx(5.0)  # an unknown true velocity is one of 0
 
 
+def test_of_several_true_velocities_those_not_known_are_0() -> None:
+    truth = truth_at((10, 0), (30, 0), velocity=[[math.nan] * 3, [0.0, 0.0, 0.0]])
+    result = evaluated("released", (found_at((10, 0, 0.9), (30, 0, 0.5)), truth)).compute()
+    assert result.errors[0].tolist() == pytest.approx([1 / 36] * 4)
+
+
 def test_velocities_that_a_detector_does_not_give() -> None:
     truth = truth_at((10, 0))
     prediction = DetectedBoxes.from_arrays(truth.center, truth.size, truth.yaw, [0.5], frame="lidar")
@@ -236,6 +242,8 @@ def test_classes_that_are_nowhere() -> None:
     prediction = found_at((10, 0, 0.5), (20, 0, 0.5))
     left_out = evaluated("paper", (prediction, truth)).compute()
     assert math.isnan(left_out.class_average_precision["van"])
+    nobody = evaluated("opencood", (found_at(), truth_at()), absent_class_is_zero=True).compute()
+    assert nobody.mean_average_precision == 0
     counted = evaluated("paper", (prediction, truth), absent_class_is_zero=True).compute()
     assert counted.mean_average_precision == pytest.approx(left_out.mean_average_precision / 6)
 

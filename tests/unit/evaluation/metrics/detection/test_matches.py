@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import DetectedBoxes, detection_truth
-from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, detection_matches
+from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, detection_matches, detection_protocol
 from deepaccident_devkit.evaluation.metrics.detection.boxes import BoxColumns, columns_of
 from deepaccident_devkit.evaluation.metrics.detection.frame_counts import frame_counts
 from deepaccident_devkit.evaluation.metrics.detection.matching import match_errors
@@ -72,3 +72,39 @@ def test_released_errors_of_places_have_three_axes() -> None:
     truth, found = columns((10.0, 5.0, 1.0)), columns((13.0, 9.0, 13.0))
     assert match_errors(found, truth, DETECTION_PROTOCOLS["released"])[0, 0] == pytest.approx(13)
     assert match_errors(found, truth, DETECTION_PROTOCOLS["paper"])[0, 0] == pytest.approx(5)
+
+
+def boxes_at(*places: tuple[float, float]) -> Boxes:
+    center = np.array([(*place, 0.75) for place in places]).reshape(-1, 3)
+    return Boxes.from_arrays(center, np.tile((4.0, 2.0, 1.5), (len(places), 1)), np.zeros(len(places)), frame="lidar")
+
+
+def detected_at(*places: tuple[float, float]) -> DetectedBoxes:
+    return DetectedBoxes(boxes=boxes_at(*places), scores=np.linspace(0.9, 0.1, len(places)))
+
+
+def test_the_threshold_that_is_not_given_is_that_of_the_errors_or_the_middle_one() -> None:
+    expected = {"released": 2.0, "released_iou": 0.15, "paper": 2.0, "opencood": 0.5}
+    assert {name: detection_matches(detected_at(), boxes_at(), name).threshold for name in expected} == expected
+
+
+def test_pairs_of_which_one_is_out_of_range_are_neither_matches_nor_errors() -> None:
+    """The released range ends at x = 84.85 m: the first pair has its truth beyond, the second its detection."""
+    truth = boxes_at((85.5, 0), (84.0, 20), (10, 0), (30, 0))
+    found = detection_matches(detected_at((84.5, 0), (85.0, 20), (50, 0), (10, 0), (40, 0)), truth, "released", 4.0)
+    assert (found.detection.tolist(), found.truth.tolist()) == ([3], [2])
+    assert (found.false.tolist(), found.missed.tolist()) == ([2, 4], [3])
+
+
+def test_ranges_begin_with_their_first_metre_and_end_before_their_last_and_areas_have_their_edges() -> None:
+    rules = detection_protocol(
+        "paper", ranges=((0.0, 30.0), (30.0, 50.0)), area=(-30.0, 31.0, -49.9, 50.0), error_threshold=None
+    )
+    places = [(0, 0), (18, 24), (-30, 40), (-30, 0), (31, 0), (0, -49.9), (0, 50.0), (0, 29.9), (9, 40), (-31, 0)]
+    rows = [detection_matches(detected_at(place), boxes_at(place), rules, 4.0).truth.tolist() for place in places]
+    assert rows == [[0], [0], [], [0], [0], [0], [], [0], [0], []]
+    edges = detection_protocol(rules, ranges=((0.0, 99.0),))
+    rows = [detection_matches(detected_at(place), boxes_at(place), edges, 4.0).truth.tolist() for place in places]
+    assert rows == [[0]] * 9 + [[]]
+    counts = frame_counts(columns_of(detected_at(*places).boxes), columns_of(boxes_at(*places)), rules)
+    assert counts["truths"][:2] == [2, 5]

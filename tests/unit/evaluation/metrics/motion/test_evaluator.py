@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -295,3 +296,55 @@ def test_paths_of_instances(orientation) -> None:
         2: [[-29.0, 1.0], [-28.0, 1.0]],
     }
     assert instance_paths(np.zeros((2, 200, 200), dtype=int), grid) == {}
+    assert instance_paths(np.stack([boxes(), boxes(_1=100)]), grid) == {}
+
+
+def row(*x: float) -> np.ndarray:
+    return np.array([(each, 0.0) for each in x])
+
+
+def test_the_gate_of_paths_is_a_mean_of_4_metres_over_the_frames() -> None:
+    truth = {8: row(0, 0, 0)}
+    for x, near in ((4.0, True), (4.001, False)):
+        found = match_trajectories({5: row(x, x, x)}, truth)
+        assert (found.pairs, found.unmatched_prediction) == ((((5, 8),), ()) if near else ((), (5,)))
+    with pytest.raises(GeometryError, match="trajectories: expected 3 points each; see `padded`"):
+        match_trajectories({5: row(0, 0)}, truth)
+
+
+@pytest.mark.parametrize(
+    ("end", "ade", "fde", "missed"),
+    [(5.0, 2.5, 5.0, 0), (5.5, 2.75, 5.5, 1), (11.0, 5.5, 10.0, 1), (17.0, 8.0, 10.0, 1), (0.0, 0.0, 0.0, 0)],
+)
+def test_errors_at_the_end_and_their_limits(end: float, ade: float, fde: float, missed: int) -> None:
+    truth, predicted = {1: row(0, 0)}, {4: row(0, end)}
+    made = trajectory_errors([predicted], truth, [replace(match_trajectories(truth, truth), pairs=((4, 1),))])
+    assert (made.ade, made.fde, made.missed, made.count) == (ade, fde, missed, 1)
+
+
+def test_the_choices_of_the_protocols_and_what_counts_hold() -> None:
+    released = {"labels": "released", "nothing_is_zero": True}
+    assert {name: asdict(rules) for name, rules in MOTION_PROTOCOLS.items()} == {
+        "released": released,
+        "paper": released | {"nothing_is_zero": False},
+    }
+    assert (asdict(MotionProtocol()), MotionEvaluator().trajectories) == (released, True)
+    label = boxes_label(*[boxes(_1=100, _2=190)] * 5)
+    counts = motion_counts(still(boxes(_1=101), boxes(_1=100, _3=40)), label)
+    alone, quality = [[1.0] * 5, [1] * 5], [[1.0] * 5, [1] * 5, [1] * 5, [1] * 5]
+    assert counts == {
+        "samples": 1,
+        "frames": 5,
+        "instance_maps": 1,
+        "cells": [[80, 0, 0], [80, 80, 80]],
+        "vpq": [[*alone, [0] * 5, [0] * 5], quality],
+        "paths": {
+            "ade": 0.0,
+            "fde": 0.0,
+            "missed": 0,
+            "count": 1,
+            "true_positive": 1,
+            "false_positive": 1,
+            "false_negative": 1,
+        },
+    }

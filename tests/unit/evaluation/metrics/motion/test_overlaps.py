@@ -8,9 +8,11 @@ from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
+    PanopticQuality,
     SegmentationCounts,
     iou,
     mask_counts,
+    panoptic_quality,
     vpq_counts,
     vpq_matches,
 )
@@ -55,3 +57,19 @@ def test_iou_of_classes() -> None:
     assert iou([counts[2], counts[0]]) == 2 / 5
     assert iou([]) == 0.0
     assert math.isnan(iou([], absent=math.nan))
+
+
+def test_quality_of_sums() -> None:
+    assert panoptic_quality(3.0, 4, 2, 6) == PanopticQuality(pq=3 / 8, sq=3 / 4, rq=4 / 8, denominator=8)
+    assert panoptic_quality(0.0, 0, 1, 0) == PanopticQuality(pq=0.0, sq=0.0, rq=0.0, denominator=1)
+
+
+def test_the_background_counts_as_one_that_is_never_missed_nor_a_false_alarm() -> None:
+    label, prediction = np.zeros((2, 3, 4, 5), dtype=np.int64)
+    label[0, 0, :3], prediction[0, 0, :2] = 1, 4
+    label[1], prediction[1, 2] = 2, 5
+    counts = vpq_counts(prediction, label)
+    assert counts.iou.tolist() == [[17 / 18, 2 / 3], [0, 0], [1, 0]]
+    assert counts.true_positive.tolist() == [[1, 1], [0, 0], [1, 0]]
+    assert counts.false_positive.tolist() == [[0, 0], [0, 1], [0, 0]]
+    assert counts.false_negative.tolist() == [[0, 0], [0, 1], [0, 0]]
