@@ -18,7 +18,8 @@ import plain_results as plain
 import pytest
 
 from deepaccident_devkit.errors import MOST_SAID, ResultsError
-from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.results import MotionForm, read_results, reader
+from deepaccident_devkit.geometry import BevGrid
 
 FIRST, SECOND, THIRD = plain.TOKENS
 Document = dict[str, Any]
@@ -624,3 +625,77 @@ def test_what_is_no_results_file(tmp_path: Path) -> None:
     (folder / "results.json").rename(folder / "manifest.json")
     refused(folder / "manifest.json", "is the manifest of motion results; call it results.json")
     refused(plain.write_json(tmp_path / "list.json", [1]), "list.json: expected a JSON object, found [1]")  # type: ignore[arg-type]
+
+
+UP = float(np.nextafter(1e6, 2e6))
+TOKEN = "a/" * 400 + "b" * 200
+"""Of 1000 characters."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "good", "wrong"),
+    [
+        ("accident", {"positions": [[1e6, -1e6], [0, 0]]}, {"positions": [[UP, 0], [0, 0]]}),
+        ("accident", {"positions": [[0, 0], [-1e6, 0]]}, {"positions": [[0, 0], [-UP, 0]]}),
+        ("accident", {"time": 1e6}, {"time": UP}),
+        ("accident", {"time": 0}, {"time": -5e-324}),
+        ("accident", {"ids": [2**63 - 1, -(2**63)]}, {"ids": [2**63, 0]}),
+        ("accident", {"ids": [0, -(2**63)]}, {"ids": [0, -(2**63) - 1]}),
+        ("detection", {"size": [0, 1e6, 0]}, {"size": [0, UP, 0]}),
+        ("detection", {"rotation": [1.0009, 0, 0, 0]}, {"rotation": [1.0011, 0, 0, 0]}),
+        ("detection", {"rotation": [0, 0.9991, 0, 0]}, {"rotation": [0, 0.9989, 0, 0]}),
+        ("detection", {"velocity": [-1e6, 1e6]}, {"velocity": [0, UP]}),
+    ],
+)
+def test_ends_of_ranges(tmp_path: Path, kind: str, good: dict[str, Any], wrong: dict[str, Any]) -> None:
+    path = tmp_path / f"{kind}.json"
+    assert len(read_results(plain.write_json(path, with_entry(kind, **good))).prediction(FIRST)) == 2
+    refused(plain.write_json(path, with_entry(kind, **wrong)), f"results of '{FIRST}': [1].")
+
+
+def test_the_longest_token_and_the_largest_form(tmp_path: Path) -> None:
+    path = tmp_path / "accident.json"
+    assert read_results(plain.write_json(path, plain.document("accident", results={TOKEN: []}))).tokens == (TOKEN,)
+    refused(plain.write_json(path, plain.document("accident", results={f"{TOKEN}b": []})), "expected a sample's token")
+    form: dict[str, Any] = {"stored": "heads", "grid": BevGrid((0, 512, 0.5), (0, 512, 0.5)), "frames": 8}
+    assert MotionForm(predictions=8, **form).predictions == 8  # of 2**20 cells
+    with pytest.raises(ResultsError, match="form: 9 predictions of 8 frames of 1048576 cells are more than memory"):
+        MotionForm(predictions=9, **form)
+
+
+@pytest.mark.parametrize(
+    ("step", "good"),
+    [(0.1, True), (0.3, True), (10, True), (0.05, False), (0.1001, False), (0.0, False), (-0.5, False)],
+)
+def test_steps_are_of_recorded_frames(step: float, *, good: bool) -> None:
+    made: dict[str, Any] = {"stored": "heads", "grid": BevGrid(), "predictions": 1, "frames": 1, "step": step}
+    if good:
+        assert MotionForm(**made).as_dict()["step"] == step
+    else:
+        with pytest.raises(ResultsError, match="step: expected seconds, a whole number of recorded frames of"):
+            MotionForm(**made)
+    assert MotionForm(**{**made, "step": 0.5}) == MotionForm(
+        **{name: each for name, each in made.items() if name != "step"}
+    )
+
+
+@pytest.mark.parametrize("kind", ["accident", "detection"])
+def test_good_results_are_read_once(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The strict reader, which takes four times as long, sees of them only meta and what is ignored."""
+    optional, name = ("ids", "score") if kind == "accident" else ("velocity", "detection_score")
+    told = with_entry(kind, **{optional: ..., name: 0.5})
+    told["meta"] = {"a:": {"b": ":"}}
+    if kind == "detection":
+        told["results"][FIRST][0].update(num_pts={"c": ":"}, ego_translation=[1, 2])
+    seen, parsed = [], reader.parsed_json
+    monkeypatch.setattr(reader, "parsed_json", lambda content, *more: seen.append(content) or parsed(content, *more))
+    path = plain.write_json(tmp_path / f"{kind}.json", told)
+    assert reader.read_document(path.read_bytes(), path)[1] == told["meta"]
+    assert [b"results" in each for each in seen] == [False]
+
+
+def test_a_wrong_value_is_cut_after_80_characters(tmp_path: Path) -> None:
+    """With its quotation marks."""
+    for count, told in ((78, f'found "{"é" * 78}" ('), (79, f'found "{"é" * 79}… (')):
+        path = plain.write_json(tmp_path / "accident.json", with_entry("accident", time="é" * count))
+        refused(path, f".time: expected `float`, {told}Seconds after the present.)")

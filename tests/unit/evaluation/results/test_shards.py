@@ -79,7 +79,7 @@ class TestMotion:
             assert read.grid == output.grid
         results.check()
 
-    @pytest.mark.parametrize(("highest", "dtype"), [(255, "u1"), (256, "u2"), (65536, "i4")])
+    @pytest.mark.parametrize(("highest", "dtype"), [(255, "u1"), (256, "u2"), (65535, "u2"), (65536, "i4")])
     def test_instance_maps_are_stored_as_given(self, tmp_path: Path, highest: int, dtype: str) -> None:
         maps = plain.instance_arrays()["instance"].astype(np.int32)
         maps[maps == 7] = highest

@@ -29,6 +29,7 @@ from deepaccident_devkit.evaluation.runs import (
     evaluate_results,
     save_run,
 )
+from deepaccident_devkit.evaluation.runs.compare import ComparedNumber, _text_row
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 Write = Callable[..., Results]
@@ -335,3 +336,59 @@ class TestNumbersThatAskForMemory:
     def test_of_accidents(self, value: float) -> None:
         """Of which the remainders never end."""
         assert len(exact_parts([[1.0, value]])) == 1
+
+
+@pytest.mark.parametrize(("count", "shown"), [(1, 1), (3, 3), (4, 4)])
+def test_names_of_many_samples_are_cut(tmp_path: Path, count: int, shown: int) -> None:
+    one, more = (write_bundle(tmp_path / f"of {each}", [(1, 1)] * each) for each in (1, count + 1))
+    with pytest.raises(EvaluationError, match="only in") as raised:
+        compare_bundles(one, more, FEW)
+    told, names = str(raised.value).split(";")[0].split(" (")
+    assert told == f"{count} samples only in {more}"
+    assert len(names.split(", ")) == shown
+    assert names.endswith("type1_subtype1_accident/Town03_003/ego_vehicle/001, …)") is (count > 3)
+
+
+@pytest.mark.parametrize(("unlike", "more"), [(2, ""), (3, ""), (4, ", and 1 more"), (5, ", and 2 more")])
+def test_unlike_rules_are_told_in_parts(tmp_path: Path, unlike: int, more: str) -> None:
+    folders = [write_bundle(tmp_path / name, [(1, 1)] * 2) for name in "ab"]
+    path = folders[1] / "metrics_summary.json"
+    summary = json.loads(path.read_text())
+    summary["settings"] |= {f"x{number}": number for number in range(unlike)}
+    path.write_text(json.dumps(summary))
+    with pytest.raises(EvaluationError, match="same rules") as raised:
+        compare_bundles(*folders, FEW)
+    told = "; ".join(f"settings/x{number} 'absent' and {number}" for number in range(min(unlike, 3)))
+    assert str(raised.value).endswith(f"by the same rules: {told}{more}; evaluate both in the same way")
+
+
+def test_the_note_on_exploration_counts(generated: Callable[..., Comparison]) -> None:
+    made = generated(HARD[:2], HARD[2:4])
+    numbers = [replace(made.numbers[0], family="other", p=p) for p in (0.01, 0.0625, 0.1, 0.04, None)]
+    told = replace(made, numbers=(made.numbers[0], *numbers)).notes()
+    explored = "for exploration: 2 of 4 other numbers have a p of at most 5%; between equally good runs about 0.2 would"
+    assert told[3:] == [f"{explored}, by chance"]
+    assert replace(made, numbers=(made.numbers[0], numbers[-1])).notes() == told[:3]
+
+
+def test_cells_of_the_table() -> None:
+    number = ComparedNumber(
+        number="x/y",
+        headline="y",
+        unit="m",
+        a=1.0,
+        b=None,
+        difference=None,
+        low=-0.5,
+        high=0.25,
+        family="main",
+        p=0.5,
+        adjusted_p=None,
+        real=False,
+        better=None,
+        decision="why",
+    )
+    assert _text_row(number) == ("y (m)", "1.000", "–", "–", "[-0.500, +0.250]", "–", "why")
+    shown = _text_row(replace(number, unit="share", low=None, difference=0.25, adjusted_p=0.0625))
+    assert shown == ("y", "1.000", "–", "+0.250", "–", "0.062", "why")
+    assert _text_row(replace(number, unit=None, high=None))[:5:4] == ("y", "–")

@@ -65,3 +65,28 @@ def test_detection_of_the_released_code() -> None:
     [note] = notes("detection")
     assert note.startswith("released: hidden boxes are truth")
     assert notes("detection", "paper") == []
+
+
+@pytest.mark.parametrize("field", ["x", "y"])
+def test_each_axis_is_that_of_published_numbers(field: str) -> None:
+    assert len(notes(**{field: [-50.0, 50.0, 0.25]})) == 1
+    [_, wide] = notes(**{field: [-50.0, 49.5, 0.5]})
+    assert wide.startswith("100x100: the maps end before")
+    ranges = PATHS | {"ranges": {"30x120": {}, "100x100": {}, "102x30": {}}}
+    assert [note.split(":")[0] for note in notes(metrics=ranges, **{field: [-51.0, 51.0, 0.5]})[1:]] == [
+        "30x120",
+        "102x30",
+    ]
+
+
+def test_up_to_where_numbers_are_as_published() -> None:
+    assert notes(frames=5) == notes(frames=1) == []
+    assert notes(frames=6)[0].startswith("predictions have 6 frames; the first 5 are evaluated")
+    assert notes(frames=3, step=1.0) == notes(frames=8, step=0.3) == []
+    assert notes(frames=4, step=1.0)[0].startswith("predictions have 4 frames; the first 3 are evaluated")
+    [note] = notes("accident", predictions=5)
+    assert note == "predictions of a sample: 5; published numbers are of 6, five samples and then their mean"
+    assert notes("accident", predictions=7) == []
+    [note] = notes(metrics=PATHS | {"path_true_positive": 89, "path_false_negative": 11})
+    assert note.startswith("89 of 100 true paths")
+    assert notes("warning", "clean", metrics={}) == []

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -161,3 +161,56 @@ def test_all_swaps_or_random_ones() -> None:
     assert swaps_of(0, Resampling()).swapped.shape == (1, 0)
     assert swaps_of(11, Resampling(resamples=1000)).swapped.shape == (1000, 11)
     assert swaps_of(5, Resampling(resamples=0)).swapped.shape == (0, 5)
+
+
+@pytest.mark.parametrize(
+    ("clusters", "resamples", "complete"),
+    [
+        (0, 1, True),
+        (1, 1, True),
+        (2, 1, False),
+        (2, 2, True),
+        (4, 7, False),
+        (4, 8, True),
+        (5, 8, False),
+        (11, 1024, True),
+    ],
+)
+def test_up_to_which_number_all_swaps_are_taken(clusters: int, resamples: int, *, complete: bool) -> None:
+    made = swaps_of(clusters, Resampling(resamples=resamples))
+    number = 2 ** max(clusters - 1, 0) if complete else resamples
+    assert (made.complete, made.swapped.shape) == (complete, (number, clusters))
+    assert made.least_p == (1 / number if complete else 1 / (number + 1))
+    assert not complete or not made.swapped[:, :1].any()
+
+
+@pytest.mark.parametrize(
+    ("observed", "complete", "p"),
+    [(1.0, True, 3 / 4), (1 + 5e-10, True, 3 / 4), (1 + 3e-9, True, 1 / 4), (2.0, True, 1 / 4)],
+)
+def test_equal_but_for_rounding(observed: float, p: float, *, complete: bool) -> None:
+    swaps = Swaps(swapped=np.zeros((4, 3), dtype=bool), complete=complete)
+    assert p_values(np.array([observed]), np.array([[2.0], [1.0], [-1.0], [0.0]]), swaps)[0] == p
+
+
+@pytest.mark.parametrize(
+    ("error", "scenarios", "told"),
+    [
+        (0.0, 9, None),
+        (0.1, 9, "9"),
+        (0.1, 10, "10"),
+        (0.5, 40, "79"),
+        (0.5, 100, "200"),
+        (5.0, 100, "20,000"),
+        (1.0, 64, "510"),
+    ],
+)
+def test_how_many_scenarios_would_decide(error: float, scenarios: int, told: str | None) -> None:
+    """At least those that there are; in two digits, rounded up."""
+    made = replace(paired(np.zeros(8), np.tile([3.0, -1.0], 4)), errors=np.array([error]))
+    other = replace(made, differences=-made.differences)
+    assert (
+        undecided(made, 0, 1, scenarios)
+        == undecided(other, 0, 1, scenarios)
+        == ("not decided" if told is None else f"not decided: about {told} scenarios would decide it")
+    )

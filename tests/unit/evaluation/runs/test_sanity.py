@@ -16,7 +16,20 @@ from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import accident_context
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
-from deepaccident_devkit.evaluation.runs.sanity import SanityReport, check_sanity
+from deepaccident_devkit.evaluation.runs import sanity as sanity_module
+from deepaccident_devkit.evaluation.runs.sanity import (
+    SanityReport,
+    _class_tally,
+    _facts,
+    _follows,
+    _mistakes,
+    _near,
+    _same_size,
+    _Seen,
+    _tally,
+    _told,
+    check_sanity,
+)
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionHeads
@@ -259,3 +272,118 @@ def test_nothing_to_look_at(da_motion: DeepAccident, right: dict[str, dict[str, 
     results, setup = MemoryResults("motion", right["maps"]), EvaluationSetup(task="motion")
     with pytest.raises(EvaluationError, match="there is no sample to look at"):
         check_sanity(da_motion, results, setup, [])
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "undone", "given", "whole", "suspected"),
+    [
+        ("x mirrored", "motion", 100, 0, 500, True),
+        ("x mirrored", "motion", 99, 0, 400, False),  # too few cells
+        ("x mirrored", "motion", 100, 0, 501, False),  # too small a share
+        ("x mirrored", "motion", 200, 100, 500, True),
+        ("x mirrored", "motion", 200, 101, 500, False),  # not twice as many
+        ("x mirrored", "accident", 4, 0, 20, True),
+        ("x mirrored", "accident", 3, 0, 3, False),
+        ("x mirrored", "detection", 10, 0, 10, True),
+        ("x mirrored", "detection", 9, 0, 9, False),
+        ("one step late", "detection", 40, 20, 100, True),
+        ("one step late", "detection", 39, 0, 100, False),
+        ("sizes in the order width, length, height", "detection", 50, 25, 100, True),
+        ("sizes in the order width, length, height", "detection", 49, 0, 100, False),
+    ],
+)
+def test_from_which_shares_on_a_mistake_is_suspected(
+    name: str, task: str, undone: int, given: int, whole: int, *, suspected: bool
+) -> None:
+    half = _Seen(tallies={name: _tally(undone / 2, given / 2, whole / 2)})
+    warnings = list(_mistakes([half, half], task))
+    assert len(warnings) == suspected
+    told = f"({undone / whole:.0%} of the truth is hit once that is undone, {given / whole:.0%} as it is)"
+    assert all(each.startswith(f"{name}: ") and each.endswith(told) for each in warnings)
+
+
+def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
+    two = np.array([[80.0, 20.0], [100.0, 100.0], [0.0, 0.0], [100.0, 100.0]])
+    one = np.where([[0, 1], [0, 0], [0, 0], [0, 0]], 30.0, two)
+    (warning,) = _mistakes(
+        [_Seen(tallies={"x mirrored": two, "y mirrored": one, "one step late": _tally(90, 0, 100)})], "motion"
+    )
+    assert warning.startswith("y mirrored: ")  # and nothing of time beside it
+    assert "(30% of the truth" in warning
+
+
+@pytest.mark.parametrize(("right", "every", "told"), [(4, 10, True), (5, 10, False), (0, 9, False)])
+def test_when_headings_look_random(right: int, every: int, *, told: bool) -> None:
+    seen = [_Seen(tallies={}, headings=(right, every - 3)), _Seen(tallies={}, headings=(0, 3))]
+    warnings = list(_mistakes(seen, "detection"))
+    assert [each.split(",")[0] for each in warnings] == [f"headings look random: {right} of {every} are right"] * told
+
+
+@pytest.mark.parametrize(
+    ("seen", "ranked", "told"),
+    [
+        ([{"scores": (1.0, 1.0)}], True, ["all 2 scores are 1"]),
+        ([{"scores": (0.5,)}, {"scores": (0.5,)}], True, ["all 2 scores are 0.5"]),
+        ([{"scores": (1.0, 1.0)}], False, []),
+        ([{"scores": (1.0,)}], True, []),
+        ([{"scores": (1.0, 0.5)}], True, []),
+        ([{"empty": True}, {"empty": True}], True, ["all 2 predictions looked at are empty"]),
+        ([{"empty": True}, {}], True, []),
+        ([{"empty": True}, {"probabilities": True}], True, ["all values of the heads' segmentation are between 0 and"]),
+        ([{"probabilities": False}, {"probabilities": True}], True, []),
+    ],
+)
+def test_what_shows_without_labels(seen: list[dict[str, Any]], *, ranked: bool, told: list[str]) -> None:
+    found = list(_facts([_Seen(tallies={}, **each) for each in seen], ranked=ranked))
+    assert [each[: len(start)] for each, start in zip(found, told, strict=True)] == told
+
+
+@pytest.mark.parametrize(
+    ("numbers", "swapped"),
+    [
+        ({(0, 1): 5, (1, 0): 5}, [5, 5]),
+        ({(0, 1): 4, (1, 0): 5, (2, 2): 2}, []),  # a class with four boxes tells nothing, and one alone is too few
+        ({(0, 1): 5, (2, 2): 5}, [5]),
+        ({(0, 1): 5, (2, 2): 6}, []),
+        ({(0, 2): 9, (1, 2): 9}, []),  # both for one
+        ({(0, 1): 6, (0, 0): 3, (1, 0): 7}, [6, 7]),
+    ],
+)
+def test_classes_that_are_swapped(numbers: dict[tuple[int, int], int], swapped: list[int]) -> None:
+    names = np.zeros((6, 6))
+    for place, number in numbers.items():
+        names[place] = number
+    found = _class_tally(names)
+    assert found[0].tolist() == swapped
+    changed = [row for row, column in numbers if row != column][: len(swapped)]
+    assert found[1].tolist() == found[3].tolist() == [names[row].sum() for row in changed]
+    assert found[2].tolist() == [names[row, row] for row in changed]
+
+
+def test_what_is_near() -> None:
+    true = np.array([[0.0, 0.0, 0.0]])
+    found = np.array([[2.0, 0, 0], [1.99, 0, 0.69], [0, 0, 0.7], [0, 0, -0.71], [1.5, 1.5, 0], [-1.4, 1.4, -0.6]])
+    assert _near(found, true).tolist() == [[False, True, False, False, False, True]]
+    way = np.array([[4.0, 0.0]])
+    for off, follows in (([0.99, 0.0], True), ([1.0, 0.0], False), ([0.0, -0.9], True), ([0.8, 0.8], False)):
+        assert _follows(np.array([[9.0, 9, 0], [*off, 5]]), np.zeros((1, 2)), way).tolist() == [follows]
+    size = np.array([[4.0, 2.0, 1.0]])
+    sizes = np.array([[5.0, 1.5, 1.25], [5.1, 2, 1], [4, 1.4, 1], [4, 2, 1.3]])
+    assert _same_size(sizes, size).tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("undone", "given", "change", "tally"),
+    [(1.0, 3.0, 4.0, [1, 1, 0, 1]), (1.1, 0.9, 4.0, [0, 1, 1, 1]), (0.0, 0.0, 2.0, [0, 0, 0, 0]), (1, 1, 2.1, [1] * 4)],
+)
+def test_accidents_tell_only_where_both_cannot_be_near(
+    undone: float, given: float, change: float, tally: list[int]
+) -> None:
+    assert _told(undone, given, change, 1.0)[:, 0].tolist() == tally
+
+
+def test_what_is_looked_at_and_asked_for() -> None:
+    """More would take longer; less would raise suspicion of right predictions."""
+    assert (sanity_module._SAMPLES, sanity_module._LISTS, sanity_module._FEWEST_FRAMES) == (20, 60, 3)
+    assert (sanity_module._MOVING, sanity_module._NEAR_IN_TIME) == (4.0, 0.15)
+    assert np.rad2deg(sanity_module._STRAIGHT) == pytest.approx(15)

@@ -1,12 +1,13 @@
 """Which samples an evaluation is of."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
-from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection
+from deepaccident_devkit.evaluation.runs import Coverage, SampleSelection, default_selection
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.synth import SynthConfig, make_release
@@ -86,3 +87,29 @@ def test_nothing_to_evaluate(tmp_path: Path) -> None:
 def test_a_horizon_may_be_rounded_a_little(da_motion: DeepAccident) -> None:
     exact = SampleSelection(split="train", horizon=1.5).tokens(da_motion)
     assert SampleSelection(split="train", horizon=1.5 - 1e-9).tokens(da_motion) == exact
+
+
+MISSING, EXTRA, UNKNOWN = ({"missing": ("a", "b")}, {"extra": ("c",)}, {"unknown": ("d", "e", "f")})
+
+
+@pytest.mark.parametrize(
+    ("parts", "told"),
+    [
+        ([], ["all 6 samples have a prediction, and nothing else has"]),
+        ([MISSING], ["2 of 6 samples have no prediction (a, b)"]),
+        ([EXTRA], ["1 predictions are of samples that are not evaluated (c)", "leave them out with --allow-partial"]),
+        ([UNKNOWN], ["3 predictions are of no sample of this release (d, e, f)"]),
+        ([MISSING, EXTRA], ["2 of 6 samples have no", "1 predictions are of samples that are not evaluated (c)"]),
+        ([EXTRA, UNKNOWN], ["1 predictions are of samples", "3 predictions are of no sample"]),
+        ([{"missing": tuple("abcd")}], ["4 of 6 samples have no prediction (a, b, c, …)"]),
+        (
+            [MISSING, {"splits": ("train", "val"), "agents": ("ego_vehicle",)}],
+            ["2 of 6 samples", "the predictions are of the splits train, val and the agents ego_vehicle"],
+        ),
+    ],
+)
+def test_what_is_told_of_the_coverage(parts: list[dict[str, Any]], told: list[str]) -> None:
+    found = Coverage(expected=6, **{name: each for part in parts for name, each in part.items()})
+    assert found.is_complete is (parts == [])
+    texts = found.to_text().replace("True); no", "True), no").split("; ")
+    assert [text[: len(start)] for text, start in zip(texts, told, strict=True)] == told

@@ -4,10 +4,11 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
     Partial,
@@ -105,3 +106,78 @@ def test_what_a_results_file_holds(
 def test_notes_of_results_that_stand_beside_say_of_which() -> None:
     metrics = {"notes": ["both"], "beside": {"paper": {"notes": ["both", "its own"]}}}
     assert list(_notes(metrics)) == ["both", "if paper: its own"]
+
+
+SUMMARY: dict[str, Any] = {
+    "task": "accident",
+    "protocol": "boxes",
+    "switches": {},
+    "agents": None,
+    "split": "val",
+    "samples": "evaluate",
+    "scope": "all",
+    "horizon": 2.0,
+    "partial": None,
+    "release": {"dataroot": "/r", "version": "v1", "fingerprint": "f"},
+    "results": {"path": "/p", "fingerprint": "g", "form": None},
+    "counts": {"samples": 6, "scenarios": 2, "left_out": 3},
+    "devkit_version": "1",
+    "headlines": [
+        {"name": name, "path": f"at/{name}", "text": text} for name, text in zip("abcdef", "123456", strict=True)
+    ],
+    "metrics": {
+        "n": 1,
+        "flag": True,
+        "at": {"a": 0.5, "pairs": [3, 4], "odd": [1, 0.5]},
+        "longer": {"k": 5},
+        "curve": {"k": 2},
+    },
+    "breakdowns": {},
+}
+
+
+def test_lines_are_aligned() -> None:
+    assert summary_text(SUMMARY) == "\n".join(
+        [
+            "evaluated",
+            "  task         accident, protocol boxes",
+            "  samples      6 of 2 scenarios: split val, list evaluate, scope all, all agents, horizon 2 s",
+            "  predictions  /p (g); 3 predictions of other samples left out",
+            "  release      /r (v1, f)",
+            "  devkit       1",
+            "",
+            "results",
+            *(
+                f"  {line}"
+                for line in ["number  value", *(f"{name}           {at}" for at, name in enumerate("abcdef", 1))]
+            ),
+            "",
+            "counts",
+            "  n 1",
+            "  at      pairs 3+4",
+            "  longer  k 5",
+        ]
+    )
+
+
+def test_breakdowns_show_five_headlines_and_what_is_unknown() -> None:
+    groups = [
+        {"value": value, "samples": 2, "scenarios": 1, "headlines": {"at/a": 0.25, "at/e": None, "at/f": 0.5}}
+        for value in ("near", None)
+    ]
+    lines = summary_text({**SUMMARY, "breakdowns": {"agent": {"groups": groups}}}, ["agent", "weather"]).split("\n\n")[
+        -1
+    ]
+    assert lines_of(lines) == [
+        "by agent",
+        "value samples scenarios a b c d e",
+        "near 2 1 0.250 – – – –",
+        "unknown 2 1 0.250 – – – –",
+    ]
+
+
+def test_of_meta_every_letter_is_shown(tmp_path: Path) -> None:
+    with ResultsWriter(tmp_path / "a.json", "accident", meta={"über": "π"}) as writer:
+        writer.add("t/s/ego_vehicle/001", [])
+    *_, line = results_text(read_results(tmp_path / "a.json")).splitlines()
+    assert line == 'meta         {"über": "π"}'

@@ -241,6 +241,7 @@ def test_the_operating_point_is_given_or_found() -> None:
     assert figures.operating.tta_hit == 1.5
     assert figures.operating.tta0 == pytest.approx(1.2)
     given = CleanWarnings(threshold=0.75).result(list(evaluator.counts.values()))
+    assert [any("on these very recordings" in note for note in each.notes) for each in (found, given)] == [True, False]
     assert (given.operating_by, given.groups["ego_involved"].operating.recall) == ("given", 0.4)
 
 
@@ -379,16 +380,17 @@ def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -
 
 def test_only_bystanders_and_the_pole_hand_their_alarm_on() -> None:
     evaluator = WarningEvaluator("clean")
-    for involvement in ("ego_involved", "bystander", "infrastructure"):
+    for involvement in ("ego_involved", "bystander", "infrastructure", ""):
         for frame in range(1, 41, 5):
             known = context("accident", frame, 41, 41, involvement)
             alarms = [Accident(positions=MEETING, time=1.0, score=0.5, ids=PAIR)]
-            evaluator.update(f"type1_subtype1_accident/{involvement}/ego_vehicle/{frame:03d}", alarms, None, known)
+            evaluator.update(f"type1_subtype1_accident/s{involvement}/ego_vehicle/{frame:03d}", alarms, None, known)
     groups = evaluator.compute().groups
     assert {name: bool(each.tta0_after) for name, each in groups.items()} == {
         "ego_involved": False,
         "bystander": True,
         "infrastructure": True,
+        "unknown": False,
     }
 
 

@@ -93,6 +93,8 @@ def test_what_the_recording_cannot_refute_stands_apart() -> None:
     assert found(1.0) == (1, 0)
     assert found(1.04) == (1, 0)  # within half a recorded frame
     assert found(1.06) == (0, 1)
+    both = counted([FALSE, replace(FALSE, time=1.5, score=0.25)], context(51, "others"))
+    assert (both["alarms"], both["unjudged"]) == ([[1.0, 0]], [0.25])
 
 
 def test_an_alarm_for_later_than_the_horizon_is_none() -> None:

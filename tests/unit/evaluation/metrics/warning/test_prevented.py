@@ -21,6 +21,7 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     anticipation,
 )
 from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.recordings import REFERENCES, TRIVIAL
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Skipped
 
 FRAMES = np.arange(1, 62, 5)
@@ -241,6 +242,9 @@ def test_alarms_that_flicker_prevent_for_free_unless_they_must_last() -> None:
     assert result.groups[GROUP].right[0.0][NOMINAL].braking_seconds_per_minute == 0
     assert (shares(result)["avoided"], shares(result, alarms="lasting")["avoided"]) == (1, 0)
     assert shares(result, "0.5 s, 6 m/s²", "lasting")["avoided"] == 1
+    chances = [f"{name}{end}" for name in TRIVIAL[2:] for end in ("", ", quiet")]
+    assert list(result.references) == [*TRIVIAL[:2], *chances, *REFERENCES]
+    assert result.notes[0].startswith("an alarm that is over before the driver brakes costs nothing")
     siren = result.references["always"][GROUP]
     assert siren.lasting[0.0][NOMINAL].shares["avoided"] == 1
     chance = result.references["random per frame, quiet"][GROUP]
@@ -295,7 +299,8 @@ def test_nothing_to_count_is_no_number() -> None:
     result = evaluated([alarm_from(1)], []).compute()
     assert math.isnan(result.groups[GROUP].threshold)
     assert math.isnan(result.avoided(GROUP))
-    assert evaluated([], []).compute().groups == {}
+    nothing = evaluated([], []).compute()
+    assert (nothing.groups, nothing.notes) == ({}, ())
 
 
 def test_no_alarm_at_the_impact_or_after_it_warns() -> None:
@@ -329,3 +334,4 @@ def test_rows_of_frames_and_of_none() -> None:
         table(), frame=FRAMES[:0], outcome=table().outcome[:, -1:], extrapolated=table().extrapolated[:, :1]
     )
     assert nothing.rows(np.array([1, 6])).tolist() == [0, 0]
+    assert replace(table(), frame=np.arange(13)).rows(np.array([0, 12, 13])).tolist() == [0, 12, 13]
