@@ -224,7 +224,10 @@ def _contact(pair: Boxes, facing: FloatArray) -> tuple[FloatArray, float, FloatA
         normal = (end - start) / gap
     push = normal * (gap + _TOUCHING)
     shared = first.intersection(translate(second, *(-push).tolist()))
-    middle = get_coordinates(shared.centroid)[0] + push / 2
+    if shared.is_empty:  # corners that nearly touch pass each other
+        middle = get_coordinates(shortest_line(first, second)).mean(axis=0)
+    else:
+        middle = get_coordinates(shared.centroid)[0] + push / 2
     return np.array([*middle, pair.center[:, 2].mean()]), gap, normal
 
 

@@ -9,6 +9,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import BEV_CLASSES, Augmentation, bev_segmentation, segmentation_of
+from deepaccident_devkit.motion.bev_segmentation import COVERAGE
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.taxonomy import BEV_SHAPE
 
@@ -106,3 +107,25 @@ def test_of_a_sample_the_ground_is_augmented_too(da: DeepAccident) -> None:
         mine.mask("road"), segmentation_of(da.load_bev(sample), BevGrid(), augmentation=augmentation).mask("road")
     )
     assert (mine.mask("road") != bev_segmentation(da, sample).mask("road")).any()
+
+
+def test_oblong_cells_count_their_own_pixels() -> None:
+    """Cells of 5 × 4 pixels, each looked at by itself; where half of a cell is enough, 10 of 20 are."""
+    tags = {"road": 7, "lane_line": 6, "sidewalk": 8, "vehicle": 10, "pedestrian": 4}
+    assert (dict(COVERAGE), BEV_CLASSES) == ({name: 0.5 * (name[0] in "rsv") for name in tags}, tuple(tags))
+    generator = np.random.default_rng(3)
+    image = _image()
+    semantic = generator.choice([0, *tags.values()], BEV_SHAPE, p=[0.02, 0.48, 0.04, 0.42, 0.02, 0.02]).astype(np.uint8)
+    targets = segmentation_of(BevImage(semantic, image.instance), BevGrid((-3, 3, 0.5), (-2, 2, 0.4)))
+    halves = 0
+    for row, column in np.ndindex(10, 12):  # y to the left by rows, x ahead by columns
+        first_row, first_column = (
+            600 - round((-3 + 0.5 * (column + 1)) / 0.1),
+            600 - round((-2 + 0.4 * (row + 1)) / 0.1),
+        )
+        cell = semantic[first_row : first_row + 5, first_column : first_column + 4]
+        counts = {name: np.count_nonzero(cell == tag) for name, tag in tags.items()}
+        halves += counts["road"] == 10
+        expected = [counts[name] >= (10 if COVERAGE[name] else 1) for name in BEV_CLASSES]
+        assert targets.masks[:, row, column].tolist() == expected
+    assert halves > 3

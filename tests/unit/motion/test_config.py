@@ -1,6 +1,6 @@
 import json
 import pickle
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.config import label_config
+from deepaccident_devkit.motion.protocols import slip_names
 from deepaccident_devkit.v2x import AgentConfig
 
 
@@ -59,12 +60,15 @@ def test_a_presets_orientation_is_kept_unless_the_grid_or_the_caller_says_otherw
             r"future_frames: expected a whole number from 1 to 1,000 \(frames after the present.*found 0",
         ),
         ({"future_frames": 10**9}, "found 1000000000"),
+        ({"future_frames": 1001}, "found 1001"),
         ({"receptive_field": True}, "receptive_field: expected a whole number from 1 .* found True"),
         ({"step": 2.5}, r"step: expected a whole number from 1 to 1,000 \(recorded frames .* found 2.5"),
         ({"ignore_index": 0}, "ignore_index: expected a whole number from 1 to 255 .*, found 0"),
         ({"ignore_index": 256}, "ignore_index: .* found 256"),
         ({"ignore_index": 199}, "199 may also be a number of cells in offset and flow; choose 200 to 255"),
         ({"sigma": 0}, "sigma: expected cells from 0.01 to 10,000, such as 3, found 0"),
+        ({"sigma": 0.009}, "sigma: .* found 0.009"),
+        ({"sigma": 10_001}, "sigma: .* found 10001"),
         ({"sigma": "3"}, "sigma: .* found '3'"),
         ({"sigma": np.nan}, "sigma: .* found nan"),
         ({"draw_ego": "no"}, "draw_ego: expected True or False, found 'no'"),
@@ -211,8 +215,81 @@ def test_an_augmentation_turns_then_scales_then_mirrors() -> None:
 
 def test_the_narrowest_and_the_widest_centre() -> None:
     assert [MotionLabelConfig(sigma=sigma).sigma for sigma in (0.01, 10_000)] == [0.01, 10_000]
+    assert MotionLabelConfig(ignore_index=200, future_frames=1000, step=1, receptive_field=1).frames == 1001
 
 
 def test_agents_of_a_configuration_are_described_by_name_and_partners() -> None:
     agents = AgentConfig("mine", ("behind", "infrastructure"))
     assert MotionLabelConfig(agents=agents).as_dict()["agents"] == {"name": "mine", "partners": list(agents.partners)}
+
+
+def test_every_preset_written_out() -> None:
+    """And its digest: label files of earlier versions have it."""
+    plain = {
+        "grid": {"x": [-50.0, 50.0, 0.5], "y": [-50.0, 50.0, 0.5]},
+        "receptive_field": 3,
+        "future_frames": 4,
+        "step": 5,
+        "only_vehicle": False,
+        "filter_invisible": True,
+        "agents": None,
+        "draw_ego": True,
+        "ignore_index": 255,
+        "orientation": "devkit",
+        "sigma": 3.0,
+        "augmentation": None,
+    }
+    others = {"only_vehicle": True, "draw_ego": False}
+    expected = {
+        "deepaccident": ("released", {}, "aa6bab7c91a6df2a"),
+        "deepaccident-3s": ("released", {"future_frames": 6}, "aefaeedb784d8aeb"),
+        "deepaccident-4s": ("released", {"future_frames": 8}, "20daa06506a4a130"),
+        "deepaccident-5s": ("released", {"future_frames": 10}, "adb29110af8447f4"),
+        "beverse": ("beverse", others, "3d559a2d563f3af4"),
+        "fiery": ("fiery", {**others, "agents": "single", "orientation": "fiery"}, "e880ac3b47b82b25"),
+    }
+    assert list(PRESETS) == list(expected)
+    for name, (protocol, changes, digest) in expected.items():
+        described = PRESETS[name].as_dict()
+        assert described.pop("protocol")["native"] == LABEL_PROTOCOLS[protocol].native
+        assert (described, PRESETS[name].protocol, PRESETS[name].digest) == ({**plain, **changes}, protocol, digest)
+
+
+def test_every_protocol_written_out() -> None:
+    yes, no = True, False
+    assert {name: astuple(rules) for name, rules in LABEL_PROTOCOLS.items()} == {
+        "released": (*[yes] * 4, "present", *[yes] * 5, "stretched", "released", "released", "whole"),
+        "clean": (*[no] * 4, "since", *[no] * 5, "exact", "released", "released", "whole"),
+        "beverse": (*[yes] * 4, "now", yes, no, yes, yes, no, "stretched", "devkit", "released", "whole"),
+        "fiery": (*[yes] * 4, "now", no, no, yes, yes, yes, "fiery", "fiery", "camera", "yaw"),
+    }
+    assert [(rules.right_handed, rules.place_in_cell) for rules in LABEL_PROTOCOLS.values()] == [
+        (False, (0.0, 1.0)),
+        (False, (0.5, 0.5)),
+        (True, (0.0, 0.0)),
+        (True, (0.0, 0.0)),
+    ]
+    assert slip_names() == [
+        "own_box_moved_twice",
+        "own_box_default",
+        "own_box_not_augmented",
+        "half_cell_shift",
+        "untracked_share_an_id",
+        "missing_frames_are_empty",
+        "outside_is_zero",
+        "vectors_not_rotated",
+        "ids_kept_between_samples",
+    ]
+
+
+def test_no_augmentation_changes_nothing() -> None:
+    assert astuple(Augmentation()) == (0.0, 1.0, False)
+    np.testing.assert_array_equal(Augmentation().matrix, np.eye(4))
+    with pytest.raises(ConfigError, match="scale: expected a factor above 0, 1 for none, found -1"):
+        Augmentation(scale=-1)
+
+
+@pytest.mark.parametrize("described", [{}, [], None, {**MotionLabelConfig().as_dict(), "colour": "red"}])
+def test_what_describes_no_configuration_is_refused(described: object) -> None:
+    with pytest.raises(ConfigError, match=r"label configuration: cannot be read \(.+\)"):
+        MotionLabelConfig.from_dict(described)

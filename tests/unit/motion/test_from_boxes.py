@@ -16,7 +16,7 @@ from deepaccident_devkit.motion import (
     motion_labels_from_boxes,
 )
 from deepaccident_devkit.motion.drawing.box_polygons import box_polygons
-from deepaccident_devkit.motion.orientations import to_orientation
+from deepaccident_devkit.motion.orientations import axes_of, to_orientation
 
 STILL = np.zeros((7, 6))
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
@@ -128,6 +128,25 @@ def test_the_egos_own_box_and_its_slips() -> None:
     assert len(box_polygons(frames, MotionLabelConfig(draw_ego=False))[0].key) == 0
 
 
+@pytest.mark.parametrize("protocol", ["released", "clean"])
+def test_where_the_agent_leans_the_middle_of_a_boxs_bottom_counts(protocol: str) -> None:
+    """The released code takes half a height off the own box twice, and moves it twice."""
+    lidar = SE3.from_six([1.0, 2.0, 3.0, 0.4, -0.3, 0.2])
+    boxes = frame((10, 5, 7, 0, 1), (3, 1, -100, 0, 0), lidar=lidar)
+    own, other = (lidar.apply(np.array([[*place, -0.75]]))[0] for place in ((3, 1), (10, 5)))
+    if protocol == "released":
+        own = lidar.apply((own - [0, 0, 0.75])[None])[0]
+    config = MotionLabelConfig(protocol=protocol)
+    drawn = box_polygons([boxes] * 5, config)[0]
+    assert_allclose(drawn.corners.mean(axis=1), [own[:2], other[:2]], atol=1e-5)
+    high = replace(frame((10, 5, 7, 0, 1), (9, 9, 8, 0, 1), lidar=lidar), center=[[10, 5, 2.0], [9, 9, 4]])
+    keys = box_polygons([high] * 5, config)[0].key.tolist()
+    assert keys == ([OWN_BOX_ID, 7, 8] if protocol == "released" else [7, 8])
+    if protocol == "released":  # a default box at the height of the first row's middle
+        default = lidar.apply(np.array([[0, 0, 2.0 - 1.62 / 2]]))[0]
+        assert_allclose(box_polygons([high] * 5, config)[0].corners[0].mean(axis=0), default[:2], atol=1e-5)
+
+
 def test_an_augmentation_moves_boxes_and_in_the_clean_way_the_egos_too() -> None:
     turned = Augmentation(rotation=np.pi / 2, scale=2, flip=True)
     frames = [frame((1, 0, -100, 0, 0), (10, 5, 7, 0, 1))] * 5
@@ -193,7 +212,9 @@ def test_ids_go_on_only_where_the_protocol_keeps_them() -> None:
     kept = replace(CLEAN, ids_kept_between_samples=True)
     made = motion_labels_from_boxes(frames, STILL, MotionLabelConfig(protocol=kept), id_map={np.int64(9): np.int32(4)})
     assert made.id_map == {9: 4}
-    for wrong in ({"a": 2}, {3: -4}, {7: 0}, {3: 1.5}, [3]):
+    nobody = MotionLabelConfig(draw_ego=False)
+    assert motion_labels_from_boxes([frame()] * 5, STILL, nobody, id_map={3: 2**24}).id_map == {3: 2**24}
+    for wrong in ({"a": 2}, {3: -4}, {7: 0}, {3: 1.5}, {3: 2**24 + 1}, [3]):
         with pytest.raises(ConfigError, match="id_map: expected"):
             motion_labels_from_boxes(frames, STILL, id_map=wrong)
 
@@ -316,3 +337,25 @@ def test_arrays_are_read_only_and_whole() -> None:
 def test_what_does_not_fit_is_refused_with_the_remedy(make: Callable[[], object], sentence: str) -> None:
     with pytest.raises(GeometryError, match=sentence):
         make()
+
+
+def test_vectors_have_two_channels_of_cells() -> None:
+    for wrong in (np.zeros((2, 5)), np.zeros((3, 4, 5))):
+        with pytest.raises(GeometryError, match=r"vectors: expected shape \(…, 2, H, W\), found"):
+            to_orientation(wrong, vectors=True, source="devkit", target="fiery")
+
+
+def test_axes_as_rows_and_columns_count_them() -> None:
+    grid = BevGrid((-20, 60, 0.5), (-30, 10, 0.25))
+    x, y = (-20, 60, 0.5), (-30, 10, 0.25)
+    for orientation, expected in (("devkit", (y, x)), ("released", ((-10, 30, 0.25), x)), ("fiery", (x, y))):
+        assert axes_of(grid.with_orientation(orientation)) == expected
+
+
+def test_labels_say_in_a_line_what_they_are() -> None:
+    made = labels([frame((5, 5, 1, 0, 1))] * 5, protocol="clean", draw_ego=False)
+    assert repr(made) == (
+        "MotionLabels(5 frames of 200 × 200 cells of 0.5 m, 1 actors in id_map, clean, each frame in its own ego frame)"
+    )
+    own = labels([frame()] * 5, protocol=replace(RELEASED, half_cell_shift=False), draw_ego=False).to_present()
+    assert repr(own).endswith("0 actors in id_map, own protocol, all at the present)")

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import get_args
@@ -838,3 +839,25 @@ def test_labels_can_be_pickled(small: DeepAccident) -> None:
     again = pickle.loads(pickle.dumps(label))
     np.testing.assert_array_equal(again.instance, label.instance)
     assert (again.config, again.id_map) == (label.config, label.id_map)
+
+
+def test_a_file_is_made_again_if_any_row_of_its_scenario_changed(tmp_path: Path, out: Path) -> None:
+    """One with no box at all, then the same elsewhere, then with one box more each time."""
+    config = MotionLabelConfig(grid=BevGrid((-4, 4, 1), (-4, 4, 1)), receptive_field=1, future_frames=1)
+    token = f"{tiny.TOKEN}/infrastructure/001"
+    rows = ["0 0", "car 2 0 0 4 2 1.5 0 0 0 5 9 True", "car 0 0 0 4 2 1.5 0 0 0 -1 9 True"]
+    for count, written in ((1, 1), (1, 0), (2, 1), (3, 1)):
+        root = tmp_path / f"release {count}"
+        lines = partial(lambda there, *_: there, rows[:count])
+        tiny.write_tiny_release(root, frames=1, agents=("infrastructure",), lines_of=lines)
+        release = opened(root)
+        assert write(release, out, [token], config) == LabelsWritten(samples=1, written=written, kept=1 - written)
+        assert_same(LabelFiles(out)[token], motion_labels(release, token, config))
+    [path] = out.rglob("*.npz")
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            assert (entry.external_attr >> 16, entry.date_time[:3]) == (0o644, (1980, 1, 1))
+            assert entry.compress_type == zipfile.ZIP_DEFLATED
+    text = (out / MANIFEST).read_text()
+    assert text.startswith('{\n "format": "DeepAccident motion labels",\n "version": 1,\n "config_digest": "')
+    assert text.endswith(f'"samples": {{\n  "{tiny.TOKEN}/infrastructure": [ 1 ]\n }}\n}}\n')

@@ -59,3 +59,14 @@ def test_points_that_do_not_lie_evenly_are_looked_at_one_by_one(motion: tuple[fl
     assert next_centers._spread(lines, config.grid.with_orientation("released")) is None
     centers = following_centers(shown, matrices, config, 1)
     assert np.isnan(centers[0, 1]).all() == (motion[0] > 0)
+
+
+def test_one_frame_that_does_not_lie_evenly_is_enough_to_look_at_every_cell() -> None:
+    grid = CONFIG.grid.with_orientation("released")
+    turned = six_vectors.to_matrices([(0, 0, 0, np.pi / 2, 0, 0)])[0]
+    for other in (turned, np.diag([0.45, 0.45, 1, 1]), np.diag([2.1, 2.1, 1, 1])):
+        lines = next_centers.sampling_lines(np.stack([np.eye(4), other]), grid, LABEL_PROTOCOLS["clean"])
+        assert next_centers._spread(lines, grid) is None
+    near = np.stack([np.eye(4), np.diag([0.55, 0.55, 1, 1]), np.diag([1.9, 1.9, 1, 1])])
+    lines = next_centers.sampling_lines(near, grid, LABEL_PROTOCOLS["clean"])
+    assert next_centers._spread(lines, grid) is not None

@@ -1,6 +1,6 @@
 """Each rule of reading instances off maps by itself; that all of them together are the released code's, parity says."""
 
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import FrozenInstanceError, astuple, replace
 
 import numpy as np
 import pytest
@@ -11,8 +11,10 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
+from deepaccident_devkit.motion.postprocessing.contours import redrawn_cells
+from deepaccident_devkit.motion.postprocessing.grouping import LABEL_LOGIT, MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import (
+    FOREGROUND_THRESHOLD,
     POST_PROCESSING,
     PostProcessing,
     post_processing,
@@ -211,6 +213,14 @@ def test_settings_that_cannot_be() -> None:
             ConfigError,
             r"max_centers: expected a whole number from 1 .*, found True",
         ),
+        (lambda: PostProcessing(max_centers=2**24 + 1), ConfigError, "from 1 to 16,777,216 .* found 16777217"),
+        (lambda: PostProcessing(max_centers=0), ConfigError, "max_centers: expected a whole number from 1 .* found 0"),
+        (lambda: PostProcessing(link_distance=-0.1), ConfigError, "a number of cells from 0, found -0.1"),
+        (
+            lambda: PostProcessing(center_threshold=-0.1),
+            ConfigError,
+            "center_threshold: expected a number from 0, found",
+        ),
         (lambda: PostProcessing(redraw=1), ConfigError, "redraw: expected True or False, found 1"),
         (
             lambda: predict_instances(drawn({}), None),
@@ -224,6 +234,45 @@ def test_settings_that_cannot_be() -> None:
         ),
     )
     assert PostProcessing(max_centers=np.int64(100), link_distance=10) == PostProcessing()
+    least = PostProcessing(max_centers=1, link_distance=0, center_threshold=0)
+    assert astuple(least) == ("argmax", True, 0.0, 1, "released", 0.0, False)
+    assert PostProcessing(max_centers=2**24).max_centers == 2**24
+
+
+def test_the_named_settings_written_out() -> None:
+    assert {name: astuple(rules) for name, rules in POST_PROCESSING.items()} == {
+        "motion": ("argmax", True, 0.1, 100, "released", 10.0, False),
+        "accident": ("sigmoid", True, 0.1, 100, "released", 8.0, True),
+        "fiery": ("argmax", True, 0.1, 100, "fiery", 3.0, False),
+    }
+    assert (FOREGROUND_THRESHOLD, LABEL_LOGIT) == (0.4, 10.0)
+    heads = drawn({(5, 5): (0, 0)}, orientation="devkit")
+    assert repr(heads) == "MotionHeads(1 frames of 30 × 40 cells, devkit)"
+    assert (
+        MotionHeads.from_arrays(heads.segmentation, heads.centerness, heads.offset, heads.flow).orientation == "devkit"
+    )
+
+
+@pytest.mark.parametrize(("move", "turns"), [(3, False), (4, True)])
+def test_a_redrawn_box_turns_after_a_move_of_four_cells_and_is_10_by_4_at_most(move: int, turns: bool) -> None:
+    hull = [(28, 8), (28, 16), (12, 16), (12, 8)]  # 16 × 8, along a row
+    centers = np.array([[[12.0, 20.0], [12.0 + move, 20.0], [13.0 + move, 20.0]]])
+    positions, ids = redrawn_cells([hull], centers, np.ones((1, 3), dtype=bool), (40, 40))
+    extents = [tuple(np.ptp(position, axis=1).tolist()) for position in positions]
+    assert extents == [(4, 10), *[(10, 4) if turns else (4, 10)] * 2]
+    assert [position.mean(axis=1).tolist() for position in positions] == centers[0].tolist()
+    assert all((one == 1).all() for one in ids)
+
+
+def test_the_smallest_redrawn_box_has_three_cells_a_side_and_stays_in_the_grid() -> None:
+    positions, ids = redrawn_cells(
+        [[(0, 0)], [(5, 6)]], np.array([[[0.0, 0.0]], [[6.0, 5.0]]]), np.ones((2, 1)) > 0, (8, 7)
+    )
+    expected = np.zeros((8, 7), dtype=int)
+    expected[:2, :2], expected[5:8, 4:7] = 1, 2
+    found = np.zeros((8, 7), dtype=int)
+    found[tuple(positions[0])] = ids[0]
+    assert_array_equal(found, expected)
 
 
 class Tensor:
@@ -320,6 +369,16 @@ def test_heads_that_cannot_be() -> None:
             lambda: MotionHeads.from_arrays(broken, heat, good, good),
             GeometryError,
             r"segmentation: nan at \(1, 0, 2, 3\) cannot be used",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(np.where(np.isnan(broken), np.nan, np.inf), heat, good, good),
+            GeometryError,
+            r"segmentation: nan at \(1, 0, 2, 3\) cannot be used",
+        ),
+        (
+            lambda: MotionHeads.from_arrays(good, heat, good, good - 1.1e15),
+            GeometryError,
+            r"flow: -1099999978979328.0 at \(0, 0, 0, 0",
         ),
         (
             lambda: MotionHeads.from_arrays(good, heat, good + np.inf, good),

@@ -4,10 +4,12 @@ import re
 from pathlib import Path
 
 import pytest
+import tiny
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.motion import evaluation_samples, samples, training_samples
+from deepaccident_devkit.motion.sample_lists import no_samples_text
 from deepaccident_devkit.taxonomy import AGENTS
 
 
@@ -44,6 +46,9 @@ def test_the_paper_leaves_horizon_and_scope_open(da_motion: DeepAccident, every_
     for scenario in da_motion.scenario:
         assert _frames(tokens, scenario["token"], "infrastructure") == [5, 10, 15, 20, 25, 30]
     assert len(samples(da_motion, every_scenario, "all")) == 2 * 5 * 7
+    assert samples(da_motion, every_scenario, "every") == [sample["token"] for sample in da_motion.sample]
+    shortest = samples(da_motion, every_scenario, "evaluate", "paper", horizon=0.5, scope="all")
+    assert {token[-3:] for token in shortest} == {"030"}
 
 
 def test_a_split_belongs_to_its_scenarios_alone(da_motion: DeepAccident, tmp_path: Path) -> None:
@@ -98,7 +103,7 @@ def test_unknown_choices_name_those_there_are(da_motion: DeepAccident, arguments
         samples(da_motion, "train", **{"purpose": "train", **arguments})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("horizon", [0.0, 0.7, -1.0, float("nan")])
+@pytest.mark.parametrize("horizon", [0.0, 0.4999, 0.7, -1.0, float("nan"), float("inf")])
 def test_a_horizon_is_a_number_of_half_seconds(da_motion: DeepAccident, horizon: float) -> None:
     with pytest.raises(ConfigError, match=r"choose 0\.5, 1, 1\.5"):
         samples(da_motion, "train", "evaluate", "paper", horizon=horizon)
@@ -118,3 +123,17 @@ def test_a_split_without_labels_says_so(own_release: Path) -> None:
     split.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
     with pytest.raises(NotAvailableError, match="none of its samples here has labels"):
         samples(unlabelled, split, "train")
+
+
+def test_a_list_without_samples_says_what_to_do(tmp_path: Path) -> None:
+    split = tmp_path / "one.txt"
+    for kind, told in (
+        ("normal", "leaves out all 1 of its scenarios, .* use scope='all'"),
+        ("accident", "^choose others"),
+    ):
+        scenario_type = f"type1_subtype1_{kind}"
+        root = tiny.write_tiny_release(tmp_path / kind, frames=1, scenario_type=scenario_type, agents=("ego_vehicle",))
+        release = DeepAccident(dataroot=root, verbose=False, workers=1)
+        split.write_text(f"{scenario_type} {tiny.NAME}\n")
+        assert re.search(told, no_samples_text(release, split, "accident"))
+        assert no_samples_text(release, split, "all") == "choose others"

@@ -1,5 +1,6 @@
 """Warps: the three rules on small grids, labels to the present, and maps of past moments and of agents."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -228,6 +229,15 @@ def test_released_vectors_keep_their_values_when_the_frame_turns() -> None:
     config = MotionLabelConfig(grid=GRID, future_frames=1)
     present = make_labels(config, np.negative(QUARTER_LEFT).tolist()).to_present()
     assert_array_equal(present.offset[1][:, present.instance[1] > 0][:, 0], [0, 1])
+
+
+def test_what_is_unknown_of_an_instance_stays_unknown_when_the_frame_turns() -> None:
+    config = MotionLabelConfig(grid=GRID, protocol="clean", future_frames=1)
+    labels = make_labels(config, np.negative(QUARTER_LEFT).tolist())
+    flow = np.full_like(labels.flow, config.ignore_index)
+    present = replace(labels, flow=flow).to_present()
+    assert present.instance[1].any()
+    assert_array_equal(present.flow, flow)
 
 
 def test_labels_at_the_present_are_not_warped_again() -> None:

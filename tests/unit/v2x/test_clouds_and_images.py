@@ -112,6 +112,15 @@ def test_a_point_keeps_its_place_in_its_box() -> None:
     assert_allclose(points[0], [1.5, 0.5, 0.2])
 
 
+def test_of_boxes_that_overlap_the_last_moves_a_point_and_one_that_only_turns_moves_it_too() -> None:
+    center, size = [[0.0, 0, 0], [1, 0, 0], [9, 0, 0]], [[4.0, 2, 2]] * 3
+    then = Boxes.from_arrays(center, size, [0.0, 0, 0], actor_id=[5, 6, 7])
+    now = Boxes.from_arrays([[0.0, 0, 9], [1, 0, 0], [9, 0, 0]], size, [0.0, np.pi / 2, 0], actor_id=[5, 6, 7])
+    points = np.array([[-1.5, 0, 0], [1.5, 0.5, 0], [9.5, 0.1, 0.3]])
+    assert_allclose(moved_points(points, then, now), [[-1.5, 0, 9], [0.5, 0.5, 0], [9.5, 0.1, 0.3]], atol=1e-12)
+    assert_array_equal(moved_points(points, then, now.select([])), points)
+
+
 def test_each_point_says_whose_and_how_old_it_is(da: DeepAccident, sample: str) -> None:
     """Of three sweeps 0.1 s apart; the partner's arrive 0.1 s late, the ego's do not, and none is from frame 0."""
     cloud = da.aggregate_point_cloud(sample, agents=["infrastructure"], sweeps=3, link=Link(latency=0.1))
@@ -155,7 +164,7 @@ def test_a_cloud_in_an_image_of_its_own_agent(da: DeepAccident, sample: str) -> 
 def test_an_image_that_was_stored_smaller_is_read_at_the_same_place() -> None:
     image = np.arange(75, dtype=np.uint8).reshape(5, 5, 3)
     last = np.nextafter(13.0, 0)  # times 5/13 that is 5, which is no column any more
-    lens, pixels = PinholeCamera(np.eye(3), 13, 10), np.array([[last, 9.9], [0, 2.0], [20, 1]])
+    lens, pixels = PinholeCamera(np.eye(3), 13, 13), np.array([[last, last], [0, 3.0], [20, 1]])
     colors = _colors_at(image, lens, pixels, np.array([True, True, False]))
     assert_array_equal(colors, [image[4, 4], image[1, 0], [0, 0, 0]])
 
@@ -206,6 +215,9 @@ def test_message_sizes(da: DeepAccident, sample: str) -> None:
     with pytest.raises(ChoiceError, match="bev_dtype: expected a type such as 'float32', found 'foo'"):
         da.message_sizes(sample, bev_dtype="foo")
     assert da.message_sizes(sample, agents="single", bev_shape=np.array((8, 100, 50)))["ego_vehicle"].bev == 24 + 160000
+    assert da.message_sizes(sample, agents="single", bev_shape=(1, 1, 1))["ego_vehicle"].bev == 24 + 4
+    usual = da.message_sizes(sample, agents="single")["ego_vehicle"]
+    assert (usual.bev, usual.cloud) == (24 + 64 * 200 * 200 * 4, mine.cloud)
 
 
 def test_message_sizes_are_of_what_arrives(da: DeepAccident, sample: str) -> None:

@@ -10,7 +10,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.v2x import AGENT_CONFIGS, AgentConfig, cooperating_agents
+from deepaccident_devkit.v2x import AGENT_CONFIGS, AGENT_SETS, AgentConfig, cooperating_agents
 
 EGO, EGO_BEHIND, OTHER, OTHER_BEHIND, POLE = AGENTS
 
@@ -25,6 +25,8 @@ def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
         "vehicles": (EGO, EGO_BEHIND, OTHER, OTHER_BEHIND),
         "all": AGENTS,
     }
+    assert (*AGENT_CONFIGS, "available") == AGENT_SETS
+    assert AgentConfig("alone").agents_for(POLE) == (POLE,)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +70,7 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
     assert cooperating_agents(da_b, sample, AGENT_CONFIGS["+other"]) == (OTHER, EGO)
     assert cooperating_agents(da_b, sample, [POLE, OTHER, POLE]) == (OTHER, POLE)
     assert cooperating_agents(da_b, sample, [POLE]) == (POLE,)
-    assert cooperating_agents(da_b, sample, "available") == cooperating_agents(da_b, sample, None)
+    assert cooperating_agents(da_b, sample, "Available") == cooperating_agents(da_b, sample, None)
     assert_refused(
         (
             lambda: cooperating_agents(da_b, sample, POLE),

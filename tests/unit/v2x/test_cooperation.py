@@ -110,6 +110,18 @@ def test_untracked_rows_stay_but_once_a_place(stacked) -> None:
     assert boxes.category_names == ["car", "car", "car", "truck", "car", "car"]
 
 
+@pytest.mark.parametrize(("apart", "kept"), [(0.25, 2), (0.5, 4)])
+def test_half_a_metre_apart_are_two_actors(stacked, apart: float, kept: int) -> None:
+    rows = {
+        "ego_vehicle": [row(50.0, -1), row(70.0, 8)],
+        "infrastructure": [row(50.0 + apart, -1), row(70 + apart, -1)],
+    }
+    view = cooperative_view(stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001")
+    assert_array_equal(view.boxes.actor_id, [8, -1, -1, -1][:kept])
+    assert_array_equal(view.seen_by, [1, 1, 16, 16][:kept])
+    assert_array_equal(view.boxes.num_lidar_pts, [9] * kept)
+
+
 def test_visible_only(stacked) -> None:
     rows = {
         "ego_vehicle": [row(0.0, -100), row(20.0, 5, 1), row(40.0, 6, 9, camera=False), row(12.0, -1)],

@@ -1,6 +1,9 @@
+import hashlib
 import inspect
 import math
 import pickle
+from dataclasses import asdict
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -209,3 +212,49 @@ def test_likely_mistakes_of_units_are_named() -> None:
         ),
     )
     assert Link(latency=20).latency_frames == 200
+
+
+def test_nothing_happens_by_default_and_the_papers_spread_is_2_cm() -> None:
+    assert asdict(Link()) == {"latency": 0.0, "pose_noise": None, "packet_loss": 0.0, "seed": 0}
+    assert asdict(PoseNoise()) == {"mean": 0.0, "std": 0.02, "heading_std": 0.0}
+
+
+def test_the_ends_of_each_range() -> None:
+    assert [Link(packet_loss=loss).packet_loss for loss in (0, 1)] == [0, 1]
+    assert Link(latency=0.1 + 0.9e-7).latency == Link(latency=0.1 - 0.9e-7).latency == 0.1
+    assert PoseNoise(mean=0, std=0, heading_std=math.pi).heading_std == math.pi
+    assert_refused(
+        (lambda: Link(packet_loss=-0.01), ConfigError, "packet_loss: -0.01 is no probability; choose a number from 0"),
+        (lambda: Link(packet_loss=1.01), ConfigError, "packet_loss: 1.01 is no probability"),
+        (
+            lambda: Link(latency=0.1 + 1.1e-7),
+            ConfigError,
+            r"is no multiple of a frame .* nearest are 0\.1 s and 0\.2 s",
+        ),
+        (lambda: Link(latency=20.1), ConfigError, r"20\.1 s is longer than any scenario; .* give 0\.0201"),
+        (lambda: PoseNoise(heading_std=3.15), ConfigError, r"heading_std is 3\.15 radians, .*; .* give 0\.05498"),
+        (lambda: PoseNoise(mean=math.inf), ConfigError, "mean is inf; choose a finite number of at least 0"),
+    )
+    assert Link(latency=0.3).frame_sent("scenario", 4) == 1
+    with pytest.raises(ConfigError, match=r"of scenario from frame 003; the longest possible is 0\.2 s, .* 004 on"):
+        Link(latency=0.3).frame_sent("scenario", 3)
+
+
+def test_draws_are_made_of_the_keys_digest() -> None:
+    def numbers(key: str) -> list[float]:
+        digest = int.from_bytes(hashlib.sha256(key.encode()).digest(), "big")
+        return [((digest >> 64 * place + 12) % 2**52 + 0.5) / 2**52 for place in (3, 2, 1, 0)]
+
+    key, normal = "7/scenario/other_vehicle/4", NormalDist()
+    turn, distance, _, heading = numbers(f"{key}/pose")
+    off, angle = 0.5 + 0.1 * normal.inv_cdf(distance), 2 * math.pi * turn
+    expected = [off * math.cos(angle), off * math.sin(angle), 0.2 * normal.inv_cdf(heading)]
+    noise = PoseNoise(mean=0.5, std=0.1, heading_std=0.2)
+    assert_allclose(noise.draw(key), expected, rtol=1e-12)
+    place = np.array([3.0, -2.0, 1.0])
+    error = Link(pose_noise=noise, seed=7).pose_error("scenario", "other_vehicle", 4, place)
+    assert_allclose(error.apply(place[None])[0] - place, [*expected[:2], 0], atol=1e-12)
+    assert_allclose(error.to_six()[5], expected[2], rtol=1e-9)
+    share = numbers(f"{key}/loss")[0]
+    for loss, lost in ((share, False), (math.nextafter(share, 1), True)):
+        assert Link(packet_loss=loss, seed=7).loses("scenario", "other_vehicle", 4) == lost

@@ -9,7 +9,7 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.statistics import dataset_statistics
-from deepaccident_devkit.v2x.collisions import first_accident
+from deepaccident_devkit.v2x.collisions import default_scenario, first_accident, labelled_pair
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -56,6 +56,8 @@ def test_tracks_of_every_scenario_are_its_own(da: DeepAccident) -> None:
         tracks = scenario_tracks(da, scenario)
         rows = [track for track in da.track if track["scenario_token"] == scenario["token"]]
         assert len(tracks.index) == len(rows)
+        assert not tracks.boxes.num_lidar_pts.any()
+        assert not tracks.boxes.camera_visible.any()
         assert tracks.at(2).actor_id.tolist() == [
             da.get("instance", row["instance_token"])["actor_id"] for row in rows if row["frame_token"].endswith("/002")
         ]
@@ -253,3 +255,69 @@ def test_one_actor_is_no_pair(tmp_path: Path) -> None:
     made = dataset_statistics(da)
     assert made.collisions == ()
     assert made.histograms["collision_angles"].left_out.counts["total"] == 1
+
+
+@pytest.mark.usefixtures("origin")
+def test_long_boxes_beside_each_other_face_with_their_sides(tmp_path: Path) -> None:
+    """Their middles are farther apart along them than across, and so overlap there."""
+
+    def lines(frame: int) -> list[str]:
+        return [
+            f"car {19.0 + frame} 0.0 0.0 10.0 2.0 1.5 0.0 0 0 1223 9 True",
+            "car 26.0 3.0 0.0 10.0 2.0 1.5 0.0 0 0 1212 9 True",
+        ]
+
+    found = accident(tmp_path, lines).collision(tiny.TOKEN)
+    assert (found.sides, found.gap) == (("right", "left"), pytest.approx(1))
+    assert_allclose(found.point, [24, -1.5, 0], atol=0.02)
+    assert found.closing_speed == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.usefixtures("origin")
+@pytest.mark.parametrize(("gap", "closing"), [(0.03, 10 / np.sqrt(2)), (0.01, 0)])
+def test_corners_close_along_the_shortest_line_and_where_they_touch_along_a_sides_normal(
+    tmp_path: Path, gap: float, closing: float
+) -> None:
+    away = gap / np.sqrt(2)
+
+    def lines(frame: int) -> list[str]:
+        return [
+            f"car {17.0 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1223 9 True",
+            f"car {24.0 + away - 0.002} {2 + away} 0.8 4.0 2.0 1.5 0.0 0 0 1212 9 True",
+        ]
+
+    found = accident(tmp_path, lines).collision(tiny.TOKEN)
+    assert found.gap == pytest.approx(gap, abs=0.002)
+    assert found.closing_speed == pytest.approx(closing, abs=0.4)
+    assert_allclose(found.point, [22, -1, 0.4], atol=0.02)
+
+
+@pytest.mark.usefixtures("origin")
+def test_in_a_recording_of_one_frame_the_labels_velocities_count(tmp_path: Path) -> None:
+    rows = ["car 20 0 0 4 2 1.5 0 3.0 4.0 1223 9 True", "car 25 0 0 4 2 1.5 0 0 0 1212 9 True"]
+    tiny.write_tiny_release(tmp_path, frames=1, agents=("ego_vehicle",), lines_of=lambda *_: ["0 0", *rows])
+    found = DeepAccident(dataroot=tmp_path, verbose=False).collision(tiny.TOKEN)
+    assert found.speeds == (pytest.approx(5), 0)
+    assert found.closing_speed == pytest.approx(3)
+
+
+def test_a_pair_is_labelled_if_both_are_and_are_two() -> None:
+    pair = {"ids": [5, 7]}
+    assert labelled_pair(pair, np.array([7, 5, 5])) == (5, 7)
+    assert labelled_pair(pair, np.array([5, 6])) is None
+    assert labelled_pair({"ids": [5, 5]}, np.array([5])) is None
+    assert labelled_pair(None, np.array([0])) is None
+
+
+def test_the_scenario_to_begin_with(tmp_path: Path, da: DeepAccident) -> None:
+    """An accident whose pair labels show, else any accident, else the first scenario; none at all is an error."""
+    assert default_scenario(da) == first_accident(da)
+    later = tiny.NAME.replace("00024", "00025")
+    accident(tmp_path, lambda _: [])
+    assert first_accident(DeepAccident(dataroot=tmp_path, verbose=False)) == tiny.TOKEN
+    both = accident(tmp_path, side_by_side, name=later)
+    assert first_accident(both) == default_scenario(both) == f"{tiny.TYPE}/{later}"
+    silent = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path / "silent", meta=None), verbose=False)
+    assert default_scenario(silent) == tiny.TOKEN
+    with pytest.raises(NotAvailableError, match=f"its meta, or show another view of .* there, such as {tiny.TOKEN}$"):
+        first_accident(silent)
