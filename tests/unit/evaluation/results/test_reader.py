@@ -661,11 +661,14 @@ def test_the_longest_token_and_the_largest_form(tmp_path: Path) -> None:
     assert MotionForm(predictions=8, **form).predictions == 8  # of 2**20 cells
     with pytest.raises(ResultsError, match="form: 9 predictions of 8 frames of 1048576 cells are more than memory"):
         MotionForm(predictions=9, **form)
+    for name in ("predictions", "frames"):
+        with pytest.raises(ResultsError, match=f"{name}: expected a whole number from 1, found 0"):
+            MotionForm(**{"predictions": 1, **form, name: 0})
 
 
 @pytest.mark.parametrize(
     ("step", "good"),
-    [(0.1, True), (0.3, True), (10, True), (0.05, False), (0.1001, False), (0.0, False), (-0.5, False)],
+    [(0.1, True), (0.3, True), (10, True), (0.05, False), (0.1001, False), (0.19, False), (0.0, False), (-0.5, False)],
 )
 def test_steps_are_of_recorded_frames(step: float, *, good: bool) -> None:
     made: dict[str, Any] = {"stored": "heads", "grid": BevGrid(), "predictions": 1, "frames": 1, "step": step}

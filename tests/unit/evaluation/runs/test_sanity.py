@@ -182,6 +182,9 @@ PLANTED: dict[tuple[str, str], Change] = {
     ("boxes", "ego frame for LiDAR frame"): of_centers(
         lambda center, ego, lidar: lidar.apply(ego.inverse().apply(center))
     ),
+    ("boxes", "all 14 predictions looked at are empty"): lambda _, __, given: DetectedBoxes(
+        boxes=given.boxes.select(np.arange(0)), scores=given.scores[:0]
+    ),
     ("boxes", "one step late"): of_earlier,
     **{
         ("boxes", f"sizes in the order {', '.join(names)}"): of_boxes(
@@ -213,6 +216,15 @@ def test_right_predictions_raise_no_suspicion(
     assert report.warnings == ()
     assert report.to_text().endswith("\nNothing looks wrong with the predictions.")
     assert json.loads(json.dumps(report.as_dict(), allow_nan=False))["warnings"] == []
+
+
+def test_the_last_of_several_heads_counts(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
+    mirrored = of_segmentation(lambda logits: np.ascontiguousarray(1 / (1 + np.exp(5 - logits[..., ::-1]))))
+    predictions = {
+        token: replace(each, heads=(*mirrored(da_motion, token, each).heads, *each.heads))
+        for token, each in right["heads"].items()
+    }
+    assert sanity(da_motion, "heads", predictions).warnings == ()
 
 
 def shown(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[DeepAccident, str], MotionOutput]:
@@ -310,6 +322,8 @@ def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
     )
     assert warning.startswith("y mirrored: ")  # and nothing of time beside it
     assert "(30% of the truth" in warning
+    one_missed = np.array([[100.0, 0.0], [100.0, 1.0], [0.0, 0.0], [100.0, 1.0]])
+    assert list(_mistakes([_Seen(tallies={"x mirrored": one_missed})], "motion")) == []
 
 
 @pytest.mark.parametrize(("right", "every", "told"), [(4, 10, True), (5, 10, False), (0, 9, False)])
