@@ -206,6 +206,7 @@ def test_what_cannot_be_broken_down() -> None:
             "1 samples have no attributes, such as 099",
             lambda: breakdown(filled(), dict(list(MANY.items())[:-1]), "town"),
         ),
+        (EvaluationError, "100 samples have no attributes, such as 000", lambda: breakdown(filled(), {}, "town")),
         (ChoiceError, r"by: expected one of .*town, .* found 'moon'", lambda: breakdown(filled(), MANY, "moon")),
         (ConfigError, "resamples: expected a whole number from 0", lambda: Resampling(resamples=-1)),
         (ConfigError, "confidence: expected a share between 0 and 1", lambda: Resampling(confidence=95)),

@@ -108,6 +108,15 @@ class TestMotionOutput:
                 lambda: MotionOutput.from_arrays(segmentation, centerness, offset, flow, grid=None),  # type: ignore[arg-type]
             ),
             ("and not both", lambda: MotionOutput(grid=GRID)),
+            (
+                r"heads: expected maps of \(12, 16\) cells in orientation devkit, found \(6, 8\) in devkit",
+                lambda: MotionOutput(
+                    grid=GRID,
+                    heads=MotionOutput.from_arrays(
+                        *stacked(1, (6, 8)), grid=BevGrid((-4.0, 4.0, 1.0), (-3.0, 3.0, 1.0))
+                    ).heads,
+                ),
+            ),
             ("at least one prediction", lambda: instances_of(np.zeros((0, 5, *GRID.shape), dtype=int), GRID)),
         ):
             with pytest.raises(GeometryError, match=words):
