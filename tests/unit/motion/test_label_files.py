@@ -44,7 +44,7 @@ from deepaccident_devkit.motion import (
     write_label_files,
 )
 from deepaccident_devkit.motion.batch_names import BatchNames
-from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST, NOBODY, NOWHERE, StoredLabels
+from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST, NOBODY, NOWHERE, StoredLabels, write_array
 from deepaccident_devkit.taxonomy import AGENTS
 
 PAGE = Path(__file__).parents[3] / "schema" / "motion_labels.md"
@@ -853,11 +853,26 @@ def test_a_file_is_made_again_if_any_row_of_its_scenario_changed(tmp_path: Path,
         release = opened(root)
         assert write(release, out, [token], config) == LabelsWritten(samples=1, written=written, kept=1 - written)
         assert_same(LabelFiles(out)[token], motion_labels(release, token, config))
-    [path] = out.rglob("*.npz")
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.infolist():
-            assert (entry.external_attr >> 16, entry.date_time[:3]) == (0o644, (1980, 1, 1))
-            assert entry.compress_type == zipfile.ZIP_DEFLATED
     text = (out / MANIFEST).read_text()
     assert text.startswith('{\n "format": "DeepAccident motion labels",\n "version": 1,\n "config_digest": "')
     assert text.endswith(f'"samples": {{\n  "{tiny.TOKEN}/infrastructure": [ 1 ]\n }}\n}}\n')
+
+
+def test_members_are_for_all_to_read_and_have_no_date(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "one.npz", "w") as archive:
+        write_array(archive, "here", np.arange(3))
+        [entry] = archive.infolist()
+    assert (entry.filename, entry.external_attr >> 16) == ("here.npy", 0o644)
+    assert (entry.date_time, entry.compress_type) == ((1980, 1, 1, 0, 0, 0), zipfile.ZIP_DEFLATED)
+
+
+def test_a_file_depends_on_the_rows_of_its_own_scenario_alone(tmp_path: Path) -> None:
+    """Poses, LiDARs, agents and counts of its samples, and seven columns of its boxes."""
+    for number, frames in ((24, 1), (25, 2)):
+        tiny.write_tiny_release(
+            tmp_path, frames=frames, name=tiny.NAME.replace("24", str(number)), agents=("infrastructure",)
+        )
+    release = opened(tmp_path)
+    for scenario, frames in zip(release.scenario, (1, 2), strict=True):
+        lengths = [len(array) for array in label_files._scenario_arrays(release, scenario["token"])]
+        assert lengths == [frames] * 4 + [2 * frames] * 7
