@@ -214,8 +214,11 @@ def _braked(plans: BrakingPlans, times: FloatArray, arcs: FloatArray) -> tuple[B
 
 
 def _places(motion: Motion, arcs: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Stretches, and the shares of them, at which the path first has some lengths."""
-    numbers = np.maximum(np.searchsorted(motion.arcs, arcs, side="left") - 1, 0)
+    """Stretches, and the shares of them, at which the path last has some lengths, shorter than the whole.
+
+    So an actor that stands when it begins to brake keeps the heading that it has when it would drive on.
+    """
+    numbers = np.searchsorted(motion.arcs, arcs, side="right") - 1
     lengths = motion.lengths[numbers]
     shares = np.divide(arcs - motion.arcs[numbers], lengths, out=np.zeros_like(arcs), where=lengths > 0)
     return numbers, shares

@@ -65,11 +65,11 @@ def test_a_recording_that_brakes_harder_stays() -> None:
     assert braked.arcs[15] < recorded.arcs[15]
 
 
-def test_where_it_stood_the_earliest_pose_of_that_length_counts() -> None:
+def test_who_stands_when_braking_begins_keeps_the_heading_from_which_the_recording_drives_on() -> None:
     path = np.column_stack([[0, 1, 1, 1, 2, 3], np.zeros(6), [0, 0, 0.1, 0.2, 0.2, 0.2]])
     motion = motion_of(path)
-    standing = at(motion, np.array([0.35, 0.6]), start=0.15)  # 0 m/s there: it never leaves
-    np.testing.assert_allclose(standing.poses, [[1, 0, 0], [1, 0, 0]], atol=1e-12)
+    standing = at(motion, np.array([0.25, 0.35, 0.6]), start=0.15)  # 0 m/s there: it never leaves
+    np.testing.assert_allclose(standing.poses, [[1, 0, 0.15], [1, 0, 0.2], [1, 0, 0.2]], atol=1e-12)
     np.testing.assert_allclose(standing.speeds, 0)
 
 
@@ -93,6 +93,7 @@ def test_nobody_is_sped_up(path: np.ndarray, start: float, deceleration: float) 
     recorded, braked = at(motion, times), at(motion, times, start, deceleration)
     assert (braked.arcs <= recorded.arcs + 1e-9).all()
     assert (np.diff(braked.arcs) >= -1e-9).all()
+    assert (np.diff(braked.turned) >= -1e-9).all()
     before = times <= start
     np.testing.assert_array_equal(braked.poses[before], recorded.poses[before])
     speed = braking_plans(motion, [start], [deceleration]).speeds[0]
