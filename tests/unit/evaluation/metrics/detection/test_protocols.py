@@ -123,7 +123,7 @@ def test_protocols_and_switches_that_cannot_be() -> None:
 
 @pytest.mark.parametrize("name", DETECTION_PROTOCOLS)
 def test_every_choice_of_the_published_procedures(name: str) -> None:
-    assert asdict(DETECTION_PROTOCOLS[name]) == PLAIN | CHOSEN[name]
+    assert asdict(detection_protocol(name)) == PLAIN | CHOSEN[name]
 
 
 def test_the_edges_of_what_can_be() -> None:
