@@ -7,7 +7,7 @@ import io
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +80,12 @@ def write_csv(path: str | os.PathLike[str], rows: Iterable[Row]) -> Path:
     csv.writer(text, lineterminator="\n").writerows(rows)
     write_bytes(target, text.getvalue().encode())
     return target
+
+
+def record_rows(kind: type[Any], records: Iterable[object]) -> list[Row]:
+    """A row for each record of a dataclass, below the names of its fields."""
+    names = tuple(each.name for each in fields(kind))
+    return [names, *([getattr(each, name) for name in names] for each in records)]
 
 
 def table_html(rows: Sequence[Sequence[str]], caption: str = "") -> str:

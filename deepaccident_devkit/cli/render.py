@@ -305,8 +305,9 @@ def _verb(name: str, picture: _Picture) -> click.Command:
             tokens = read_results(choices["results"]).tokens[:1]
         dataset = DeepAccident(**release)
         rows = rows_to_draw(dataset, picture.of, tokens, frames)
-        for word in styles:
-            choices |= {"style": word} if word in picture.styles else {}  # the last one, as of places
+        looks = [word for word in styles if word in picture.styles]
+        if looks:
+            choices["style"] = looks[-1]
         places = [cast(StyleName, word) for word in styles if word not in picture.styles]
         with style(places[-1]) if places else nullcontext():
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):

@@ -28,7 +28,7 @@ from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.evaluation.runs.verification import differing
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.reading import shortened
-from deepaccident_devkit.reports import Report, Row
+from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.text import columns_text
 
 Family = Literal["main", "headlines", "other"]
@@ -71,9 +71,6 @@ class ComparedNumber(ShortRepr):
     real: bool
     better: str | None
     decision: str
-
-
-_COLUMNS: Final = tuple(ComparedNumber.__dataclass_fields__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,7 +149,7 @@ class Comparison(Report):
 
     def named_tables(self) -> dict[str, list[Row]]:
         """A line a number."""
-        return {"numbers": [_COLUMNS, *([getattr(each, name) for name in _COLUMNS] for each in self.numbers)]}
+        return {"numbers": record_rows(ComparedNumber, self.numbers)}
 
 
 def _text_row(each: ComparedNumber) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ from deepaccident_devkit.evaluation.runs.prevention import with_prevented
 from deepaccident_devkit.evaluation.runs.rows import sample_rows
 from deepaccident_devkit.files import path_of
 from deepaccident_devkit.reading import shortened
-from deepaccident_devkit.reports import Report, Row
+from deepaccident_devkit.reports import Report, Row, record_rows
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -97,7 +97,6 @@ def _short(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
-_COLUMNS: Final = tuple(Difference.__dataclass_fields__)
 _SHOWN: Final = 20
 """Differences that the text lists."""
 _NOT_COMPARED: Final = ("environment", "sanity", "release/dataroot", "results/path")
@@ -146,7 +145,7 @@ class Verification(Report):
 
     def named_tables(self) -> dict[str, list[Row]]:
         """A line a difference."""
-        return {"differences": [_COLUMNS, *([getattr(each, name) for name in _COLUMNS] for each in self.differences)]}
+        return {"differences": record_rows(Difference, self.differences)}
 
 
 def verify_bundle(

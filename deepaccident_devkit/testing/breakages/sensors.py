@@ -1,9 +1,11 @@
 """Files of sensors that cannot be read, are missing, or show something else than the labels."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
 from deepaccident_devkit.release import read_image, write_image
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
@@ -17,6 +19,13 @@ CAMERA = "Camera_Front"
 
 def _half(content: bytes) -> bytes:
     return content[: len(content) // 2]
+
+
+def _rewritten(victim: Victim, channel: str, change: Callable[[AnyArray], AnyArray]) -> Path:
+    """The file of the victim's array, which is another one now."""
+    array = victim.editor.array(victim.agent, channel, victim.frame)
+    victim.editor.write_array(victim.agent, channel, victim.frame, change(array))
+    return victim.file(channel)
 
 
 @FORM.enter("sensor-unreadable", channel=CAMERA)
@@ -57,25 +66,19 @@ def lidar_cut(victim: Victim) -> Path:
 @FORM.enter("sensor-unreadable", channel=LIDAR)
 def lidar_three_columns(victim: Victim) -> Path:
     """A point cloud lacks the intensity."""
-    points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points[:, :3])
-    return victim.file(LIDAR)
+    return _rewritten(victim, LIDAR, lambda points: points[:, :3])
 
 
 @FORM.enter("sensor-unreadable", channel=LIDAR)
 def lidar_objects(victim: Victim) -> Path:
     """A point cloud is an array of Python objects, which only a pickle can load."""
-    points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points.astype(object))
-    return victim.file(LIDAR)
+    return _rewritten(victim, LIDAR, lambda points: points.astype(object))
 
 
 @MEANING.enter("points-differ", channel=LIDAR)
 def lidar_right_handed(victim: Victim) -> Path:
     """A point cloud has the other handedness."""
-    points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points * np.array([1, -1, 1, 1], dtype=np.float32))
-    return victim.file(LIDAR)
+    return _rewritten(victim, LIDAR, lambda points: points * np.array([1, -1, 1, 1], dtype=np.float32))
 
 
 @FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
@@ -87,9 +90,7 @@ def bev_cut(victim: Victim) -> Path:
 @FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
 def bev_half_size(victim: Victim) -> Path:
     """A BEV array has 600 rows and columns."""
-    picture = victim.editor.array(victim.agent, BEV_CAMERA, victim.frame)
-    victim.editor.write_array(victim.agent, BEV_CAMERA, victim.frame, picture[::2, ::2])
-    return victim.file(BEV_CAMERA)
+    return _rewritten(victim, BEV_CAMERA, lambda picture: picture[::2, ::2])
 
 
 @MEANING.enter("bev-orientation", channel=BEV_CAMERA)
