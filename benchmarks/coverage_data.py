@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray
 
 SIZES = ("20 samples", "5 to 20", "0 to 5")
 CORRELATIONS = (0.1, 0.5, 0.9)

@@ -4,8 +4,8 @@ import numpy as np
 
 from benchmarks.labels import make_frames, make_motion
 from benchmarks.measure import Figure, best_of, one_core
-from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS, AccidentContext, AccidentProtocol
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.accident import PROTOCOLS, AccidentContext, AccidentProtocol
+from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.motion.drawing.from_boxes import motion_labels_from_boxes
 

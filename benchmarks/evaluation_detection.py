@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.measure import Figure, best_of, one_core
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes, DetectionEvaluator
+from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator
 from deepaccident_devkit.geometry import Boxes
 
 FRAMES, OBJECTS, REPEATS = 100, 30, 5

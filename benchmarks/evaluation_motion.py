@@ -4,8 +4,8 @@ import numpy as np
 
 from benchmarks.labels_postprocess import FRAMES, clear_heads
 from benchmarks.measure import Figure, best_of, one_core
-from deepaccident_devkit.evaluation.metrics.motion import motion_counts
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
+from deepaccident_devkit.evaluation.motion import motion_counts
+from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels, predict_instances
 
 PREDICTIONS = 6

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import Figure, best_of, one_core
-from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release import find_release, read_image
 from deepaccident_devkit.release.store import ReleasePath, StorePath, index_places, open_dataroot
 from deepaccident_devkit.release.store.members import Listing, write_members
 from deepaccident_devkit.release.store.opening import list_name, state_of
 from deepaccident_devkit.release.store.store import opened_store
+from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.tables.scan import folder_digest
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT
 

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit import nuscenes_names
-from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.se3 import stored_transforms, trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
 from deepaccident_devkit.release.store import ReleasePath, StorePath
+from deepaccident_devkit.support import nuscenes_names
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
+from deepaccident_devkit.support.text import choice, spelled
 from deepaccident_devkit.tables import OpenTables, RowArgument, displacement_velocities, visible_ids, visible_mask
 from deepaccident_devkit.tables.opened import token_of
 from deepaccident_devkit.tables.store import damaged_value
@@ -30,7 +31,6 @@ from deepaccident_devkit.taxonomy import (
     UNTRACKED_ID,
     Frame,
 )
-from deepaccident_devkit.text import choice, spelled
 
 __all__ = ["VISIBLE", "Dataset", "RowArgument", "VelocitySource", "Visible"]
 

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit import maps, overview, selection, v2x
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import path_of
+from deepaccident_devkit.errors import IndexStoreError, escaped
 from deepaccident_devkit.interactions import interactions as interactions_of_scenario
-from deepaccident_devkit.reading import escaped
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
+from deepaccident_devkit.support.files import path_of
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 

@@ -8,11 +8,31 @@ What strangers wrote stands in these sentences too. So a sentence has a most len
 terminal's cursor, rings or turns the direction of letters.
 """
 
+import re
 from typing import ClassVar, Final
 
-from deepaccident_devkit.reading import escaped, shortened
-
 MOST_SAID: Final = 2000  # characters
+MOST_QUOTED: Final = 100
+"""Characters of a stranger's text in a message."""
+MOST_TOLD: Final = 300
+"""Characters of what a library or the gate says of a fault: numbers, a remedy, perhaps a stranger's text."""
+# control characters except new line and tab, marks that turn the direction of letters, and halves of characters
+_UNSEEN: Final = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
+)
+
+
+def shortened(text: str, most: int = MOST_QUOTED) -> str:
+    """A stranger's text for a message: with a long middle left out."""
+    if len(text) <= most:
+        return text
+    half = (most - 3) // 2
+    return f"{text[:half]} … {text[-half:]}"
+
+
+def escaped(text: str) -> str:
+    r"""A stranger's text for a terminal: what cannot be seen there stands as in JSON, such as `\u001b`."""
+    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 class DeepAccidentError(Exception):

@@ -12,6 +12,7 @@ from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.reports import Report
+from deepaccident_devkit.support.text import columns_text, natural_order
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CHANNEL_FORMAT,
@@ -21,7 +22,6 @@ from deepaccident_devkit.taxonomy import (
     SCENARIO_ATTRIBUTES,
     SPLITS,
 )
-from deepaccident_devkit.text import columns_text, natural_order
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import AgentRecord, ScenarioRecord

@@ -11,10 +11,10 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.files import path_of, writable_folder, write_bytes
-from deepaccident_devkit.pages import rendered
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import path_of, writable_folder, write_bytes
+from deepaccident_devkit.support.pages import rendered
+from deepaccident_devkit.support.text import columns_text
 
 Row = Sequence[object]
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, TokenError
-from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.release import write_split_file
 from deepaccident_devkit.reports import Report
+from deepaccident_devkit.support.files import path_of, replacing
+from deepaccident_devkit.support.text import columns_text, natural_order, share_text
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SCENARIO_ATTRIBUTES, SPLITS, VEHICLE_AGENTS
-from deepaccident_devkit.text import columns_text, natural_order, share_text
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord

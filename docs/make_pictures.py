@@ -16,7 +16,7 @@ from selenium import webdriver
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.demo import SCENARIO
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 PAGE = Path(__file__).parent / "gallery.md"

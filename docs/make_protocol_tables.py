@@ -10,7 +10,7 @@ import numpy as np
 from make_accident_tables import RELEASE, TESTS, put
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.metrics.detection import (
+from deepaccident_devkit.evaluation.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
     DetectionEvaluator,
@@ -18,10 +18,10 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     DetectionResult,
     detection_truth,
 )
-from deepaccident_devkit.evaluation.metrics.detection.evaluator import detection_result
-from deepaccident_devkit.evaluation.metrics.detection.frame_counts import frame_counts
-from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
+from deepaccident_devkit.evaluation.detection.evaluator import detection_result
+from deepaccident_devkit.evaluation.detection.frame_counts import frame_counts
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionHeads, MotionLabels
 from deepaccident_devkit.synth import make_release

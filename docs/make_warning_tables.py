@@ -18,9 +18,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import outlook
 from deepaccident_devkit.baselines.collisions import accidents_ahead
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, WarningEvaluator
-from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, accident_context
-from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN
+from deepaccident_devkit.evaluation.accident import AccidentContext, accident_context
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
+from deepaccident_devkit.evaluation.warning.recordings import GIVEN
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 RELEASE = SynthConfig(scenarios=60, seed=7, sensors=False)

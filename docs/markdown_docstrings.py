@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _CODE_SPAN = re.compile(r"(?<![`\\])`([^`]+)`(?!`)")
 _ARRAY = re.compile(r"~?(numpy\.)?ndarray\[tuple\[[^\]]*\], ~?(numpy\.)?dtype\[~?(numpy\.|typing\.)*(?P<dtype>\w+)\]\]")
 _ARRAY_NAMES = {"float64": "FloatArray", "int64": "IntArray", "bool": "BoolArray", "uint8": "ByteArray"}
-"""As `deepaccident_devkit.arrays` calls them."""
+"""As `deepaccident_devkit.support.arrays` calls them."""
 _WITHOUT_TYPE = ("attribute", "data", "property")
 """What napoleon takes `type: text` off, if there is a colon in the first line."""
 _SECTIONS = ("Args:", "Attributes:", "Examples:", "Raises:", "Returns:", "Yields:")

@@ -44,7 +44,6 @@ from model_study_rows import (
 
 from deepaccident_devkit import __version__
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.model.checkpoint import FINAL, read_weights, write_weights
 from deepaccident_devkit.model.checkpoint import SHIPPED as SHIPPED_WEIGHTS
 from deepaccident_devkit.model.presets import ModelChoice, load_model
@@ -55,6 +54,7 @@ from deepaccident_devkit.model.training.state import read_log
 from deepaccident_devkit.model.training.train import train
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.split_files import write_split_file
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 HERE: Final = Path(__file__).parent

@@ -9,18 +9,13 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.evaluation import DetectedBoxes, Evaluator, MotionOutput, Resampling
-from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
-from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio, total
-from deepaccident_devkit.evaluation.metrics.intervals import (
-    LEAST_CLUSTERS,
-    Clusters,
-    difference_intervals,
-    intervals_of,
-)
-from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
+from deepaccident_devkit.evaluation.evaluator import Counts, ratio, total
+from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS, Clusters, difference_intervals, intervals_of
+from deepaccident_devkit.evaluation.numbers import numbers_of
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.seen import seen_actors
 

@@ -16,16 +16,16 @@ from model_study_numbers import Evaluators, HiddenActors, scene_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.export.torch import V2XDataset, collate
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.model.checkpoint import load_weights, read_weights
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.presets import ModelChoice, tiny
 from deepaccident_devkit.model.results import PredictConfig, prediction_of
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Link
 

@@ -8,7 +8,6 @@ from statistics import mean
 import numpy as np
 import yaml
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.release import (
     Labels,
     ScenarioFolder,
@@ -20,6 +19,7 @@ from deepaccident_devkit.release import (
     read_lidar,
     read_meta,
 )
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob, forget_scenario, record_scenario

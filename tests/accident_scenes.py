@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.motion import (
     FrameBoxes,
     MotionHeads,

@@ -8,7 +8,7 @@ from typing import Any
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import instances_of
-from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, total
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, total
 
 BROKEN = -1.0
 

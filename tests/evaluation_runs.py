@@ -10,9 +10,9 @@ import numpy as np
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import DetectedBoxes, Resampling, breakdown, detection_truth, instances_of
-from deepaccident_devkit.evaluation.metrics.accident import BoxTruth, accident_context
-from deepaccident_devkit.evaluation.metrics.breakdowns import sample_attributes
-from deepaccident_devkit.evaluation.metrics.predictions import Accident
+from deepaccident_devkit.evaluation.accident import BoxTruth, accident_context
+from deepaccident_devkit.evaluation.breakdowns import sample_attributes
+from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.results import Results, ResultsTask, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,

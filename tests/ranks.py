@@ -14,8 +14,8 @@ from torch.utils.data import DataLoader, DistributedSampler
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, detection_truth
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.export.torch import (
     RandomAugmentation,
     V2XConfig,

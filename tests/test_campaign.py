@@ -13,7 +13,7 @@ from campaign.pool import drawn, run
 from campaign.stops import VERBS, Stop, run_stops
 from campaign.worker import Case
 
-from deepaccident_devkit.reading import LIMITS
+from deepaccident_devkit.support.reading import LIMITS
 
 TOP = Path(__file__).parents[1]
 PAGE = TOP / "docs" / "reliability.md"

@@ -17,7 +17,7 @@ from processes import catches, is_running, wait_for, workers_of, works
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.files import temporary_of
+from deepaccident_devkit.support.files import temporary_of
 
 LINE = "interrupted; no file is half-written, and the same command can be run again"
 KILLED = "error: a worker process was killed ("

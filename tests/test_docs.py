@@ -17,16 +17,13 @@ from scripts import loaded_script
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
-from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, DetectionProtocol
-from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, MotionProtocol
-from deepaccident_devkit.evaluation.metrics.warning import (
-    WARNING_PROTOCOLS,
-    CleanWarnings,
-)
+from deepaccident_devkit.evaluation.accident import PROTOCOLS
+from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
+from deepaccident_devkit.evaluation.alarms.reading import AccidentReading
+from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectionProtocol
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionProtocol
+from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, CleanWarnings
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
 from deepaccident_devkit.synth import SynthConfig, make_release

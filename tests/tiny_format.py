@@ -12,7 +12,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.bulk import Format, Output, Unit, export_release
 from deepaccident_devkit.export.sensor_files import sensor_files
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.tables.tokens import frame_token
 
 CAMERA = "Camera_Front"

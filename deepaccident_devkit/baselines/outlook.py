@@ -11,11 +11,11 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, FrozenArrays
 from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, Link
 from deepaccident_devkit.v2x.seen import SeenActors, seen_actors
 

@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.baselines.collisions import DANGER_DISTANCE, accidents_ahead
 from deepaccident_devkit.baselines.outlook import MotionModel, outlook
 from deepaccident_devkit.dataset import Dataset, RowArgument
@@ -19,6 +18,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, motion_labels_from_boxes
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import Agents, Link, future_egomotion
 from deepaccident_devkit.v2x.seen import SeenActors, seen_actors

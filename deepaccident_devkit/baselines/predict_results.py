@@ -19,12 +19,12 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, read_results
-from deepaccident_devkit.files import path_of
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
+from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.text import choice, settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import choice, settle_choices
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link, cooperating_agents
 
 if TYPE_CHECKING:

@@ -70,7 +70,7 @@ def _versions() -> str:
     """What a report of a bug needs: the versions of the devkit, Python, the system and each library of any extra."""
     from importlib.metadata import PackageNotFoundError, requires, version  # here: it takes longer than all the rest
 
-    from deepaccident_devkit.text import columns_text
+    from deepaccident_devkit.support.text import columns_text
 
     def installed(name: str) -> str:
         try:

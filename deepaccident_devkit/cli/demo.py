@@ -21,20 +21,20 @@ from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
-from deepaccident_devkit.evaluation.metrics.numbers import headlines
+from deepaccident_devkit.evaluation.numbers import headlines
 from deepaccident_devkit.evaluation.results import ResultsTask, read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import place_in, remove_leftovers, write_bytes
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
-from deepaccident_devkit.pages import document
 from deepaccident_devkit.render import detached_figure, render_replay
 from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
 from deepaccident_devkit.render.pictures import save_picture
+from deepaccident_devkit.support.files import place_in, remove_leftovers, write_bytes
+from deepaccident_devkit.support.pages import document
+from deepaccident_devkit.support.text import columns_text
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import columns_text
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import FrameRecord, ScenarioRecord

@@ -30,9 +30,8 @@ from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.metrics.breakdowns import ATTRIBUTES, EVERYTHING, attribute_name
-from deepaccident_devkit.evaluation.metrics.intervals import MOST_RESAMPLES
-from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings, FieldWarnings
+from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, EVERYTHING, attribute_name
+from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -54,6 +53,7 @@ from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
+from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
 from deepaccident_devkit.taxonomy import AGENTS

@@ -17,15 +17,15 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.metrics.intervals import MOST_RESAMPLES
+from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
 from deepaccident_devkit.evaluation.runs import compare_bundles, read_bundle, verify_bundle
 from deepaccident_devkit.evaluation.runs.verification import check_repeated
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.render.evaluation import render_comparison
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, save_picture
 from deepaccident_devkit.reports import write_csv
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.tables import place_outside
 from deepaccident_devkit.taxonomy import OnError
 

@@ -27,8 +27,8 @@ from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ExportError, NotAvailableError
 from deepaccident_devkit.motion import PRESETS
+from deepaccident_devkit.support.text import choice, size_text
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
-from deepaccident_devkit.text import choice, size_text
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 if TYPE_CHECKING:
@@ -311,8 +311,8 @@ def _town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) 
     The maps are made from what the BEV cameras of all recordings saw. Coordinates are metres of the simulator's world,
     right-handed: no longitude and latitude.
     """
-    from deepaccident_devkit.files import writable_folder
     from deepaccident_devkit.maps import town_map, towns_of
+    from deepaccident_devkit.support.files import writable_folder
 
     folder, dataset = writable_folder(out), DeepAccident(**release)
     chosen = dataset.find(*where) if where else None

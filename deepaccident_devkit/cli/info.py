@@ -82,9 +82,9 @@ def info(
 
 
 def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:
-    from deepaccident_devkit.files import writable_folder
     from deepaccident_devkit.render.statistics import save_statistics  # it imports matplotlib
     from deepaccident_devkit.statistics import dataset_statistics
+    from deepaccident_devkit.support.files import writable_folder
 
     folder = None if out is None else writable_folder(out)
     found = dataset_statistics(dataset, chosen, **how)

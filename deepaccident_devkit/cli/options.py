@@ -11,11 +11,11 @@ import click
 from click.core import ParameterSource
 
 from deepaccident_devkit.cli.verbs import Function, WordChoice, advanced, field_option, together
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.parallel import cluster_executor
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
-from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE, Link
 
 _ALL = ("all", AVAILABLE)

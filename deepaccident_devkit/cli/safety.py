@@ -18,7 +18,6 @@ from deepaccident_devkit.cli.options import (
 )
 from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.safety import render_lead_times, save_safety_report
@@ -33,6 +32,7 @@ from deepaccident_devkit.safety import (
     twin_report,
 )
 from deepaccident_devkit.safety.avoidability import GROUPS
+from deepaccident_devkit.support.files import writable_folder, write_bytes
 
 _DPI: Final = 150
 Scenarios = Sequence[Any] | None

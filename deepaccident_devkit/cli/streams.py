@@ -12,7 +12,7 @@ from typing import Any, Final, TextIO, cast
 
 import click
 
-from deepaccident_devkit.reading import escaped
+from deepaccident_devkit.errors import escaped
 
 # how a text of a progress bar begins: at the start of the line, or it only moves up to another bar's line
 _OF_BARS: Final = re.compile(r"\r|\n*(?:\x1b\[A)+\Z")

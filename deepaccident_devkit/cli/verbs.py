@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, g
 
 import click
 
-from deepaccident_devkit.text import meant_text
+from deepaccident_devkit.support.text import meant_text
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 if TYPE_CHECKING:

@@ -1,13 +1,13 @@
 """The official metrics, and those that the paper describes: motion, accidents, detection, warnings.
 
-Three rooms: `metrics` counts arrays and sums the counts, a package a task; `results` are predictions in files; `runs`
-evaluates them into bundles that others can check, and looks for mistakes in predictions (`runs.sanity`). `breakdown`
-sums by attribute; `metrics.warning` says how early accidents are warned of.
+Each task has a package, which counts arrays and sums the counts; `results` are predictions in files; `runs` evaluates
+them into bundles that others can check, and looks for mistakes in predictions (`runs.sanity`). `breakdown` sums by
+attribute.
 """
 
 from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit.evaluation.metrics.accident import (
+from deepaccident_devkit.evaluation.accident import (
     AccidentContext,
     AccidentEvaluator,
     AccidentResult,
@@ -18,27 +18,22 @@ from deepaccident_devkit.evaluation.metrics.accident import (
     box_truth,
     foreseen_accident,
 )
-from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, SampleAttributes, breakdown, sample_attributes
-from deepaccident_devkit.evaluation.metrics.detection import (
-    DetectedBoxes,
-    DetectionEvaluator,
-    DetectionResult,
-    detection_truth,
-)
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
-from deepaccident_devkit.evaluation.metrics.intervals import Resampling
-from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult, motion_counts
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_counts
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
-from deepaccident_devkit.evaluation.metrics.trajectories import match_trajectories
-from deepaccident_devkit.evaluation.metrics.warning import (
+from deepaccident_devkit.evaluation.breakdowns import Breakdown, SampleAttributes, breakdown, sample_attributes
+from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator, DetectionResult, detection_truth
+from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.intervals import Resampling
+from deepaccident_devkit.evaluation.motion import MotionEvaluator, MotionResult, motion_counts
+from deepaccident_devkit.evaluation.motion.overlaps import vpq_counts
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, instances_of
+from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
+from deepaccident_devkit.evaluation.trajectories import match_trajectories
+from deepaccident_devkit.evaluation.warning import (
     AnticipationResult,
     CleanWarnings,
     FieldResult,
     FieldWarnings,
     WarningEvaluator,
 )
-from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 
 if TYPE_CHECKING:
     from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples

@@ -11,12 +11,12 @@ from urllib.parse import urlencode
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, IntArray
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.explore.scenarios import Facet, Scenarios
 from deepaccident_devkit.selection import parse_where
 from deepaccident_devkit.selection.conditions import condition_of
 from deepaccident_devkit.selection.fields import FIELDS, field_of
+from deepaccident_devkit.support.arrays import BoolArray, IntArray
 
 if TYPE_CHECKING:
     from deepaccident_devkit.explore.background import Job

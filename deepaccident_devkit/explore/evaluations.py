@@ -11,16 +11,16 @@ from typing import Any, Final
 import msgspec
 
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentsWithin
-from deepaccident_devkit.evaluation.metrics.breakdowns import ATTRIBUTES, EVERYTHING
-from deepaccident_devkit.evaluation.metrics.numbers import LIMITS, value_text
+from deepaccident_devkit.evaluation.accident.scoring import AccidentsWithin
+from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, EVERYTHING
+from deepaccident_devkit.evaluation.numbers import LIMITS, value_text
 from deepaccident_devkit.evaluation.runs import Bundle
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE, Line
 from deepaccident_devkit.explore.scenarios import UNKNOWN
-from deepaccident_devkit.json_text import as_record
-from deepaccident_devkit.pages import scalar
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
 from deepaccident_devkit.render.outcomes.above import count_words
+from deepaccident_devkit.support.json_text import as_record
+from deepaccident_devkit.support.pages import scalar
 
 _METHOD: Final = ("method", "name", "authors", "url", "date")
 """What results say of themselves, and is shown if they do."""

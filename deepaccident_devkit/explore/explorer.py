@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import as_floats
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.explore.background import Jobs
@@ -27,6 +26,7 @@ from deepaccident_devkit.render.pictures import figure_png
 from deepaccident_devkit.render.replay import recording_of, served_replay
 from deepaccident_devkit.render.replay.recording import Recording
 from deepaccident_devkit.render.roles import actor_color, recorders_of
+from deepaccident_devkit.support.arrays import as_floats
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks

@@ -11,9 +11,9 @@ from typing import Final, Generic, TypeVar
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import is_writable_folder, place_in
 from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release.store.cache import FileCache
+from deepaccident_devkit.support.files import is_writable_folder, place_in
 
 Value = TypeVar("Value")
 _THUMBNAILS: Final = "thumbnails"

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.numbers import headlines, value_text
+from deepaccident_devkit.evaluation.numbers import headlines, value_text
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
@@ -22,6 +21,7 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
 from deepaccident_devkit.explore.background import Job, Jobs
 from deepaccident_devkit.explore.evaluations import finite
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
+from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
     from deepaccident_devkit.explore.scenarios import Scenarios

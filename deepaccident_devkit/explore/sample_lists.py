@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 from urllib.parse import urlencode
 
 from deepaccident_devkit.errors import TokenError
-from deepaccident_devkit.evaluation.metrics.breakdowns import SampleAttributes, attribute_name, sample_attributes
+from deepaccident_devkit.evaluation.breakdowns import SampleAttributes, attribute_name, sample_attributes
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.choices import MOST_WORD
 from deepaccident_devkit.explore.models import standings_job
 from deepaccident_devkit.explore.scenarios import UNKNOWN
-from deepaccident_devkit.text import natural_order
+from deepaccident_devkit.support.text import natural_order
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset

@@ -24,7 +24,14 @@ from deepaccident_devkit.explore.pages.answers import assets
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_context
 from deepaccident_devkit.explore.pages.scenarios import SLOW, cell, entry
 from deepaccident_devkit.explore.scenarios import accident_columns
-from deepaccident_devkit.files import (
+from deepaccident_devkit.interactions import interactions
+from deepaccident_devkit.parallel import Engine, Places, run_batch
+from deepaccident_devkit.render.replay import recording_of, tried_replay
+from deepaccident_devkit.render.replay.replay import facts
+from deepaccident_devkit.safety import twin_of
+from deepaccident_devkit.selection import find
+from deepaccident_devkit.selection.fields import measures_of_moving_pairs
+from deepaccident_devkit.support.files import (
     path_of,
     plain_names,
     replacing_folder,
@@ -32,15 +39,8 @@ from deepaccident_devkit.files import (
     writable_folder,
     write_bytes,
 )
-from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.pages import rendered
-from deepaccident_devkit.parallel import Engine, Places, run_batch
-from deepaccident_devkit.reading import read_bytes
-from deepaccident_devkit.render.replay import recording_of, tried_replay
-from deepaccident_devkit.render.replay.replay import facts
-from deepaccident_devkit.safety import twin_of
-from deepaccident_devkit.selection import find
-from deepaccident_devkit.selection.fields import measures_of_moving_pairs
+from deepaccident_devkit.support.pages import rendered
+from deepaccident_devkit.support.reading import read_bytes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -19,15 +19,22 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.errors import ConfigError, ExportError, MissingFileError, NotAvailableError, ReleaseError
+from deepaccident_devkit.errors import (
+    ConfigError,
+    ExportError,
+    MissingFileError,
+    NotAvailableError,
+    ReleaseError,
+    shortened,
+)
 from deepaccident_devkit.export.format import Format, Link, Output, Tally, Unit, flat_name
-from deepaccident_devkit.files import path_of, place_in, remove_in, remove_leftovers, temporary_of, write_bytes
-from deepaccident_devkit.json_text import parsed_record
 from deepaccident_devkit.parallel import Engine, Failure, Places, Store, Tried, check_failures, run_batch
-from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders, sensor_digest
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
+from deepaccident_devkit.support.files import path_of, place_in, remove_in, remove_leftovers, temporary_of, write_bytes
+from deepaccident_devkit.support.json_text import parsed_record
+from deepaccident_devkit.support.reading import fault_text, read_bytes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

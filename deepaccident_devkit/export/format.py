@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ChoiceError, SensorFileError
-from deepaccident_devkit.files import place_in, remove_in, replacing, replacing_folder
-from deepaccident_devkit.reading import fault_text, open_file, read_bytes
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.selection import parse_where
+from deepaccident_devkit.support.files import place_in, remove_in, replacing, replacing_folder
+from deepaccident_devkit.support.reading import fault_text, open_file, read_bytes
+from deepaccident_devkit.support.text import choice, settle_choices
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, MINI_SPLITS, SPLITS
-from deepaccident_devkit.text import choice, settle_choices
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset

@@ -21,20 +21,20 @@ from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 import msgspec
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, ExportError, MissingFileError, SensorFileError
 from deepaccident_devkit.export.bulk import Format, Manifest, Output, Unit, flat_name
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.sensor_files import sensor_files
-from deepaccident_devkit.files import path_of
-from deepaccident_devkit.json_text import as_record
-from deepaccident_devkit.reading import check_size, fault_text, open_file
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image, encode_jpeg
+from deepaccident_devkit.support.arrays import ByteArray, FloatArray, IntArray
+from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.json_text import as_record
+from deepaccident_devkit.support.reading import check_size, fault_text, open_file
+from deepaccident_devkit.support.text import settle_choices, size_text
 from deepaccident_devkit.tables.tokens import sample_data_token, sample_token
 from deepaccident_devkit.taxonomy import AgentName
-from deepaccident_devkit.text import settle_choices, size_text
 from deepaccident_devkit.v2x.configurations import agents_of
 
 __all__ = ["CachedImages", "Codec", "ImageCache"]

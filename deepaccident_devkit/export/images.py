@@ -11,12 +11,12 @@ from typing import Final, Literal, SupportsIndex, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import PinholeCamera
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, checked
+from deepaccident_devkit.support.text import choice, settle_choices
 from deepaccident_devkit.taxonomy import CAMERAS
-from deepaccident_devkit.text import choice, settle_choices
 
 ImageDtype = Literal["float32", "uint8"]
 Decoding = Literal["full", "scaled"]

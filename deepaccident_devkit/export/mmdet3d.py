@@ -29,10 +29,10 @@ from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.scenes import CAMERA_CHANNELS, TURNS, VERSION, sensor_path, token
 from deepaccident_devkit.export.sensor_files import stored_camera
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3
-from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 
 if TYPE_CHECKING:

@@ -22,19 +22,20 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.format import Format, Output, Unit, some_of
 from deepaccident_devkit.export.sensor_files import sensor_files, stored_camera
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.handedness import camera_from_lidar_to_raw, flip_pose
 from deepaccident_devkit.geometry.quaternions import to_matrix
 from deepaccident_devkit.geometry.se3 import inverses, stored_transforms
-from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import (
     BEV_CAMERA,
@@ -48,7 +49,6 @@ from deepaccident_devkit.taxonomy import (
     UNTRACKED_ID,
     VEHICLE_AGENTS,
 )
-from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:

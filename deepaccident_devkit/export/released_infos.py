@@ -24,10 +24,10 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.keyframes import keyframes
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release import Labels, ScenarioFolder, read_calib, read_label
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, CHANNEL_FORMAT, CHANNELS, LIDAR
 from deepaccident_devkit.v2x.configurations import agents_of

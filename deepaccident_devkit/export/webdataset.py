@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.keyframes import keyframes
@@ -24,9 +23,10 @@ from deepaccident_devkit.export.shards import README, readme, shards
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import image_size, read_image_bytes
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CATEGORIES, CHANNELS, LIDAR
-from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_numbers
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.text import settle_choices
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_numbers
+from deepaccident_devkit.support.text import settle_choices
 
 Orientation = Literal["devkit", "released", "fiery"]
 Axis = tuple[float, float, float]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import (
+from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.geometry.box_columns import COLUMNS, category_codes, check_numbers, unit
+from deepaccident_devkit.geometry.footprints import gaps, intersection_areas
+from deepaccident_devkit.geometry.frames import checked_frame
+from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
+from deepaccident_devkit.geometry.se3 import SE3, checked_transform
+from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,
     FloatArray,
@@ -21,16 +28,9 @@ from deepaccident_devkit.arrays import (
     checked,
     readonly,
 )
-from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.geometry.box_columns import COLUMNS, category_codes, check_numbers, unit
-from deepaccident_devkit.geometry.footprints import gaps, intersection_areas
-from deepaccident_devkit.geometry.frames import checked_frame
-from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
-from deepaccident_devkit.geometry.se3 import SE3, checked_transform
-from deepaccident_devkit.nuscenes_names import BOX, BOX_MADE, without_names
+from deepaccident_devkit.support.nuscenes_names import BOX, BOX_MADE, without_names
+from deepaccident_devkit.support.text import Pictured
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
-from deepaccident_devkit.text import Pictured
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion

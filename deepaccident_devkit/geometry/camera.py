@@ -9,7 +9,9 @@ from typing import Final, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import (
+from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.geometry.boxes import Boxes, checked_boxes
+from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,
     FloatArray,
@@ -19,8 +21,6 @@ from deepaccident_devkit.arrays import (
     checked_whole,
     readonly,
 )
-from deepaccident_devkit.errors import ChoiceError, GeometryError
-from deepaccident_devkit.geometry.boxes import Boxes, checked_boxes
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, Frame
 
 VISIBLE_DEPTH = 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray
 
 
 def time_to_collision(

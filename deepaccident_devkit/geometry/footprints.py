@@ -6,7 +6,7 @@ Only differences of positions are used, so that world coordinates lose no digits
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray
 
 _SIGNS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
 """Corners as shares of (length, width), counter-clockwise from front left."""

@@ -11,7 +11,7 @@ All functions take arrays with any leading axes, return new float64 arrays and d
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import FloatArray, as_floats
+from deepaccident_devkit.support.arrays import FloatArray, as_floats
 
 _S = np.array([1.0, -1.0, 1.0])
 _S4 = np.array([1.0, -1.0, 1.0, 1.0])

@@ -9,7 +9,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import (
+from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.geometry.bev_grid import BevGrid
+from deepaccident_devkit.geometry.frames import checked_frame
+from deepaccident_devkit.geometry.se3 import SE3, checked_transform
+from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,
     FloatArray,
@@ -18,12 +22,8 @@ from deepaccident_devkit.arrays import (
     checked_number,
     readonly,
 )
-from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry.bev_grid import BevGrid
-from deepaccident_devkit.geometry.frames import checked_frame
-from deepaccident_devkit.geometry.se3 import SE3, checked_transform
-from deepaccident_devkit.nuscenes_names import CLOUD, without_names
-from deepaccident_devkit.text import Pictured
+from deepaccident_devkit.support.nuscenes_names import CLOUD, without_names
+from deepaccident_devkit.support.text import Pictured
 
 Range = tuple[float, float]
 _SOURCES: Final = {"agent": np.int8, "time_lag": np.float32}

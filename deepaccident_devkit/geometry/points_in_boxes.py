@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.support.arrays import FloatArray, IntArray
 
 _CELLS = 128
 """Cells of the coarse grid along x and along y, over the ground that the boxes cover."""

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import FloatArray, as_floats
+from deepaccident_devkit.support.arrays import FloatArray, as_floats
 
 
 def from_yaw(yaw: ArrayLike) -> FloatArray:

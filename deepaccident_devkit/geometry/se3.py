@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, overload, runtime_chec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, as_numbers, checked, checked_number, readonly
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import quaternions, six_vectors
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    FloatArray,
+    FrozenArrays,
+    as_numbers,
+    checked,
+    checked_number,
+    readonly,
+)
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion

@@ -11,8 +11,8 @@ At ry = ±π/2 (gimbal lock) only rx ± rz is determined, and rounding errors de
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import FloatArray, as_floats
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.support.arrays import FloatArray, as_floats
 
 
 def from_matrices(matrix: ArrayLike) -> FloatArray:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.conflicts import along, normals, side_gaps
 from deepaccident_devkit.geometry.footprints import corner_offsets, gaps_of_pairs
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray
 
 _TOLERANCE = 1e-9
 """Metres by which two boxes may be apart where they touch by calculation."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.conflicts import normals
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
@@ -24,6 +23,7 @@ from deepaccident_devkit.interactions.measures import (
     time_integrated,
     time_to_collision_1d,
 )
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.tables import displacement_velocities
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import ScenarioTracks

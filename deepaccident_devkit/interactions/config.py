@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import FloatArray, checked, checked_number
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.support.arrays import FloatArray, checked, checked_number
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 CLASS_MASSES: Final[Mapping[str, float]] = MappingProxyType(

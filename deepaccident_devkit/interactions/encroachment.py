@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.geometry.conflicts import along, half_extents, normals, side_gaps, side_yaws
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _PARALLEL = 1e-12

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.conflicts import normals
 from deepaccident_devkit.geometry.footprints import separations_of_pairs
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 
 
 def time_to_collision_1d(

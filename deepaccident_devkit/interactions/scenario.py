@@ -16,11 +16,11 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import place_in
 from deepaccident_devkit.interactions.compute import actor_motion, measured_pairs, pair_summaries
 from deepaccident_devkit.interactions.config import InteractionConfig
 from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names, interaction_specs
 from deepaccident_devkit.parallel import Places, Store, in_order, run_unordered
+from deepaccident_devkit.support.files import place_in
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.tables.store import read_streams, streams
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks

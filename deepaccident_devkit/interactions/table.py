@@ -12,8 +12,8 @@ from typing import Annotated, Any, Final, TypedDict
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.interactions.config import InteractionConfig
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.tables.columns import Key, Number, TableSpec, Vector
 from deepaccident_devkit.tables.records import spec_of
 from deepaccident_devkit.tables.tokens import frame_token, instance_token

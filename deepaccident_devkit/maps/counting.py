@@ -14,13 +14,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, IntArray, checked_number
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, MissingFileError, SensorFileError
 from deepaccident_devkit.geometry.se3 import stored_transforms
 from deepaccident_devkit.release import read_bev
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, IntArray, checked_number
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE, FRAME_PERIOD
 
 logger = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray, IntArray
+from deepaccident_devkit.support.arrays import ByteArray, IntArray
 
 _LARGEST: Final = 60.0
 """Square metres of a hole that parked vehicles can make: two lorries. A larger one may be a yard."""

@@ -14,11 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.archives import open_zip, read_array
-from deepaccident_devkit.arrays import IntArray, as_floats
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, IndexStoreError, NotAvailableError
-from deepaccident_devkit.files import place_in
 from deepaccident_devkit.maps.counting import (
     GROUND_CLASSES,
     Counts,
@@ -31,9 +28,12 @@ from deepaccident_devkit.maps.counting import (
 from deepaccident_devkit.maps.hidden import hidden_ground
 from deepaccident_devkit.maps.town_map import TownMap, classes_of
 from deepaccident_devkit.parallel import Places, Store, run_unordered
-from deepaccident_devkit.reading import limit_of
+from deepaccident_devkit.support.archives import open_zip, read_array
+from deepaccident_devkit.support.arrays import IntArray, as_floats
+from deepaccident_devkit.support.files import place_in
+from deepaccident_devkit.support.reading import limit_of
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import BEV_CAMERA
-from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

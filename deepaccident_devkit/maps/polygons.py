@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon

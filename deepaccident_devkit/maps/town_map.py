@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, as_floats, checked
-from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.maps.counting import GROUND_CLASSES
 from deepaccident_devkit.maps.polygons import AREAS, Area, geojson_of, outlines, simplified
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, as_floats, checked
+from deepaccident_devkit.support.files import path_of, write_bytes
+from deepaccident_devkit.support.text import choice
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon

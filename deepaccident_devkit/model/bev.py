@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
 from deepaccident_devkit.motion.orientations import axes_of
+from deepaccident_devkit.support.arrays import check_least
 
 
 def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:

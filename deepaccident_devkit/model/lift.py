@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import POLE_HEIGHT
-from deepaccident_devkit.text import settle_choices
 
 Frustum = Literal["corners", "centres"]
 Rounding = Literal["trunc", "floor"]

@@ -14,7 +14,6 @@ import msgspec
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
 from deepaccident_devkit.model.checkpoint import load_weights, read_weights
 from deepaccident_devkit.model.detection import (
@@ -39,9 +38,10 @@ from deepaccident_devkit.model.motion import MotionHeadConfig, MotionLossConfig
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.temporal import TemporalConfig
 from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.support.json_text import as_record
+from deepaccident_devkit.support.text import choice as chosen_word
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, ModelFusion, ModelPreset
-from deepaccident_devkit.text import choice as chosen_word
-from deepaccident_devkit.text import settle_choices
 
 
 class _Described(msgspec.Struct):

@@ -15,17 +15,17 @@ from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, ResultsWriter, foreseen_accident
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.export.torch import V2XDataset, collate
-from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.model.detection import decode_detections, detected_boxes
 from deepaccident_devkit.model.entry import mirrored_boxes, model_inputs
 from deepaccident_devkit.model.motion import MotionMaps
 from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link
 

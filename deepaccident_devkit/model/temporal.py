@@ -26,7 +26,7 @@ from deepaccident_devkit.model.warps import (
     six_from_matrices,
     warp_features,
 )
-from deepaccident_devkit.text import settle_choices
+from deepaccident_devkit.support.text import settle_choices
 
 
 class ConvBnRelu3d(nn.Module):

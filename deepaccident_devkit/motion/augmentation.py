@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.motion.settings import flag, number
+from deepaccident_devkit.support.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,14 +10,14 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, IntArray, ShortRepr, readonly
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
+from deepaccident_devkit.support.arrays import BoolArray, IntArray, ShortRepr, readonly
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
-from deepaccident_devkit.text import choice
 
 BEV_CLASSES: Final = ("road", "lane_line", "sidewalk", "vehicle", "pedestrian")
 """The classes of the targets, in their order."""

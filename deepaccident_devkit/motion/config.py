@@ -15,8 +15,8 @@ from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol, label_protocol
 from deepaccident_devkit.motion.settings import count, flag, number
+from deepaccident_devkit.support.text import choice, spelled
 from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.text import choice, spelled
 from deepaccident_devkit.v2x import AGENT_SETS, AgentConfig, Agents
 from deepaccident_devkit.v2x.configurations import is_available
 

@@ -20,10 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 
-from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_array
-from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, LabelFilesError, NotAvailableError, TokenError
-from deepaccident_devkit.files import place_in, replacing
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.label_folder import (
@@ -42,9 +39,12 @@ from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.parallel import Places
 from deepaccident_devkit.release.fingerprints import digest_of
+from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, open_zip, read_array
+from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.files import place_in, replacing
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
-from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import cooperating_agents
 
 if TYPE_CHECKING:

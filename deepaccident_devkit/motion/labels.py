@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.motion.batch_names import MAPS, BatchNames, from_batch, to_batch
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.warps.to_present import maps_to_present
 from deepaccident_devkit.motion.warps.warping import WarpMode
-from deepaccident_devkit.text import Pictured
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
+from deepaccident_devkit.support.text import Pictured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Axis, Orientation, cells_in, turned
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.text import choice
 
 __all__ = ["axes_of", "cells_in", "to_orientation", "vectors_in"]
 

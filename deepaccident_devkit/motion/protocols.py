@@ -10,7 +10,7 @@ from typing import Final, Literal, get_args
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion.settings import flag
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.support.text import choice
 
 WarpRule = Literal["stretched", "exact", "fiery"]
 """How a raster is sampled when it is warped to another frame: see `motion.warps.warping`."""

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import six_vectors
@@ -20,6 +19,7 @@ from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes
 from deepaccident_devkit.motion.drawing.from_boxes import motion_labels_from_boxes
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warps.chains import egomotion
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x import cooperating_agents

@@ -8,11 +8,11 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import checked_number
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.support.arrays import checked_number
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import choice
 
 Purpose = Literal["train", "evaluate", "all", "every"]
 SampleProtocol = Literal["released", "paper"]

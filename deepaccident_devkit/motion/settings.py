@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from deepaccident_devkit.arrays import checked_number, checked_whole
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.support.arrays import checked_number, checked_whole
 
 
 def flag(name: str, value: object) -> bool:

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import WorkerError
-from deepaccident_devkit.files import temporary_path
+from deepaccident_devkit.support.files import temporary_path
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

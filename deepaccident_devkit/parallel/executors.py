@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.errors import DeepAccidentError, MissingExtraError, WorkerError
-from deepaccident_devkit.reading import MOST_TOLD, fault_text, shortened
+from deepaccident_devkit.errors import MOST_TOLD, DeepAccidentError, MissingExtraError, WorkerError, shortened
+from deepaccident_devkit.support.reading import fault_text
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

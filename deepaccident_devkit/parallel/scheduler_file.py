@@ -8,8 +8,8 @@ from typing import Annotated, Final
 
 import msgspec
 
-from deepaccident_devkit.json_text import parsed_record
-from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.support.json_text import parsed_record
+from deepaccident_devkit.support.reading import read_bytes
 
 _SECONDS: Final = 10.0
 

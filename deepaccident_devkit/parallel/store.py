@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 from deepaccident_devkit.errors import DeepAccidentError
-from deepaccident_devkit.files import place_in, remove_in, say_waiting, write_bytes
 from deepaccident_devkit.parallel.batches import run_batch
 from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
-from deepaccident_devkit.reading import FileKind, read_bytes
+from deepaccident_devkit.support.files import place_in, remove_in, say_waiting, write_bytes
+from deepaccident_devkit.support.reading import FileKind, read_bytes
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

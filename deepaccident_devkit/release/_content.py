@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray
 from deepaccident_devkit.errors import MissingFileError, ReleaseError
-from deepaccident_devkit.reading import FileKind, fault_text, read_bytes
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray
+from deepaccident_devkit.support.reading import FileKind, fault_text, read_bytes
 
 REMEDY: Final = "restore the file from its archive"
 _NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)

@@ -15,7 +15,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, NoReturn, TypeAlias
 
-from deepaccident_devkit.reading import shortened
+from deepaccident_devkit.errors import shortened
 
 _LONGEST_NUMBER: Final = 32
 """Characters of a number written as text: reading it takes time in proportion to the square of them."""

@@ -8,14 +8,14 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, ShortRepr, readonly
 from deepaccident_devkit.errors import CalibError
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3, handedness
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
 from deepaccident_devkit.release._content import LARGEST, REMEDY, in_range, read_content
 from deepaccident_devkit.release.pickles import load_arrays, pickled
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, ShortRepr, readonly
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import CAMERAS
 
 _EGO_KEYS = ("lidar_to_ego", "ego_to_world")

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.reading import FileKind
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers, frame_sizes
 from deepaccident_devkit.release.store import ReleasePath, places_of
+from deepaccident_devkit.support.reading import FileKind
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT
 
 if TYPE_CHECKING:

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray
-from deepaccident_devkit.errors import SensorFileError
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import MOST_TOLD, check_size, fault_text, open_file, shortened
+from deepaccident_devkit.errors import MOST_TOLD, SensorFileError, shortened
 from deepaccident_devkit.release._content import REMEDY, read_content
 from deepaccident_devkit.release.store import ReleasePath, real_path
+from deepaccident_devkit.support.arrays import ByteArray
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.reading import check_size, fault_text, open_file
 
 JPEG_QUALITY = 90
 _DAMAGED = (OSError, SyntaxError, ValueError, struct.error, EOFError, MemoryError, OverflowError, zlib.error)

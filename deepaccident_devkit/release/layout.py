@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import DatarootError, VersionError
 from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed
 from deepaccident_devkit.release.store.names import (
@@ -18,13 +17,14 @@ from deepaccident_devkit.release.store.names import (
     SPLIT_FILES,
     SPLIT_FOLDERS,
 )
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.text import spelled
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CHANNEL_FORMAT,
     VERSIONS,
     AgentName,
 )
-from deepaccident_devkit.text import spelled
 
 _UNLISTABLE_REMEDY = "unpack its archive again, or make it readable"
 _ABOVE_TYPES = (*SPLIT_FOLDERS, MINI_FOLDER)

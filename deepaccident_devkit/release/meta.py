@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.errors import MetaError
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import shortened
+from deepaccident_devkit.errors import MetaError, shortened
 from deepaccident_devkit.release._content import LARGEST, REMEDY, in_range, integer_of, number_of, read_lines
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
 
 _FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"

@@ -8,8 +8,8 @@ from typing import get_args
 
 from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import OnError
-from deepaccident_devkit.text import choice
 
 _logger = logging.getLogger(__name__)
 

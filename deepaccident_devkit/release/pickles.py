@@ -13,9 +13,10 @@ from typing import Any, BinaryIO, Final, Literal, NamedTuple, cast
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.reading import fault_text, shortened
+from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.release._unpickle import Machine
+from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.reading import fault_text
 
 _PROTOCOL: Final = 3
 _BEGIN: Final = pickle.PROTO + bytes([_PROTOCOL])

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from deepaccident_devkit.errors import SplitFileError
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import shortened
+from deepaccident_devkit.errors import SplitFileError, shortened
 from deepaccident_devkit.release._content import read_lines
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.files import write_bytes
 
 
 def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = False) -> list[str]:

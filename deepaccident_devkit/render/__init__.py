@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from deepaccident_devkit.nuscenes_names import with_keywords_named
 from deepaccident_devkit.render.accident import render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
 from deepaccident_devkit.render.axes import LAYERS, Layer, detached_figure
@@ -24,6 +23,7 @@ from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.styles import style
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
+from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 
 __all__ = [
     "LAYERS",

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import LAYERS, Layer, axis_words, figure_or_new, layers_of, with_light_grid
@@ -23,6 +22,7 @@ from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.roles import camera_name, in_drawing_order, recorders_of, role_colors
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title, set_title
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, OWN_ACTOR_ID, frame_timestamp, short_name
 from deepaccident_devkit.v2x import Agents, cooperating_agents

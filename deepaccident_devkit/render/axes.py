@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.colors import GRID_COLOR
 from deepaccident_devkit.render.styles import size_in_style
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.support.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

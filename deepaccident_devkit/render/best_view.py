@@ -8,13 +8,13 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, as_floats
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import Boxes, PinholeCamera
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.boxes import bounds_in_image
 from deepaccident_devkit.render.legends import is_there
+from deepaccident_devkit.support.arrays import FloatArray, as_floats
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.projection import camera_of
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import concatenate
@@ -36,8 +35,9 @@ from deepaccident_devkit.render.legends import (
 from deepaccident_devkit.render.roles import at_once, collider_ids, label_ids, recorder_ids, role_colors
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame, short_name
-from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x import (
     Agents,
     Link,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, PinholeCamera
@@ -15,6 +14,7 @@ from deepaccident_devkit.render.axes import Layer
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
 from deepaccident_devkit.render.colors import CASING_COLOR, CATEGORY_COLORS, CATEGORY_MARKERS, OWN_COLOR
 from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.geometry import Boxes
@@ -32,8 +31,9 @@ from deepaccident_devkit.render.legends import (
 from deepaccident_devkit.render.roles import role_colors
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import moment_words, set_scene_title
+from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
-from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
 from deepaccident_devkit.v2x.projection import ImagePoints, camera_of
 

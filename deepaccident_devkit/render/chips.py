@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.render.colors import CASING_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
+from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

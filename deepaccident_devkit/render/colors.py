@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from deepaccident_devkit.pages import part
+from deepaccident_devkit.support.pages import part
 from deepaccident_devkit.taxonomy import AGENTS, SPLITS
 
 AGENT_COLORS: Mapping[str, str] = dict(

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import SE3
@@ -17,6 +16,7 @@ from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.axes import axes_or_new, axis_words
 from deepaccident_devkit.render.colors import BEV_COLORS
 from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
@@ -20,6 +19,7 @@ from deepaccident_devkit.render.colors import AGENT_COLORS, MUTED_COLOR, OWN_COL
 from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import UNTRACKED_ID, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes
 

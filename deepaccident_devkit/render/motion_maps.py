@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
-from deepaccident_devkit.evaluation.metrics.trajectories import instance_paths
+from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.evaluation.trajectories import instance_paths
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionHeads, MotionLabels, PostProcessing, predict_instances
 from deepaccident_devkit.motion.orientations import to_orientation
@@ -26,6 +25,7 @@ from deepaccident_devkit.render.colors import (
     INSTANCE_COLORS,
     OWN_COLOR,
 )
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID, short_name
 
 if TYPE_CHECKING:

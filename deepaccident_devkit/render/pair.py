@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.render.axes import Layer
@@ -25,6 +24,7 @@ from deepaccident_devkit.render.colors import CASING_COLOR, COLLIDER_COLOR, GRID
 from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.legends import is_there
 from deepaccident_devkit.render.roles import actor_tags, camera_name, role_colors
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, FRAME_PERIOD
 from deepaccident_devkit.v2x import Contact

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.render.axes import detached_figure, settled
 from deepaccident_devkit.render.styles import current_style
+from deepaccident_devkit.support.files import path_of, replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.render.axes import detached_figure, figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import (
@@ -33,8 +32,9 @@ from deepaccident_devkit.statistics import (
     QuantileRow,
     QuantileTable,
 )
+from deepaccident_devkit.support.files import writable_folder
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import CATEGORIES
-from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
-from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.parallel import Engine, Places, in_order, run_unordered
 from deepaccident_devkit.render.accident import draw_countdown
 from deepaccident_devkit.render.axes import LAYERS, Layer, layers_of
@@ -34,9 +32,11 @@ from deepaccident_devkit.render.pair import PAIR_LAYERS
 from deepaccident_devkit.render.pictures import figure_of_pixels
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
+from deepaccident_devkit.support.arrays import ByteArray
+from deepaccident_devkit.support.files import path_of, replacing
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import frame_token, sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
-from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, cooperating_agents
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Final, cast, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import (
@@ -28,9 +27,10 @@ from deepaccident_devkit.render.legends import agent_handles, draw_legend, has_c
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID, Frame, short_name
-from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, aggregate_point_cloud, cooperating_agents, cooperative_boxes
 from deepaccident_devkit.v2x.cooperation import visible_actors
 

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import GeometryError, NotAvailableError
 from deepaccident_devkit.reports import Report, Row
@@ -30,8 +29,9 @@ from deepaccident_devkit.safety.accidents import (
     those_of,
 )
 from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, known
+from deepaccident_devkit.support.text import columns_text
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, AgentName, short_name
-from deepaccident_devkit.text import columns_text
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -8,12 +8,12 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, IntArray, checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.support.arrays import BoolArray, IntArray, checked_whole
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, AgentName
-from deepaccident_devkit.text import settle_choices
 
 ObservationKind = Literal["points", "released", "annotated"]
 

@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 HORIZON: Final = 3.0

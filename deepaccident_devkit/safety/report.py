@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit.arrays import ShortRepr, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.interactions import InteractionConfig, InteractionPairs, interactions
 from deepaccident_devkit.reports import Report, Row
@@ -25,6 +24,7 @@ from deepaccident_devkit.safety.observation import ObservationRule
 from deepaccident_devkit.safety.outcomes import BRAKINGS
 from deepaccident_devkit.safety.stories import Story, scenario_facts, story_text
 from deepaccident_devkit.safety.twins import Parting, TwinDiff, TwinReport, diff_of_accident, twins_of
+from deepaccident_devkit.support.arrays import ShortRepr, known
 from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 if TYPE_CHECKING:

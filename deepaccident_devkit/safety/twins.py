@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked_number, known
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
@@ -26,8 +25,9 @@ from deepaccident_devkit.safety.accidents import (
     those_of,
 )
 from deepaccident_devkit.safety.twin_matching import MatchedBy, Recording, matched_rows, recording_of, shift_of, shifted
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked_number, known
+from deepaccident_devkit.support.text import columns_text, number_text
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, UNTRACKED_ID, AgentName, frame_timestamp, short_name
-from deepaccident_devkit.text import columns_text, number_text
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

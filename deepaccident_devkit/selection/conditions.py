@@ -13,7 +13,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.selection.fields import Field, Value
-from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.support.text import possible_text
 
 FilterValue = Value | Collection[Value]
 """What a keyword of `find` takes: a value, or several values, one of which must match."""

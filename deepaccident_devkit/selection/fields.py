@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from deepaccident_devkit import taxonomy
-from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import FieldError, NotAvailableError
 from deepaccident_devkit.interactions import InteractionPairs, Interactions, interactions_of
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray
+from deepaccident_devkit.support.text import columns_text, possible_text
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
 from deepaccident_devkit.tables.records import table_spec
-from deepaccident_devkit.text import columns_text, possible_text
 from deepaccident_devkit.v2x import accident_visibility, collision
 from deepaccident_devkit.v2x.accident_visibility import VISIBILITIES
 

@@ -1,6 +1,5 @@
 """The paper's statistics of a release, computed on the tables' columns."""
 
-from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.statistics.compute import dataset_statistics
 from deepaccident_devkit.statistics.report import DatasetStatistics
 from deepaccident_devkit.statistics.results import (
@@ -14,6 +13,7 @@ from deepaccident_devkit.statistics.results import (
     QuantileRow,
     QuantileTable,
 )
+from deepaccident_devkit.support.files import writable_folder
 
 __all__ = [
     "ENDS",

@@ -20,8 +20,8 @@ from deepaccident_devkit.statistics.results import (
     Table,
     collision_rows,
 )
+from deepaccident_devkit.support.text import columns_text, number_text, share_text
 from deepaccident_devkit.taxonomy import CATEGORIES
-from deepaccident_devkit.text import columns_text, number_text, share_text
 
 _PAIRS = "collision_pairs"
 _LIMITS = (0.5, 1.0, 1.5, 3.0)

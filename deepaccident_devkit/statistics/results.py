@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import astuple, dataclass, fields
 from typing import Final
 
-from deepaccident_devkit.arrays import ShortRepr
+from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.taxonomy import SPLITS
 
 TOTAL: Final = "total"

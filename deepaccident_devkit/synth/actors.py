@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, readonly
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, readonly
 from deepaccident_devkit.synth import solids
 from deepaccident_devkit.synth.shapes import MODELS, shape_of
 from deepaccident_devkit.synth.solids import Color, Solids

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
+from deepaccident_devkit.support.arrays import FloatArray
 
 
 def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Final, Literal, get_args
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View
 from deepaccident_devkit.taxonomy import Layout
-from deepaccident_devkit.text import settle_choices
 
 Sensors = Literal["all", "cameras", "none"]
 """Which sensors' files a release has: of all, the images alone, or of none."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, IntArray, checked, readonly
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
+from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, IntArray, checked, readonly
 
 Color = tuple[int, int, int]
 """Red, green, blue, 0 to 255."""

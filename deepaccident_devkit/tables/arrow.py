@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray
 from deepaccident_devkit.tables.columns import (
     NULL_INTEGER,
     Choice,

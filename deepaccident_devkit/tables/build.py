@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release import Calibs, Labels, Meta, ScenarioFolder, read_calibs, read_labels, read_meta
 from deepaccident_devkit.release.store import ReleasePath, fetched
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.tables import boxes as box_rules
 from deepaccident_devkit.tables.boxes import ScenarioBoxes
 from deepaccident_devkit.tables.columns import NULL_INTEGER

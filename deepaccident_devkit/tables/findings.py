@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.support.arrays import ShortRepr
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")

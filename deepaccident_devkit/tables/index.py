@@ -24,9 +24,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError, VersionError
-from deepaccident_devkit.files import (
+from deepaccident_devkit.parallel import Engine, Places, Store
+from deepaccident_devkit.release import ReleaseLayout
+from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in, places_of
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import (
     is_writable_folder,
     place_in,
     remove_in,
@@ -34,17 +37,14 @@ from deepaccident_devkit.files import (
     temporary_of,
     write_bytes,
 )
-from deepaccident_devkit.parallel import Engine, Places, Store
-from deepaccident_devkit.reading import RefusedFileError, fault_text, file_checksum, limit_of, read_bytes
-from deepaccident_devkit.release import ReleaseLayout
-from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in, places_of
+from deepaccident_devkit.support.reading import RefusedFileError, fault_text, file_checksum, limit_of, read_bytes
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.indexing import SCHEMA_VERSION, Outcome, index_scenario, join_tables
 from deepaccident_devkit.tables.records import table_specs
 from deepaccident_devkit.tables.scan import contents_digest, folder_digest
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
 from deepaccident_devkit.tables.store import table_path
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
-from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

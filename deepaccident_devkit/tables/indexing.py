@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.parallel import Store
-from deepaccident_devkit.reading import observed
 from deepaccident_devkit.release import ScenarioFolder, read_meta
+from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.reading import observed
 from deepaccident_devkit.tables.arrow import Columns
 from deepaccident_devkit.tables.build import ScenarioFiles, read_scenario, scenario_rows
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
-from deepaccident_devkit.files import path_of
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.release.store import ReleasePath, places_of
+from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.text import choice, spelled
 from deepaccident_devkit.tables.index import Problem
 from deepaccident_devkit.tables.tables import Table, Tables, table_names
 from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS, OnError
-from deepaccident_devkit.text import choice, spelled
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables import records

@@ -9,7 +9,8 @@ from types import UnionType
 from typing import Annotated, Any, TypedDict, Union, get_args, get_origin, get_type_hints
 
 from deepaccident_devkit.errors import TableError
-from deepaccident_devkit.nuscenes_names import table_remedy
+from deepaccident_devkit.support.nuscenes_names import table_remedy
+from deepaccident_devkit.support.text import meant_text, spelled
 from deepaccident_devkit.tables.columns import (
     Choice,
     Column,
@@ -34,7 +35,6 @@ from deepaccident_devkit.taxonomy import (
     TIMES_OF_DAY,
     VELOCITY_FRAMES,
 )
-from deepaccident_devkit.text import meant_text, spelled
 
 
 class CollisionRecord(TypedDict):

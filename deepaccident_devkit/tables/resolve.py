@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit.errors import TokenError
+from deepaccident_devkit.support.text import meant_text
 from deepaccident_devkit.tables import tokens
 from deepaccident_devkit.tables.store import damaged_value
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
-from deepaccident_devkit.text import meant_text
 
 Views = Mapping[str, Mapping[str, Any]]
 """Table → stored column → view of it."""

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TypeAlias
 
 from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.reading import FileKind, fault_text, read_bytes
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.release.store import ReleasePath, StorePath, listed
+from deepaccident_devkit.support.reading import FileKind, fault_text, read_bytes
 from deepaccident_devkit.tables.findings import Finding, finding_of
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 

@@ -5,9 +5,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Calibs
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.taxonomy import (
     BEV_CAMERA,

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import replacing
-from deepaccident_devkit.reading import irregular_text, shortened
+from deepaccident_devkit.errors import IndexStoreError, shortened
+from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.reading import irregular_text
 from deepaccident_devkit.tables.arrow import (
     Columns,
     arrow_schema,

@@ -7,12 +7,12 @@ from typing import Any, Generic, NoReturn, TypeVar, cast, overload
 import numpy as np
 
 from deepaccident_devkit.errors import FieldError, IndexStoreError, TableError, TokenError
-from deepaccident_devkit.nuscenes_names import field_remedy
+from deepaccident_devkit.support.nuscenes_names import field_remedy
+from deepaccident_devkit.support.text import meant_text, spelled
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.records import table_spec, table_specs
 from deepaccident_devkit.tables.resolve import Resolver
 from deepaccident_devkit.tables.store import REMEDY, StoredTable, damaged_value
-from deepaccident_devkit.text import meant_text, spelled
 
 Record = TypeVar("Record")
 _Getter = Callable[[int], Any]

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release.labels import turned
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.tables.boxes import ScenarioBoxes, world_rotations
 from deepaccident_devkit.taxonomy import (
     FRAME_PERIOD,

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.release import ScenarioFolder, read_calib, write_raw_calib
 from deepaccident_devkit.release.labels import FIELDS
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.release.npz import KEY, read_npz
 from deepaccident_devkit.release.store import real_path
+from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import CHANNEL_FORMAT
 
 Rows = list[list[str]]

@@ -9,9 +9,10 @@ from typing import get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import replacing_folder
 from deepaccident_devkit.release import Collision, Meta, ScenarioFolder, write_meta, write_split_file
 from deepaccident_devkit.release.store import real_path
+from deepaccident_devkit.support.files import replacing_folder
+from deepaccident_devkit.support.text import choice, settle_choices
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -25,7 +26,6 @@ from deepaccident_devkit.taxonomy import (
     Layout,
 )
 from deepaccident_devkit.testing.scene import AGENT_IDS, PAIR, Recorder, SmallScene, small_scene
-from deepaccident_devkit.text import choice, settle_choices
 
 _MOST_FRAMES = 100
 _LEAST_IMAGE, _MOST_IMAGE = (16, 9), (1600, 900)

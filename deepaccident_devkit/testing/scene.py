@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, as_floats
 from deepaccident_devkit.geometry import SE3, Boxes, BoxVisibility, PinholeCamera
 from deepaccident_devkit.release import (
     Calib,
@@ -21,6 +20,7 @@ from deepaccident_devkit.release import (
 )
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import real_path
+from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, as_floats
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,

@@ -9,10 +9,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import MissingExtraError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.release import Calib, Collision, Labels, Meta
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CAMERAS,

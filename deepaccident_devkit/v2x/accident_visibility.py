@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, as_numbers
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import GeometryError, TokenError
+from deepaccident_devkit.support.arrays import BoolArray, as_numbers
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, VEHICLE_AGENTS
 

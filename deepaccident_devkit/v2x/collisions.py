@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import Boxes, quaternions
+from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.tables.tokens import frame_token, instance_token
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from deepaccident_devkit.v2x.configurations import agents_of

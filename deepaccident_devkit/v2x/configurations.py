@@ -8,8 +8,8 @@ from typing import Final, Literal, get_args
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.support.text import choice, spelled
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, AgentName
-from deepaccident_devkit.text import choice, spelled
 
 Role = Literal["behind", "other", "other_behind", "infrastructure"]
 """The role of a partner: the vehicle behind the ego, the two vehicles of the other side, the infrastructure."""

@@ -7,14 +7,14 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import VISIBLE, Dataset, RowArgument, Visible
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import concatenate, trusted_boxes
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.tables.tokens import instance_token
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID
-from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x.configurations import Agents
 from deepaccident_devkit.v2x.link import Link
 from deepaccident_devkit.v2x.messages import Message, messages

@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, checked_number, checked_whole
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.support.arrays import FloatArray, checked_number, checked_whole
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _NORMAL: Final = NormalDist()

@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import DTypeLike
 
-from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.support.arrays import checked_whole
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, AgentName, OnError
 from deepaccident_devkit.v2x.configurations import Agents, cooperating_agents

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, six_vectors
 from deepaccident_devkit.geometry.se3 import inverses
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, checked
 
 Poses = Sequence[SE3] | ArrayLike
 """Poses of several agents or moments: SE3 objects, or an array (K, 4, 4)."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import LidarPointCloud, PinholeCamera
+from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, checked
 from deepaccident_devkit.v2x.poses import transform
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FrozenArrays
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import concatenate
+from deepaccident_devkit.support.arrays import AnyArray, FrozenArrays
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, AgentName
 from deepaccident_devkit.v2x.configurations import Agents
 from deepaccident_devkit.v2x.cooperation import cooperative_view

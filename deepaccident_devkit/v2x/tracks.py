@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.geometry.boxes import trusted_boxes
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _MOVED = ("center", "rotation", "velocity")

@@ -7,10 +7,10 @@ from itertools import combinations
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.geometry.footprints import gaps
-from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release import Collision, Meta
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import (
     CATEGORIES,

@@ -8,9 +8,9 @@ import os
 from dataclasses import asdict, dataclass
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.reading import LIMITS_VARIABLE
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.store import Entry, ReleasePath, listed
+from deepaccident_devkit.support.reading import LIMITS_VARIABLE
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.scan import times_digest
 from deepaccident_devkit.tables.velocities import VelocityFit, total_fit

@@ -8,13 +8,14 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ReleaseError, TokenError
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import frame_sizes
 from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of
 from deepaccident_devkit.reports import Report
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.text import columns_text, counted, size_text
 from deepaccident_devkit.tables.scan import ENDINGS
 from deepaccident_devkit.tables.split_assignment import assign_splits
 from deepaccident_devkit.taxonomy import (
@@ -27,7 +28,6 @@ from deepaccident_devkit.taxonomy import (
     LIDAR,
     SPLITS,
 )
-from deepaccident_devkit.text import columns_text, counted, size_text
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.release.labels import read_lone_words
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_text, near_pairs

@@ -12,14 +12,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.reading import FileKind, read_bytes
 from deepaccident_devkit.release import read_bev, read_lidar
 from deepaccident_devkit.release.images import decode_image, read_image_bytes
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
+from deepaccident_devkit.support.reading import FileKind, read_bytes
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
 from deepaccident_devkit.taxonomy import (

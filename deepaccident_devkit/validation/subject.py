@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.geometry import Boxes, quaternions
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import Finding, displacement_velocities
 from deepaccident_devkit.tables import boxes as box_rules
 from deepaccident_devkit.tables.boxes import ScenarioBoxes

@@ -13,18 +13,18 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, TokenError
-from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.parallel import Places, Store, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import left_aside, names_without_calib
 from deepaccident_devkit.release.store import Dataroot, checksums_compared, open_dataroot, places_of
 from deepaccident_devkit.reports import Report
+from deepaccident_devkit.support.files import writable_folder
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.tables import SEVERITIES, Finding
 from deepaccident_devkit.tables.build import read_scenario
 from deepaccident_devkit.tables.scan import scan_scenario
 from deepaccident_devkit.tables.velocities import VelocityFit, fit_velocities, total_fit
 from deepaccident_devkit.taxonomy import VELOCITY_FRAMES
-from deepaccident_devkit.text import counted
 from deepaccident_devkit.validation.agreement import check_agreement, check_story
 from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, check_key
 from deepaccident_devkit.validation.completeness import Completeness, chosen_scenarios, completeness, files_of

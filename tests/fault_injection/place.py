@@ -7,8 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.release import ScenarioFolder
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, VEHICLE_AGENTS
 from deepaccident_devkit.testing.editing import ENDINGS, FIELD, Rows, ScenarioEditor
 

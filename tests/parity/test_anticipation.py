@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepaccident_devkit.evaluation.metrics.warning import ScoreSeries, printed_figures
-from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores
+from deepaccident_devkit.evaluation.warning import ScoreSeries, printed_figures
+from deepaccident_devkit.evaluation.warning.clean import CleanScores
 
 FIELD_NAMES = {
     "AP": "average_precision",

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from deepaccident_devkit.evaluation.metrics.breakdowns import SampleAttributes, tokens_by_value
+from deepaccident_devkit.evaluation.breakdowns import SampleAttributes, tokens_by_value
 from deepaccident_devkit.selection.fields import FIELDS
 
 _TIMES = ("Noon", "Sunset", "Night")

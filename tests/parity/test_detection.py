@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.evaluation.metrics.detection import (
+from deepaccident_devkit.evaluation.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
     DetectionEvaluator,
     DetectionResult,
 )
-from deepaccident_devkit.evaluation.metrics.detection.boxes import BoxColumns
-from deepaccident_devkit.evaluation.metrics.detection.evaluator import detection_result
-from deepaccident_devkit.evaluation.metrics.detection.frame_counts import class_codes, frame_counts, ring_of
-from deepaccident_devkit.evaluation.metrics.detection.matching import ERRORS, highest_score_by_truth, nearest_by_truth
-from deepaccident_devkit.evaluation.metrics.detection.result import mean_of
+from deepaccident_devkit.evaluation.detection.boxes import BoxColumns
+from deepaccident_devkit.evaluation.detection.evaluator import detection_result
+from deepaccident_devkit.evaluation.detection.frame_counts import class_codes, frame_counts, ring_of
+from deepaccident_devkit.evaluation.detection.matching import ERRORS, highest_score_by_truth, nearest_by_truth
+from deepaccident_devkit.evaluation.detection.result import mean_of
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from parity.conftest import GoldenCase
 
-from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.motion import MotionEvaluator, MotionResult
+from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import safety
-from deepaccident_devkit.evaluation.metrics.warning.recordings import AlarmRuns
+from deepaccident_devkit.evaluation.warning.recordings import AlarmRuns
 from deepaccident_devkit.safety import (
     COALITIONS,
     OUTCOMES,

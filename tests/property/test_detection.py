@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepaccident_devkit.evaluation.metrics.detection import (
+from deepaccident_devkit.evaluation.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
     DetectionEvaluator,
     detection_matches,
 )
-from deepaccident_devkit.evaluation.metrics.detection.curves import recall_matches
-from deepaccident_devkit.evaluation.metrics.detection.matching import nearest_by_truth
+from deepaccident_devkit.evaluation.detection.curves import recall_matches
+from deepaccident_devkit.evaluation.detection.matching import nearest_by_truth
 from deepaccident_devkit.geometry import Boxes
 
 SIZE = (4.0, 2.0, 1.5)

@@ -9,9 +9,16 @@ from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.arrays import FrozenArrays, as_floats, as_numbers, checked, checked_number, checked_whole
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud, PinholeCamera
+from deepaccident_devkit.support.arrays import (
+    FrozenArrays,
+    as_floats,
+    as_numbers,
+    checked,
+    checked_number,
+    checked_whole,
+)
 from deepaccident_devkit.v2x import cooperative_view
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 

@@ -22,9 +22,9 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabelConfig, agents_to_ego, config_from_names
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.render.axes import layers_of
+from deepaccident_devkit.support.text import choice, meant_text
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.testing import SmallRelease
-from deepaccident_devkit.text import choice, meant_text
 from deepaccident_devkit.v2x import AgentConfig, cooperating_agents
 
 SETTINGS = {"grid_conf": {"xbound": (-50.0, 50.0, 0.5), "ybound": (-30.0, 50.0, 0.5)}}

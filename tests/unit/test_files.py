@@ -15,7 +15,9 @@ import pytest
 from PIL import Image
 from processes import wait_for
 
-from deepaccident_devkit.files import (
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.support.files import (
     plain_names,
     remove_leftovers,
     replacing,
@@ -24,13 +26,11 @@ from deepaccident_devkit.files import (
     temporary_path,
     write_bytes,
 )
-from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.pictures import write_figure
 
 WRITER = """
 import sys, time
 from pathlib import Path
-from deepaccident_devkit.files import replacing, replacing_folder
+from deepaccident_devkit.support.files import replacing, replacing_folder
 folder = Path(sys.argv[1])
 with replacing(folder / "table.json") as path, replacing_folder(folder / "run") as run:
     (run / "half").touch()

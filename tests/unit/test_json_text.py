@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from refusals import assert_refused
 
-from deepaccident_devkit.json_text import MOST_LEVELS, parsed_json, parsed_record
+from deepaccident_devkit.support.json_text import MOST_LEVELS, parsed_json, parsed_record
 
 
 @pytest.mark.parametrize("value", [None, 1, "a", [], {}, {"a": [1.5, {"b": '[[[\\"{'}], "[": "\\"}, '\\"' * 3, "é😀"])

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepaccident_devkit import DeepAccident, DeepAccidentError, nuscenes_names, render
+from deepaccident_devkit import DeepAccident, DeepAccidentError, render
 from deepaccident_devkit.errors import FieldError, KeywordError, MissingNameError, TableError
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud
+from deepaccident_devkit.support import nuscenes_names
 from deepaccident_devkit.tables.records import table_specs
 
 CLASSES: list[tuple[type, Mapping[str, str]]] = [

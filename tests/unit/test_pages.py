@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from report_page import Page
 
-from deepaccident_devkit.pages import breakable, environment, result_text
+from deepaccident_devkit.support.pages import breakable, environment, result_text
 
 TREE = '{% from "macros.html" import tree %}{{ tree(value) }}'
 

@@ -10,8 +10,8 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, DatarootError, DeepAccidentError
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import read_bundle
-from deepaccident_devkit.files import path_of, writable_folder
 from deepaccident_devkit.motion import write_label_files
+from deepaccident_devkit.support.files import path_of, writable_folder
 from deepaccident_devkit.synth import make_release
 from deepaccident_devkit.validation import validate_release
 

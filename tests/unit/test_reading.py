@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 import deepaccident_devkit
-from deepaccident_devkit.reading import (
+from deepaccident_devkit.errors import shortened
+from deepaccident_devkit.support.reading import (
     LIMITS,
     LIMITS_VARIABLE,
     check_size,
@@ -18,7 +19,6 @@ from deepaccident_devkit.reading import (
     limit_of,
     open_file,
     read_bytes,
-    shortened,
 )
 
 

@@ -20,7 +20,6 @@ from report_page import Page
 
 import deepaccident_devkit
 import deepaccident_devkit.render.notebook
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.evaluation import (
     Accident,
     AccidentEvaluator,
@@ -35,6 +34,7 @@ from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud
 from deepaccident_devkit.interactions import InteractionConfig, Interactions
 from deepaccident_devkit.interactions.scenario import interactions_of_tracks
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.v2x import Contact
 
 GRID = BevGrid((-4.0, 4.0, 0.5), (-3.0, 3.0, 0.25))

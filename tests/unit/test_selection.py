@@ -9,7 +9,7 @@ from tiny import META, NAME, TYPE, label_lines, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError
-from deepaccident_devkit.evaluation.metrics.breakdowns import ATTRIBUTES
+from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES
 from deepaccident_devkit.overview import _counts
 from deepaccident_devkit.selection import Filter, fields, parse_where
 from deepaccident_devkit.selection.fields import FIELDS, group_texts

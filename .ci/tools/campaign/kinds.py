@@ -19,9 +19,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, evaluate_results, verify_bundle
 from deepaccident_devkit.motion import LabelFiles
-from deepaccident_devkit.reading import file_checksum
 from deepaccident_devkit.release import find_release, read_calib
 from deepaccident_devkit.render.evaluation.report import report_html
+from deepaccident_devkit.support.reading import file_checksum
 from deepaccident_devkit.synth.spec import draw, read_spec
 from deepaccident_devkit.synth.spec.model import Items, Part
 from deepaccident_devkit.tables import Index

@@ -31,7 +31,7 @@ from campaign.healthy import HAS_TORCH, copied
 from campaign.kind import Action, Kind, Room
 from campaign.mutations import MARKER, MUTATIONS
 from deepaccident_devkit.errors import DeepAccidentError
-from deepaccident_devkit.files import temporary_path
+from deepaccident_devkit.support.files import temporary_path
 
 assert all((pyarrow.csv, pyarrow.parquet, scipy.optimize, shapely))  # what the readers import when they need it
 if HAS_TORCH:

@@ -16,14 +16,13 @@ from typing import Any, Final, TypeVar
 import msgspec
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
-from deepaccident_devkit.errors import EvaluationError, ResultsError
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, checked_prediction
+from deepaccident_devkit.errors import EvaluationError, ResultsError, shortened
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, checked_prediction
 from deepaccident_devkit.evaluation.results.header import ContentError, at, check_token, decoded
 from deepaccident_devkit.evaluation.results.records import AccidentEntry, BoxEntry
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.reading import shortened
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import CATEGORIES, UNTRACKED_ID
 
 Columns = dict[str, AnyArray]

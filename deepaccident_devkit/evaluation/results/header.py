@@ -15,15 +15,15 @@ from typing import Any, Final, TypeVar, get_args
 import msgspec
 from msgspec import inspect
 
-from deepaccident_devkit import json_text
-from deepaccident_devkit.arrays import checked_number
-from deepaccident_devkit.errors import DeepAccidentError, ResultsError
+from deepaccident_devkit.errors import MOST_TOLD, DeepAccidentError, ResultsError, shortened
 from deepaccident_devkit.evaluation.results.records import WORDS, FormRecord, ResultsTask, Stored
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
-from deepaccident_devkit.reading import MOST_TOLD, fault_text, shortened
+from deepaccident_devkit.support import json_text
+from deepaccident_devkit.support.arrays import checked_number
+from deepaccident_devkit.support.reading import fault_text
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import settle_choices
 
 Kind = TypeVar("Kind")
 

@@ -13,12 +13,12 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, read_member
-from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.results.header import ContentError, MotionForm, at
 from deepaccident_devkit.motion import predict_instances
+from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, array_of, read_member
+from deepaccident_devkit.support.arrays import AnyArray
 
 _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 _WIDEST: Final = 8

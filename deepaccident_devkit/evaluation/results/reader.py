@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 
 from deepaccident_devkit.errors import ResultsError, TokenError
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results.entries import ENTRIES, Entries, entry_place, read_entries
 from deepaccident_devkit.evaluation.results.header import (
     RESULTS_FILE,
@@ -36,9 +36,9 @@ from deepaccident_devkit.evaluation.results.header import (
 from deepaccident_devkit.evaluation.results.motion_arrays import stored_output
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, MotionFile, ResultsFile, ResultsTask
 from deepaccident_devkit.evaluation.results.shards import check_shard, read_manifest, shared_archive
-from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.reading import NO_NAME, fault_text, irregular_text, read_bytes
+from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.reading import NO_NAME, fault_text, irregular_text, read_bytes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

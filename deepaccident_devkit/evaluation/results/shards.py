@@ -13,10 +13,8 @@ from typing import Any, Final
 
 import msgspec
 
-from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip
-from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.errors import ResultsError, shortened
+from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.results.header import (
     RESULTS_FILE,
     ContentError,
@@ -36,7 +34,9 @@ from deepaccident_devkit.evaluation.results.motion_arrays import (
 )
 from deepaccident_devkit.evaluation.results.records import MotionFile, Shard, Stored
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.reading import check_size, file_checksum, irregular_text, shortened
+from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, open_zip
+from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.reading import check_size, file_checksum, irregular_text
 
 
 def read_manifest(document: MotionFile, root: Path) -> tuple[MotionForm, dict[str, Shard]]:

@@ -10,15 +10,15 @@ from types import TracebackType
 from typing import Any, get_args
 
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results.entries import EntryWriter
 from deepaccident_devkit.evaluation.results.header import ContentError, MotionForm, check_token, json_meta
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, ResultsTask, Stored
 from deepaccident_devkit.evaluation.results.shards import ShardWriter
-from deepaccident_devkit.files import path_of, replacing, replacing_folder
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.support.files import path_of, replacing, replacing_folder
+from deepaccident_devkit.support.text import choice
 
 
 class ResultsWriter:

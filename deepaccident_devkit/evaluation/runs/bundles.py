@@ -13,26 +13,18 @@ from typing import Annotated, Any, Final
 
 import msgspec
 
-from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
+from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results.header import check_token
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
 from deepaccident_devkit.evaluation.runs.many_samples import remove_checkpoints
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import path_of, remove_in, replacing_folder, temporary_path
-from deepaccident_devkit.json_text import Record, as_record, parsed_json
-from deepaccident_devkit.reading import (
-    MOST_TOLD,
-    check_size,
-    fault_text,
-    file_checksum,
-    irregular_text,
-    read_bytes,
-    shortened,
-)
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import path_of, remove_in, replacing_folder, temporary_path
+from deepaccident_devkit.support.json_text import Record, as_record, parsed_json
+from deepaccident_devkit.support.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
 SUMMARY_FILE: Final = "metrics_summary.json"

@@ -15,21 +15,20 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, ShortRepr, known
-from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.breakdowns import cluster_of
-from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
-from deepaccident_devkit.evaluation.metrics.intervals import Clusters, Resampling
-from deepaccident_devkit.evaluation.metrics.numbers import Headline, headlines, numbers_of
+from deepaccident_devkit.errors import EvaluationError, shortened
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.frozen_mappings import plain
+from deepaccident_devkit.evaluation.intervals import Clusters, Resampling
+from deepaccident_devkit.evaluation.numbers import Headline, headlines, numbers_of
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.paired import PairedTest, holm, paired_test, undecided
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.evaluation.runs.verification import differing
-from deepaccident_devkit.files import path_of
-from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.reports import Report, Row, record_rows
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.support.arrays import FloatArray, ShortRepr, known
+from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.text import columns_text
 
 Family = Literal["main", "headlines", "other"]
 """What a number is tested with: by itself, with all other headlines, or not at all."""

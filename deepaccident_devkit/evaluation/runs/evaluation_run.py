@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, ResultsError
-from deepaccident_devkit.evaluation.metrics.breakdowns import (
+from deepaccident_devkit.evaluation.breakdowns import (
     WITHIN_RECORDINGS,
     Breakdown,
     Group,
@@ -25,11 +24,10 @@ from deepaccident_devkit.evaluation.metrics.breakdowns import (
     breakdown,
     sample_attributes,
 )
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
-from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
-from deepaccident_devkit.evaluation.metrics.intervals import Resampling
-from deepaccident_devkit.evaluation.metrics.numbers import headlines
-from deepaccident_devkit.evaluation.metrics.warning import PreventedResult
+from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.frozen_mappings import plain
+from deepaccident_devkit.evaluation.intervals import Resampling
+from deepaccident_devkit.evaluation.numbers import headlines
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs.many_samples import checkpoint_path, evaluate_samples
 from deepaccident_devkit.evaluation.runs.selection import (
@@ -41,8 +39,10 @@ from deepaccident_devkit.evaluation.runs.selection import (
     scenario_of,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.warning import PreventedResult
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
+from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError, ResultsError
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import path_of, remove_in
-from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.parallel import Places, Store, run_batch, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
+from deepaccident_devkit.support.files import path_of, remove_in
+from deepaccident_devkit.support.json_text import parsed_json
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -15,15 +15,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
-from deepaccident_devkit.evaluation.metrics.intervals import (
-    Clusters,
-    Resampling,
-    difference_intervals,
-    numbers_of_draws,
-)
-from deepaccident_devkit.evaluation.metrics.numbers import has_interval
+from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.intervals import Clusters, Resampling, difference_intervals, numbers_of_draws
+from deepaccident_devkit.evaluation.numbers import has_interval
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 
 _ROUNDING: Final = 1e-9
 """Differences that differ by at most this share of them count as equal."""

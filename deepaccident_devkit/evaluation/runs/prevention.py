@@ -12,28 +12,28 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
-from deepaccident_devkit.evaluation.metrics.breakdowns import EVERYTHING, breakdown
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
-from deepaccident_devkit.evaluation.metrics.intervals import Resampling
-from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings
-from deepaccident_devkit.evaluation.metrics.warning.anticipation import LATENCIES
-from deepaccident_devkit.evaluation.metrics.warning.evaluator import PreventedEvaluator
-from deepaccident_devkit.evaluation.metrics.warning.prevention import (
+from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, breakdown
+from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.intervals import Resampling
+from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
+from deepaccident_devkit.evaluation.runs.predictors import number_text
+from deepaccident_devkit.evaluation.warning import CleanWarnings
+from deepaccident_devkit.evaluation.warning.anticipation import LATENCIES
+from deepaccident_devkit.evaluation.warning.evaluator import PreventedEvaluator
+from deepaccident_devkit.evaluation.warning.prevention import (
     NOMINAL,
     SETTINGS,
     AccidentOutcomes,
     OutcomeTable,
     PreventedResult,
 )
-from deepaccident_devkit.evaluation.metrics.warning.recordings import GIVEN, UNPLACED
-from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
-from deepaccident_devkit.evaluation.runs.predictors import number_text
+from deepaccident_devkit.evaluation.warning.recordings import GIVEN, UNPLACED
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.reports import Table
 from deepaccident_devkit.safety import OUTCOMES, Accident, Skipped, accident_of, outcomes_of, undisturbed
+from deepaccident_devkit.support.arrays import IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:

@@ -8,15 +8,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.metrics.accident import AccidentResult
-from deepaccident_devkit.evaluation.metrics.detection import DetectionProtocol
-from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
-from deepaccident_devkit.evaluation.metrics.motion import MotionResult
+from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
+from deepaccident_devkit.evaluation.accident import AccidentResult
+from deepaccident_devkit.evaluation.detection import DetectionProtocol
+from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.frozen_mappings import plain
+from deepaccident_devkit.evaluation.motion import MotionResult
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
-from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.reading import MOST_TOLD, check_size, fault_text, read_bytes, shortened
+from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.reading import check_size, fault_text, read_bytes
 
 Row = dict[str, Any]
 Cells = Iterator[tuple[str, Any]]

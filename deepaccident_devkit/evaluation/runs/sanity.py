@@ -16,20 +16,20 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxAccidents
-from deepaccident_devkit.evaluation.metrics.alarms.raised import LABEL_STEP, by_sureness, position_difference
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
-from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, frames_there, labels_at_present
+from deepaccident_devkit.evaluation.accident import AccidentContext, BoxAccidents
+from deepaccident_devkit.evaluation.alarms.raised import LABEL_STEP, by_sureness, position_difference
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.detection.boxes import columns_of
+from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 
 if TYPE_CHECKING:

@@ -7,13 +7,13 @@ from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal, get_args
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.motion import samples
 from deepaccident_devkit.motion.sample_lists import no_samples_text
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.text import choice, settle_choices, spelled
 from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS
-from deepaccident_devkit.text import choice, settle_choices, spelled
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]

@@ -9,24 +9,24 @@ from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS as ACCIDENT_PROTOCOLS
-from deepaccident_devkit.evaluation.metrics.accident import AccidentEvaluator, ReleasedAccidents, accident_context
-from deepaccident_devkit.evaluation.metrics.choices import switched
-from deepaccident_devkit.evaluation.metrics.detection import (
+from deepaccident_devkit.evaluation.accident import PROTOCOLS as ACCIDENT_PROTOCOLS
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator, ReleasedAccidents, accident_context
+from deepaccident_devkit.evaluation.choices import switched
+from deepaccident_devkit.evaluation.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
     DetectionEvaluator,
     detection_truth,
 )
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
-from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenDict
-from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningEvaluator
+from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.frozen_mappings import FrozenDict
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator
 from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, WarningEvaluator
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
 from deepaccident_devkit.parallel import Places
+from deepaccident_devkit.support.text import choice, settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import choice, settle_choices
 
 TaskName = Literal["motion", "accident", "detection", "warning"]
 TASK_PROTOCOLS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(

@@ -10,10 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import DeepAccidentError, ResultsError
-from deepaccident_devkit.evaluation.metrics.intervals import Resampling
+from deepaccident_devkit.errors import DeepAccidentError, ResultsError, shortened
+from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs.bundles import (
     COUNTS_FILE,
@@ -28,9 +27,9 @@ from deepaccident_devkit.evaluation.runs.bundles import (
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, evaluate_results
 from deepaccident_devkit.evaluation.runs.prevention import with_prevented
 from deepaccident_devkit.evaluation.runs.rows import sample_rows
-from deepaccident_devkit.files import path_of
-from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.reports import Report, Row, record_rows
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -20,10 +20,10 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import Route
 
 from deepaccident_devkit.explore.explorer import Explorer
-from deepaccident_devkit.pages import part, path_in_address
-from deepaccident_devkit.pages import rendered as filled
 from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.replay import replay_script, replay_style
+from deepaccident_devkit.support.pages import part, path_in_address
+from deepaccident_devkit.support.pages import rendered as filled
 
 KEPT: Final = "private, max-age=600"
 """A browser may keep pictures for some minutes: files of a release seldom change."""

@@ -13,7 +13,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation.metrics.numbers import value_text
+from deepaccident_devkit.evaluation.numbers import value_text
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison, compare_bundles
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.evaluations import Evaluated, evaluated, verdict

@@ -12,7 +12,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError, TokenError
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader
 from deepaccident_devkit.explore.background import Job
@@ -22,9 +22,9 @@ from deepaccident_devkit.explore.models import Model
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, part_of, picture
 from deepaccident_devkit.explore.pages.pictures import sample_of
 from deepaccident_devkit.explore.sample_lists import ORDERS, SampleChoices, is_sample, listed
-from deepaccident_devkit.pages import path_in_address
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.outcomes import render_evaluation, render_outcome_in_cameras
+from deepaccident_devkit.support.pages import path_in_address
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Kind = Literal["above", "cameras"]

@@ -19,7 +19,7 @@ from deepaccident_devkit.explore.pages.answers import explorer_of, page
 from deepaccident_devkit.explore.scenarios import VISIBILITY_RANKS, ending
 from deepaccident_devkit.selection.fields import FIELDS
 from deepaccident_devkit.splits import save_selection
-from deepaccident_devkit.text import number_text
+from deepaccident_devkit.support.text import number_text
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
-from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.motion.config import label_config
+from deepaccident_devkit.support.arrays import checked_whole
+from deepaccident_devkit.support.text import choice, possible_text
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
-from deepaccident_devkit.text import choice, possible_text
 from deepaccident_devkit.v2x import Agents
 
 EPOCH: Final = 1_704_067_200

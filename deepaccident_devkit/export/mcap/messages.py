@@ -33,12 +33,12 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.mcap.config import EPOCH
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.render.boxes import EDGES
 from deepaccident_devkit.render.roles import recorders_of
+from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR
 from deepaccident_devkit.v2x.configurations import Agents, agents_of, cooperating_agents

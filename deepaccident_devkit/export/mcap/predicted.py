@@ -8,11 +8,10 @@ from typing import Any, Final
 import numpy as np
 from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.export.mcap.config import Predictions
 from deepaccident_devkit.export.mcap.messages import (
@@ -39,6 +38,7 @@ from deepaccident_devkit.export.mcap.messages import (
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels, predict_instances
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, PREDICTED_COLOR
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 CELL_POINT: Final = np.dtype(

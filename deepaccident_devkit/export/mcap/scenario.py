@@ -18,7 +18,6 @@ from google.protobuf.wrappers_pb2 import DoubleValue
 from tqdm import tqdm
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.export.mcap.config import EXPORTED_CHANNELS, McapConfig, Predictions
@@ -45,7 +44,6 @@ from deepaccident_devkit.export.mcap.messages import (
     transform_message,
 )
 from deepaccident_devkit.export.mcap.predicted import MotionMaps, PredictedScenes
-from deepaccident_devkit.files import replacing
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion.config import label_config
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
@@ -54,6 +52,8 @@ from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.roles import role_colors
+from deepaccident_devkit.support.arrays import FloatArray, IntArray
+from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, LIDAR, UNTRACKED_ID
 from deepaccident_devkit.v2x import cooperative_view

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.errors import ResultsError, shortened
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.evaluation.results.entries import (
     Entries,
@@ -29,9 +29,9 @@ from deepaccident_devkit.evaluation.results.header import ContentError, at, show
 from deepaccident_devkit.evaluation.results.records import FORMAT, BoxEntry
 from deepaccident_devkit.export.keyframes import KEY_STEP
 from deepaccident_devkit.export.nuscenes.scenes import token
-from deepaccident_devkit.files import path_of
-from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.reading import fault_text, read_bytes, shortened
+from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 if TYPE_CHECKING:

@@ -25,10 +25,10 @@ from deepaccident_devkit.export.nuscenes.scenes import (
     token,
     write_sensors,
 )
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import SPLITS
-from deepaccident_devkit.text import settle_choices
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset

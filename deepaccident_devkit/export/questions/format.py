@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeAlias, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
-from deepaccident_devkit.evaluation.metrics.accident import box_truth
+from deepaccident_devkit.evaluation.accident import box_truth
 from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.questions.observed import (
     RATE,
@@ -28,11 +27,12 @@ from deepaccident_devkit.export.questions.observed import (
 )
 from deepaccident_devkit.export.questions.texts import answer_schema, readme
 from deepaccident_devkit.export.sensor_files import sensor_files
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.text import Word, choice, settle_choices, spelled
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS, AgentName
-from deepaccident_devkit.text import Word, choice, settle_choices, spelled
 from deepaccident_devkit.v2x.collisions import collision, labelled_pair
 from deepaccident_devkit.v2x.configurations import AGENT_SETS, agents_of, cooperating_agents
 from deepaccident_devkit.v2x.tracks import scenario_tracks

@@ -14,11 +14,18 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, checked_number, checked_whole
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.keyframes import KEY_STEP
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.geometry.boxes import concatenate
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked_number,
+    checked_whole,
+)
 from deepaccident_devkit.tables.tokens import agent_token, sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
 from deepaccident_devkit.v2x.cooperation import cooperative_view

@@ -16,15 +16,15 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, as_floats, checked, checked_number, checked_whole
 from deepaccident_devkit.dataset import Visible
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid, Boxes, LidarPointCloud, six_vectors
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.warps.warping import WarpMode
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, as_floats, checked, checked_number, checked_whole
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import OnError
-from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x import Agents, Link
 from deepaccident_devkit.v2x.link import checked_link
 

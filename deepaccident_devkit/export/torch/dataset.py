@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.export.image_cache import ImageCache
@@ -19,6 +18,7 @@ from deepaccident_devkit.export.torch.collate import V2XItem
 from deepaccident_devkit.export.torch.config import V2XConfig, augmented_boxes, augmented_six_vectors
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
+from deepaccident_devkit.support.arrays import checked_whole
 from deepaccident_devkit.tables.tokens import agent_token
 from deepaccident_devkit.v2x import cooperative_boxes
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator, EvaluatorT
+from deepaccident_devkit.evaluation.evaluator import Evaluator, EvaluatorT
 
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup

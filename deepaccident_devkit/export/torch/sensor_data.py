@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.export.image_cache import ImageCache
@@ -16,6 +15,7 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.torch.config import V2XConfig, augmented_points, augmented_pose
 from deepaccident_devkit.motion import Augmentation
 from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import LIDAR, AgentName
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents

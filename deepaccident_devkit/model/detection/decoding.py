@@ -11,14 +11,14 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, check_least
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.geometry.footprints import intersection_areas
 from deepaccident_devkit.model.detection.head import CODE_CHANNELS, ClassSlots, DetectionConfig, TaskMaps
 from deepaccident_devkit.model.detection.targets import gather_cells, precise
-from deepaccident_devkit.text import settle_choices
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, check_least
+from deepaccident_devkit.support.text import settle_choices
 
 Method = Literal["rotated", "circle"]
 _FOOTPRINT = [0, 1, 3, 4, 6]

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.support.arrays import check_least
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES
-from deepaccident_devkit.text import settle_choices
 
 Axis = tuple[float, float, float]
 ClassSlots = tuple[tuple[int | None, ...], ...]

@@ -9,11 +9,11 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.detection.head import CODE_CHANNELS, CODE_SIZE, DetectionConfig, TaskMaps
+from deepaccident_devkit.support.arrays import check_least
+from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES
-from deepaccident_devkit.text import settle_choices
 
 
 def peak_radius(length: Tensor, width: Tensor, min_overlap: float) -> Tensor:

@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.fusion.attention import FeedForward, PreNorm, Windows, attention
 from deepaccident_devkit.model.fusion.simple import Fusion, masked_mean, visible
 from deepaccident_devkit.model.images.swin import relative_positions
-from deepaccident_devkit.text import settle_choices
+from deepaccident_devkit.support.text import settle_choices
 
 _RELATIONS = 3
 """An agent and itself, the ego and a partner, two partners."""

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.temporal import Bottleneck3d, TemporalBlock
-from deepaccident_devkit.text import settle_choices
+from deepaccident_devkit.support.text import settle_choices
 
 
 class Fusion(nn.Module, ABC):

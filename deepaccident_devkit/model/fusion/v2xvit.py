@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.fusion.attention import AgentAttention, FeedForward, MultiWindowAttention, PreNorm
 from deepaccident_devkit.model.fusion.simple import Fusion, visible
-from deepaccident_devkit.text import settle_choices
+from deepaccident_devkit.support.text import settle_choices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

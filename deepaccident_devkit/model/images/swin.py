@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.reading import shortened
+from deepaccident_devkit.errors import ConfigError, shortened
 
 
 class WindowAttention(nn.Module):

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from deepaccident_devkit.arrays import check_least
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.model.motion.decoders import (
     HIDDEN_WARPS,
@@ -22,7 +21,8 @@ from deepaccident_devkit.model.motion.decoders import (
     SharedDecoder,
     SpatialDistribution,
 )
-from deepaccident_devkit.text import settle_choices
+from deepaccident_devkit.support.arrays import check_least
+from deepaccident_devkit.support.text import settle_choices
 
 IGNORE_INDEX: Final = 255
 """What offset and flow have outside instances (`motion.MotionLabelConfig.ignore_index`)."""

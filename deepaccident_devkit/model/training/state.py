@@ -15,11 +15,11 @@ import torch
 from torch import Tensor, distributed, nn
 from torch.optim import AdamW
 
-from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.json_text import as_record, parsed_json
+from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.model.checkpoint import LAST, OPTIMIZER, read_weights, reason_of, write_weights
-from deepaccident_devkit.reading import fault_text, read_bytes, shortened
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.json_text import as_record, parsed_json
+from deepaccident_devkit.support.reading import fault_text, read_bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,8 +20,6 @@ from tqdm.auto import tqdm
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import writable_folder, write_bytes
-from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.presets import ModelChoice
@@ -48,8 +46,10 @@ from deepaccident_devkit.model.training.step import (
     training_batch,
     with_dropped_partners,
 )
-from deepaccident_devkit.reading import fault_text, read_bytes
 from deepaccident_devkit.render.training import save_training
+from deepaccident_devkit.support.files import writable_folder, write_bytes
+from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.reading import fault_text, read_bytes
 
 logger = logging.getLogger(__name__)
 RUN: Final = "run.json"

@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, IntArray, checked, checked_whole
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry.bev_grid import Axis
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
@@ -26,6 +25,7 @@ from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.settings import count
 from deepaccident_devkit.motion.warps.chains import frames_from_next
 from deepaccident_devkit.motion.warps.warping import sampling_matrix
+from deepaccident_devkit.support.arrays import AnyArray, IntArray, checked, checked_whole
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
 _FAR: Final = 2**24

@@ -17,8 +17,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, checked
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, checked
 
 _FIXED = 16
 """Binary digits after the point, for the place where an edge crosses a row."""

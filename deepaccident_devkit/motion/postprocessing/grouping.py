@@ -15,7 +15,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import (
+from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
+from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.orientations import to_orientation
+from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,
     FloatArray,
@@ -25,11 +29,7 @@ from deepaccident_devkit.arrays import (
     checked,
     readonly,
 )
-from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
-from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.orientations import to_orientation
-from deepaccident_devkit.text import settle_choices
+from deepaccident_devkit.support.text import settle_choices
 
 LABEL_LOGIT: Final = 10.0
 """The right class's logit when the released evaluation treats labels as a prediction; the other class has 0."""

@@ -10,7 +10,6 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, readonly
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
@@ -27,7 +26,8 @@ from deepaccident_devkit.motion.postprocessing.grouping import (
 )
 from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol
 from deepaccident_devkit.motion.settings import count, flag, number
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, readonly
+from deepaccident_devkit.support.text import choice
 
 Foreground = Literal["argmax", "sigmoid"]
 FOREGROUND_THRESHOLD: Final = 0.4

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, checked
 from deepaccident_devkit.geometry import six_vectors
 from deepaccident_devkit.geometry.handedness import flip_pose, flip_six_vector
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
+from deepaccident_devkit.support.arrays import AnyArray, checked
 from deepaccident_devkit.v2x import future_egomotion
 
 

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepaccident_devkit.arrays import Float32Array, FloatArray, IntArray
 from deepaccident_devkit.geometry import six_vectors as geometry_six_vectors
+from deepaccident_devkit.support.arrays import Float32Array, FloatArray, IntArray
 
 _SINE: Final = (2.605780704850265e-06, -0.00019809602928568679, 0.008333066246354204, -0.16666659550431576, 1.0)
 """sin t / t as a polynomial of t², the highest power first.

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, as_numbers, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.handedness import flip_pose
@@ -25,6 +24,7 @@ from deepaccident_devkit.motion.warps.warping import (
     take_cells,
     warp,
 )
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, as_numbers, checked
 
 
 def maps_to_present(

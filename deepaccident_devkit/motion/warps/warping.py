@@ -28,14 +28,14 @@ from typing import Final, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepaccident_devkit.arrays import AnyArray, Float32Array, FloatArray, IntArray, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
 from deepaccident_devkit.motion.orientations import axes_of
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.support.arrays import AnyArray, Float32Array, FloatArray, IntArray, checked
+from deepaccident_devkit.support.text import choice
 
 WarpMode = Literal["nearest", "bilinear"]
 CellIndices = NDArray[np.intp]

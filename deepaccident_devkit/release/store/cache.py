@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import place_in, remove_in, temporary_of, write_bytes
-from deepaccident_devkit.reading import bytes_of, fault_text
+from deepaccident_devkit.support.files import place_in, remove_in, temporary_of, write_bytes
+from deepaccident_devkit.support.reading import bytes_of, fault_text
 
 FOLDER_VARIABLE: Final = "DEEPACCIDENT_CACHE"
 SIZE_VARIABLE: Final = "DEEPACCIDENT_CACHE_SIZE"

@@ -15,10 +15,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.errors import DatarootError, IndexStoreError
-from deepaccident_devkit.files import replacing
-from deepaccident_devkit.reading import irregular_text, shortened
+from deepaccident_devkit.errors import DatarootError, IndexStoreError, shortened
+from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.reading import irregular_text
 
 FORM: Final = 2
 """Counts up whenever the file's form or its meaning changes."""

@@ -15,9 +15,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError
-from deepaccident_devkit.files import is_writable_folder, path_text
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.reading import fault_text, open_file
 from deepaccident_devkit.release.store.members import FORM, Listing, Members, write_members
 from deepaccident_devkit.release.store.names import (
     MINI_FOLDER,
@@ -32,6 +30,8 @@ from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, Store
 from deepaccident_devkit.release.store.sources import UrlSource, asked
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.release.store.zips import list_zip
+from deepaccident_devkit.support.files import is_writable_folder, path_text
+from deepaccident_devkit.support.reading import fault_text, open_file
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

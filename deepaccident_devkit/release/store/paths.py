@@ -12,8 +12,8 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import TypeAlias
 
 from deepaccident_devkit.errors import DatarootError, NotAvailableError
-from deepaccident_devkit.reading import FileKind, fault_text
 from deepaccident_devkit.release.store.store import COMPARES, READ_BEFORE, Store
+from deepaccident_devkit.support.reading import FileKind, fault_text
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 from urllib.parse import urlsplit
 
-from deepaccident_devkit.errors import DatarootError, MissingExtraError
-from deepaccident_devkit.reading import MOST_TOLD, RefusedFileError, open_file, shortened
+from deepaccident_devkit.errors import MOST_TOLD, DatarootError, MissingExtraError, shortened
+from deepaccident_devkit.support.reading import RefusedFileError, open_file
 
 Result = TypeVar("Result")
 _SECRETS: Final = re.compile(r"\?\S*|(?<=://)[^/@\s]+@")

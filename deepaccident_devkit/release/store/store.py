@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
-from deepaccident_devkit.reading import FileKind, RefusedFileError, check_size, fault_text
 from deepaccident_devkit.release.store.cache import FileCache
 from deepaccident_devkit.release.store.members import Member, Members
 from deepaccident_devkit.release.store.sources import Range, Source, source_of
 from deepaccident_devkit.release.store.zips import HEAD_LENGTH, LONGEST_HEAD, damaged, head_length, member_bytes
+from deepaccident_devkit.support.reading import FileKind, RefusedFileError, check_size, fault_text
 
 _SENSOR_KINDS: Final[tuple[FileKind, ...]] = ("image", "lidar", "bev")
 COMPARES: ContextVar[bool] = ContextVar("compares", default=False)

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
-from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, ERRORS_AT, Alarm, hit_of
-from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
+from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
+from deepaccident_devkit.evaluation.accident.scoring import DISTANCES, ERRORS_AT, Alarm, hit_of
+from deepaccident_devkit.evaluation.evaluator import Counts, ratio
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.boxes import write_beside
 from deepaccident_devkit.render.chips import keep_free
@@ -20,6 +19,7 @@ from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_title
+from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

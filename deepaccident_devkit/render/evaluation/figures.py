@@ -12,20 +12,19 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.arrays import BoolArray
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.metrics.accident import compared_accidents
-from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
-from deepaccident_devkit.evaluation.metrics.breakdowns import EVERYTHING, WITHIN_RECORDINGS, Breakdown
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
-from deepaccident_devkit.evaluation.metrics.motion.evaluator import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.numbers import Headline, headlines
-from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, frames_there, labels_at_present
-from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult
+from deepaccident_devkit.evaluation.accident import compared_accidents
+from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, WITHIN_RECORDINGS, Breakdown
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
+from deepaccident_devkit.evaluation.motion.evaluator import MotionEvaluator
+from deepaccident_devkit.evaluation.numbers import Headline, headlines
+from deepaccident_devkit.evaluation.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader
+from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axes_or_new, detached_figure, titled_from_above
 from deepaccident_devkit.render.colors import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR
@@ -36,6 +35,7 @@ from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_dete
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title, set_title
+from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:

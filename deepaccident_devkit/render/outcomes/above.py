@@ -8,20 +8,19 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray, ShortRepr
-from deepaccident_devkit.evaluation.metrics.accident import AccidentResult, BoxTruth, ComparedAccidents
-from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentsWithin
-from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
-from deepaccident_devkit.evaluation.metrics.detection import (
+from deepaccident_devkit.evaluation.accident import AccidentResult, BoxTruth, ComparedAccidents
+from deepaccident_devkit.evaluation.accident.scoring import AccidentsWithin
+from deepaccident_devkit.evaluation.alarms.raised import position_difference
+from deepaccident_devkit.evaluation.detection import (
     DetectedBoxes,
     DetectionMatches,
     DetectionProtocol,
     detection_matches,
     detection_protocol,
 )
-from deepaccident_devkit.evaluation.metrics.motion.evaluator import RANGES
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_matches
-from deepaccident_devkit.evaluation.metrics.predictions import (
+from deepaccident_devkit.evaluation.motion.evaluator import RANGES
+from deepaccident_devkit.evaluation.motion.overlaps import vpq_matches
+from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,
     cells_within,
@@ -37,6 +36,7 @@ from deepaccident_devkit.render.colors import BEYOND_COLOR, COLLIDER_COLOR, OUTC
 from deepaccident_devkit.render.legends import INSIDE, draw_legend, draw_legend_of_fills
 from deepaccident_devkit.render.motion_maps import MotionMaps, draw_trail_of, maps_of_labels, maps_of_output
 from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray, ShortRepr
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

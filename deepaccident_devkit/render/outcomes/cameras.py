@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.predictions import Prediction
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Prediction
 from deepaccident_devkit.geometry import SE3, Boxes, PinholeCamera
 from deepaccident_devkit.maps.polygons import outlines
 from deepaccident_devkit.motion import MotionLabels
@@ -34,8 +33,9 @@ from deepaccident_devkit.render.outcomes.evaluation import (
 )
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, OWN_ACTOR_ID, POLE_HEIGHT
-from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x.projection import camera_of
 
 if TYPE_CHECKING:

@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.evaluation.metrics.accident import (
+from deepaccident_devkit.evaluation.accident import (
     AccidentEvaluator,
     BoxTruth,
     ComparedAccidents,
     accident_context,
     compared_accidents,
 )
-from deepaccident_devkit.evaluation.metrics.detection import (
+from deepaccident_devkit.evaluation.detection import (
     DetectedBoxes,
     DetectionEvaluator,
     DetectionMatches,
@@ -26,8 +25,8 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     detection_protocol,
     detection_truth,
 )
-from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.predictions import (
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,
     Prediction,
@@ -59,8 +58,9 @@ from deepaccident_devkit.render.outcomes.above import (
 from deepaccident_devkit.render.roles import collider_ids
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
-from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

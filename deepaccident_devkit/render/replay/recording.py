@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.roles import actor_color, agent_letters, recorders_of
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, AgentName, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents

@@ -12,8 +12,6 @@ from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
-from deepaccident_devkit.files import path_of, write_bytes
-from deepaccident_devkit.pages import document, part, source_hash
 from deepaccident_devkit.render.colors import (
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
@@ -43,6 +41,8 @@ from deepaccident_devkit.render.replay.sensors import (
     lidar_points,
 )
 from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
+from deepaccident_devkit.support.files import path_of, write_bytes
+from deepaccident_devkit.support.pages import document, part, source_hash
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
 from deepaccident_devkit.v2x import Agents
 

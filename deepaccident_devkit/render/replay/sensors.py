@@ -11,7 +11,6 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray, as_floats
 from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
@@ -19,6 +18,7 @@ from deepaccident_devkit.parallel import own_threads, run_batch
 from deepaccident_devkit.release import read_image
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.replay.recording import Recording
+from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray, as_floats
 from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 

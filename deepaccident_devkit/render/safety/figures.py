@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.render.axes import figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
@@ -24,8 +23,9 @@ from deepaccident_devkit.safety import (
 )
 from deepaccident_devkit.safety.avoidability import GROUPS
 from deepaccident_devkit.safety.lead_times import CAVEAT
+from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import AGENTS, short_name
-from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

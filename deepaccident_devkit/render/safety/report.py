@@ -13,10 +13,7 @@ from urllib.parse import quote
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.files import place_in, plain_names, writable_folder, write_bytes
-from deepaccident_devkit.pages import document, part
 from deepaccident_devkit.parallel import Engine, Places, run_batch
-from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.pictures import write_figure
@@ -31,8 +28,11 @@ from deepaccident_devkit.safety import COALITIONS, OUTCOMES, PARTNERS, AccidentR
 from deepaccident_devkit.safety.avoidability import GROUPS
 from deepaccident_devkit.safety.lead_times import CAVEAT
 from deepaccident_devkit.safety.report import CRITICAL, DECELERATIONS, actor_name
+from deepaccident_devkit.support.files import place_in, plain_names, writable_folder, write_bytes
+from deepaccident_devkit.support.pages import document, part
+from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.text import number_text
 from deepaccident_devkit.taxonomy import AGENTS, short_name
-from deepaccident_devkit.text import number_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,8 +6,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays
 from deepaccident_devkit.release.npz import TAGS
+from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays
 from deepaccident_devkit.synth.roads.layout import EXTENT, KERB_RADIUS, LANE_WIDTH, OUTWARD, Arm, RoadSpec, slot_edges
 
 MAP_EXTENT = EXTENT

@@ -6,8 +6,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, ShortRepr, readonly
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.support.arrays import FloatArray, ShortRepr, readonly
 from deepaccident_devkit.synth.roads.ground import GroundMap, paint_junction
 from deepaccident_devkit.synth.roads.layout import ARMS, KERB_RADIUS, OUTWARD, Arm, RoadSpec, Terrain, parking_places
 from deepaccident_devkit.synth.roads.paths import (

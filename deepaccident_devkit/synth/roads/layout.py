@@ -6,9 +6,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import Float32Array, FloatArray
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.support.arrays import Float32Array, FloatArray
+from deepaccident_devkit.support.text import choice
 
 Arm = Literal["west", "south", "east", "north"]
 ARMS: tuple[Arm, ...] = get_args(Arm)

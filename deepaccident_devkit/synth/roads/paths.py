@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked, readonly
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked, readonly
 
 SPACING = 0.1
 """The largest distance between samples, metres."""

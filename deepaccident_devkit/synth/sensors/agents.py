@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.geometry import SE3, PinholeCamera, handedness, quaternions
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.release import Calib
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.actors import Actor, Actors
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.stage import World

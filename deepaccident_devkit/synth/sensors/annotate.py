@@ -10,10 +10,10 @@ from itertools import combinations
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.release import Labels, label_from_world_velocity
+from deepaccident_devkit.support.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.synth.sensors.agents import Agent, Camera
 from deepaccident_devkit.synth.sensors.lidar import Scan
 from deepaccident_devkit.synth.sensors.scene import Scene

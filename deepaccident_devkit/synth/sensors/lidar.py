@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray, readonly
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray, readonly
 from deepaccident_devkit.synth.sensors.agents import Agent
 from deepaccident_devkit.synth.sensors.caster import NOTHING, make_caster
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, ByteArray, Float32Array, FloatArray, readonly
+from deepaccident_devkit.support.arrays import AnyArray, ByteArray, Float32Array, FloatArray, readonly
 from deepaccident_devkit.synth.roads import MAP_EXTENT, Arm
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.solids import Color

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.synth.sensors.caster import NOTHING
 from deepaccident_devkit.synth.sensors.light import Light
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting, Surfaces

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.synth.roads import Arm, Terrain
 from deepaccident_devkit.synth.sensors.agents import Camera
 from deepaccident_devkit.synth.sensors.annotate import nearest_movers

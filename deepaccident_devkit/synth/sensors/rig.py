@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage, Calib, Labels
 from deepaccident_devkit.release.npz import TAGS
+from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.synth.actors import Actors
 from deepaccident_devkit.synth.config import Sensors
 from deepaccident_devkit.synth.roads import MAP_EXTENT, MAP_RESOLUTION, TERRAIN, Arm, GroundMap, tag_of_code

@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.synth.actors import Actors, Snapshot
 from deepaccident_devkit.synth.roads import Terrain
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, Caster, make_caster, plane_distance

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.synth import roads
 from deepaccident_devkit.synth.roads import MAP_CELLS, MAP_EXTENT, MAP_RESOLUTION, GroundMap, Terrain
 from deepaccident_devkit.synth.sensors.caster import NOTHING

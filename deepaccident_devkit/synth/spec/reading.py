@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
 
-from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.reading import shortened
+from deepaccident_devkit.errors import ConfigError, shortened
+from deepaccident_devkit.support.text import meant_text, spelled
 from deepaccident_devkit.synth.spec.model import Bounds, Choice, Fixed, Items, OneOf, Part, Range, key_of
-from deepaccident_devkit.text import meant_text, spelled
 
 if TYPE_CHECKING:
     import yaml

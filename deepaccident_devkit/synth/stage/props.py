@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, TREE, Arm, GroundMap, RoadSpec, Terrain
 from deepaccident_devkit.synth.roads.layout import KERB_RADIUS, OUTWARD
 from deepaccident_devkit.synth.solids import Block, Color, Solids, build

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.synth.roads import Arm, GroundMap, Junction, Terrain
 from deepaccident_devkit.synth.roads.layout import OUTWARD
 from deepaccident_devkit.synth.solids import Solids

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.actors import Body, random_body
 from deepaccident_devkit.synth.roads import Junction, Path, Route
 from deepaccident_devkit.synth.roads.layout import OUTWARD

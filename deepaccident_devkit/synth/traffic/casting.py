@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.actors import random_body
 from deepaccident_devkit.synth.roads import LANE_WIDTH, Arm, Junction, Path, Route, Turn, crossing, lane_change
 from deepaccident_devkit.synth.spec import ActorSpec, MeetSpec, ScenarioSpec

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.collision import gap, separation
 from deepaccident_devkit.synth.traffic.simulate import Simulation
 

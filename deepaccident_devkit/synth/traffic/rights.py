@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.synth.roads.layout import OUTWARD, Arm
 from deepaccident_devkit.synth.roads.paths import Path
 from deepaccident_devkit.synth.traffic.users import RoadUser

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.actors import Body
 from deepaccident_devkit.synth.roads import Arm, Junction, Path, Route, Turn, straight
 from deepaccident_devkit.synth.roads.layout import OUTWARD, RoadSpec

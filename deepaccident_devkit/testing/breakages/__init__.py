@@ -6,12 +6,12 @@ from pathlib import Path
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import ScenarioFolder, find_release
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 from deepaccident_devkit.testing.breakages import files, folders, legal, sensors
 from deepaccident_devkit.testing.breakages.kinds import Breakage, BrokenRelease, Victim
 from deepaccident_devkit.testing.editing import ScenarioEditor
 from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
-from deepaccident_devkit.text import choice
 
 _GROUPS = (
     files.LABEL_FORM,

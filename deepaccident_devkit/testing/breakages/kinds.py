@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, AgentName
 from deepaccident_devkit.testing.editing import ScenarioEditor
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
 from deepaccident_devkit.release import read_image, write_image
+from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
 from deepaccident_devkit.testing.breakages.kinds import Group, Victim
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.baselines import SeenActors, seen_actors
 from deepaccident_devkit.baselines.predict import label_times, motion_of
 from deepaccident_devkit.evaluation import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 
 CLEAN = MOTION_PROTOCOLS["released"].__class__(labels="clean")

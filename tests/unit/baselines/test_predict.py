@@ -13,7 +13,7 @@ from deepaccident_devkit.baselines import (
 )
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError
 from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, detection_truth
-from deepaccident_devkit.evaluation.metrics.accident import accident_context
+from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabelConfig

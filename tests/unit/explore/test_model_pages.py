@@ -20,8 +20,8 @@ from evaluation_runs import BREAKDOWNS, PARTIAL, stored_run
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.metrics.breakdowns import tokens_by_value
-from deepaccident_devkit.evaluation.metrics.predictions import Accident
+from deepaccident_devkit.evaluation.breakdowns import tokens_by_value
+from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,

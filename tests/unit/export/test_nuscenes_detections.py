@@ -12,7 +12,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.detection import detection_truth
+from deepaccident_devkit.evaluation.detection import detection_truth
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.results.entries import detection_entries
 from deepaccident_devkit.export.nuscenes.detections import OTHER_CLASSES, results_from_nuscenes

@@ -20,7 +20,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.shards import SPLIT_NAMES
 from deepaccident_devkit.export.webdataset import JSON_FIELDS, WebDataset
-from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.taxonomy import CAMERAS
 
 FILES = [f"camera_{side}.jpg" for side in ("front", "front_left", "front_right", "back", "back_left", "back_right")]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.maps import TownMap, town_map
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.scenario import build_scenario

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps.counting import GROUND_CLASSES, cells_around, codes_in_world
 from deepaccident_devkit.release.npz import TAGS
+from deepaccident_devkit.support.arrays import ByteArray
 
 
 def checkered(side: int) -> ByteArray:

@@ -10,9 +10,9 @@ import pytest
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.maps import TownMap, TownMapConfig, kept_town_map, making, town_map, towns_of
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA

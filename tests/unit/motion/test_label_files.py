@@ -27,7 +27,6 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, LabelFilesError, NotAvailableError, TokenError
-from deepaccident_devkit.files import replacing, temporary_path
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -45,6 +44,7 @@ from deepaccident_devkit.motion import (
 )
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST, NOBODY, NOWHERE, StoredLabels, write_array
+from deepaccident_devkit.support.files import replacing, temporary_path
 from deepaccident_devkit.taxonomy import AGENTS
 
 PAGE = Path(__file__).parents[3] / "schema" / "motion_labels.md"

@@ -7,7 +7,6 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import LabelFilesError, NotAvailableError, SomeFailedError
-from deepaccident_devkit.files import temporary_path
 from deepaccident_devkit.motion import (
     LabelFiles,
     LabelsWritten,
@@ -17,6 +16,7 @@ from deepaccident_devkit.motion import (
     write_label_files,
 )
 from deepaccident_devkit.motion.label_folder import Manifest, label_store
+from deepaccident_devkit.support.files import temporary_path
 
 
 def contents(folder: Path) -> dict[str, bytes]:

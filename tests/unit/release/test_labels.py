@@ -10,9 +10,9 @@ from refusals import assert_refused
 from strategies import mutations
 
 from deepaccident_devkit.errors import LabelError, MissingFileError
-from deepaccident_devkit.reading import LIMITS_VARIABLE
 from deepaccident_devkit.release import Labels, read_label, read_labels, write_label
 from deepaccident_devkit.release.labels import read_lone_words
+from deepaccident_devkit.support.reading import LIMITS_VARIABLE
 
 # lines of real labels; docs/format.md, Label, says what each value is
 HEADER = "0.0034441 -5.6166797"

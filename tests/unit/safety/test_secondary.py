@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from replayed_accidents import CAR, rear_end, straight
 
-from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.safety.contact import secondary_contacts
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.v2x.tracks import ScenarioTracks
 
 CASE = rear_end(20, 10)

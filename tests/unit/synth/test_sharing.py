@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import temporary_path
+from deepaccident_devkit.support.files import temporary_path
 from deepaccident_devkit.synth import SynthConfig, generate, make_release
 from deepaccident_devkit.synth.generate import Unfinished
 

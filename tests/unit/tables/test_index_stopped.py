@@ -21,8 +21,8 @@ from tiny_index import INDEX, THIRD, contents, edit, opened
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import temporary_path
 from deepaccident_devkit.release import find_release
+from deepaccident_devkit.support.files import temporary_path
 from deepaccident_devkit.tables import Index, Tables, clear_index, open_index
 from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables.index import MANIFEST_FILE

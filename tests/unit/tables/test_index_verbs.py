@@ -8,9 +8,9 @@ import pytest
 from click.testing import CliRunner
 from tiny_index import INDEX, contents, opened
 
-from deepaccident_devkit import files
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import IndexStoreError, VersionError
+from deepaccident_devkit.support import files
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables.index import MANIFEST_FILE, SCHEMA_VERSION

@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.runs import (
     save_run,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.reading import file_checksum
+from deepaccident_devkit.support.reading import file_checksum
 
 FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}
 MISFITS: dict[str, tuple[Callable[[Any], object], str]] = {
@@ -164,7 +164,7 @@ class TestPlaces:
                 raise OSError(28, "No space left on device")
             replace_file(source, target)
 
-        monkeypatch.setattr("deepaccident_devkit.files.os.replace", full)
+        monkeypatch.setattr("deepaccident_devkit.support.files.os.replace", full)
         with pytest.raises(ResultsError, match=r"bundle: cannot be written \(.*No space left"):
             save_run(replace(run, sanity={}), folder, overwrite=True)
         assert {name: file_checksum(folder / name) for name in FILES} == before

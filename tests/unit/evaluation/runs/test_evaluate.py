@@ -10,7 +10,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import AccidentEvaluator, Resampling, accident_context, sample_attributes
-from deepaccident_devkit.evaluation.metrics.breakdowns import WITHIN_RECORDINGS
+from deepaccident_devkit.evaluation.breakdowns import WITHIN_RECORDINGS
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter
 from deepaccident_devkit.evaluation.runs import (
     BREAKDOWNS,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
-from deepaccident_devkit.evaluation.metrics.intervals import Resampling
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.runs.paired import (
     PairedTest,
     Swaps,

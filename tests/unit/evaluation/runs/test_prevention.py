@@ -21,11 +21,11 @@ from deepaccident_devkit.evaluation import (
     WarningEvaluator,
     accident_context,
 )
-from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS
-from deepaccident_devkit.evaluation.metrics.warning.recordings import REFERENCES
 from deepaccident_devkit.evaluation.runs import prevented_accidents, with_prevented
 from deepaccident_devkit.evaluation.runs.prevention import accident_outcomes, prevention_tables, prevention_text
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.warning.prevention import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.warning.recordings import REFERENCES
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, accident_of, outcomes, outcomes_of
 
 EVERYONE = ("ego_vehicle", "other_vehicle_behind", "infrastructure")

@@ -13,9 +13,9 @@ from memory_results import MemoryResults
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.accident import accident_context
-from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
+from deepaccident_devkit.evaluation.accident import accident_context
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.runs import sanity as sanity_module
 from deepaccident_devkit.evaluation.runs.sanity import (
     SanityReport,

@@ -20,9 +20,9 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     instances_of,
 )
-from deepaccident_devkit.evaluation.metrics.warning import WarningEvaluator
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.warning import WarningEvaluator
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabels
 

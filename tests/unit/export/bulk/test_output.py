@@ -10,7 +10,7 @@ import pytest
 
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.export.bulk import Link, Output
-from deepaccident_devkit.files import temporary_path
+from deepaccident_devkit.support.files import temporary_path
 
 
 @pytest.fixture

@@ -28,8 +28,8 @@ from deepaccident_devkit.errors import (
 )
 from deepaccident_devkit.export import bulk
 from deepaccident_devkit.export.bulk import Exported, Tally, export_release
-from deepaccident_devkit.files import temporary_of, temporary_path
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
+from deepaccident_devkit.support.files import temporary_of, temporary_path
 from deepaccident_devkit.taxonomy import AGENTS
 
 SCENARIOS, PICTURES = 3, 18

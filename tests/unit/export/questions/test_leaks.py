@@ -13,11 +13,11 @@ import pytest
 from question_files import Asked, accident_of, ask
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.release import read_meta
 from deepaccident_devkit.release.layout import find_release
 from deepaccident_devkit.release.meta import write_meta
+from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.testing.editing import FIELD, ScenarioEditor
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult
+from deepaccident_devkit.evaluation.detection.result import DetectionResult
 from deepaccident_devkit.motion import samples
 
 

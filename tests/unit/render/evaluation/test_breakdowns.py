@@ -4,9 +4,9 @@ from drawing import new_axes
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
-from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
-from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult
+from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
+from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
+from deepaccident_devkit.evaluation.detection.result import DetectionResult
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.evaluation import render_breakdown
 

@@ -5,7 +5,7 @@ from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult
+from deepaccident_devkit.evaluation.detection.result import DetectionResult
 from deepaccident_devkit.render.evaluation import render_precision_recall
 
 

@@ -5,8 +5,8 @@ import pytest
 from drawing import new_axes, words
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.evaluation.metrics.warning import PreventedResult, PreventionCurve, PreventionFigures
-from deepaccident_devkit.evaluation.metrics.warning.prevention import NOMINAL, SETTINGS, OutcomeFigures
+from deepaccident_devkit.evaluation.warning import PreventedResult, PreventionCurve, PreventionFigures
+from deepaccident_devkit.evaluation.warning.prevention import NOMINAL, SETTINGS, OutcomeFigures
 from deepaccident_devkit.render.evaluation import render_prevention
 from deepaccident_devkit.safety import OUTCOMES
 

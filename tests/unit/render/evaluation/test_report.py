@@ -16,7 +16,7 @@ from report_page import page_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, OutputFolderError
-from deepaccident_devkit.evaluation.metrics.numbers import headlines
+from deepaccident_devkit.evaluation.numbers import headlines
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.render.colors import WARNING_COLOR
 from deepaccident_devkit.render.evaluation import save_report

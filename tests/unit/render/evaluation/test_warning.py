@@ -2,7 +2,7 @@
 
 from drawing import new_axes, words
 
-from deepaccident_devkit.evaluation.metrics.warning import WarningEvaluator
+from deepaccident_devkit.evaluation.warning import WarningEvaluator
 from deepaccident_devkit.render.evaluation import render_predictors
 
 

@@ -11,8 +11,8 @@ from replay_page import accident, data_of, normal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation import Accident, instances_of
-from deepaccident_devkit.evaluation.metrics.detection.boxes import DetectedBoxes
-from deepaccident_devkit.evaluation.metrics.predictions import labels_at_present
+from deepaccident_devkit.evaluation.detection.boxes import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import labels_at_present
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels

@@ -1,0 +1,252 @@
+"""`AccidentReading`: how an accident is read off instance maps, by the paper's words.
+
+docs/released_code.md, Paper versus code, has where the released code differs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.alarms.hulls import convex_hulls, hull_distances
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import Orientation
+from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
+from deepaccident_devkit.motion.orientations import cells_in
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
+
+TIE: Final = 1e-9
+"""Lengths that differ by less, in metres, are equal: means of cells are inexact in the last bits."""
+_TIE_DECIMALS: Final = 9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AccidentReading:
+    """Which instances collide: those whose cells' centres have convex hulls (points and lines allowed) near each other.
+
+    Of heads the instances are those of the paper's motion metrics; the present frame counts, and the frame of a pair's
+    accident is where it is closest, the earliest if there are several.
+
+    Attributes:
+        danger_distance: metres; instances that come nearer to each other collide. The paper says 1 m.
+    """
+
+    danger_distance: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the value; raises ConfigError."""
+        if not 0 < self.danger_distance < np.inf:
+            raise ConfigError(f"danger_distance: expected metres above 0, found {self.danger_distance!r}")
+
+
+def instances_of_heads(heads: MotionHeads) -> AnyArray:
+    """(T, H, W) the instances of heads, in their orientation, read off as for the motion metrics."""
+    return predict_instances(heads, "motion").instance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InstanceTracks(FrozenArrays):
+    """Where instances are at T moments; arrays are read-only.
+
+    Attributes:
+        identity: (I,) int64, ascending.
+        center: (T, I, 2) float64 mean of their cells, x forward, y left, metres; NaN where they are not.
+    """
+
+    identity: IntArray
+    center: FloatArray
+
+    def at(self, frame: int, identities: tuple[int, int]) -> FloatArray:
+        """(2, 2) where two instances are at a moment; NaN where they are not."""
+        return np.asarray(self.center[frame, self.identity.searchsorted(identities)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contact:
+    """The two instances that collide.
+
+    Attributes:
+        frame: of the maps, from 0.
+        ids: ascending.
+        distance: metres between their outlines.
+    """
+
+    frame: int
+    ids: tuple[int, int]
+    distance: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InstanceAccident:
+    """What is read off one set of instance maps.
+
+    Attributes:
+        tracks: of all instances.
+        contact: None if no pair comes near enough.
+    """
+
+    tracks: InstanceTracks
+    contact: Contact | None
+
+    @property
+    def positions(self) -> FloatArray:
+        """(2, 2) x forward, y left of the two that collide, at that moment; of those with a contact."""
+        if self.contact is None:
+            return np.full((2, 2), np.nan)
+        return self.tracks.at(self.contact.frame, self.contact.ids)
+
+
+def even(length: FloatArray) -> FloatArray:
+    """Lengths in metres of which those that differ by less than `TIE` in their last bits are equal floats."""
+    return np.round(length, _TIE_DECIMALS)
+
+
+def accident_of(
+    instance: AnyArray, grid: BevGrid, rules: LabelProtocol | None, reading: AccidentReading
+) -> InstanceAccident:
+    """Where instances are, and which pair of them collides when, if any does.
+
+    Of several pairs and moments the one with the smallest distance is taken; of equal ones the earlier, then that with
+    the nearer centres, then that with the lower ids.
+
+    Args:
+        instance: (T, H, W) ids from 1 that stay the same over the frames, 0 or less elsewhere.
+        grid: its cells and orientation.
+        rules: of the labels that the maps are, or were learned from: where they have the half-cell shift, it is undone
+            in positions. None for maps without any.
+        reading: how near is a collision.
+    """
+    shapes = _shapes(instance, grid.orientation)
+    size = np.array([grid.x[2], grid.y[2]])
+    contact = _contact(shapes, size, reading.danger_distance)
+    identity, which = np.unique(shapes.identity, return_inverse=True)
+    center = np.full((len(instance), len(identity), 2), np.nan)
+    center[shapes.frame, which] = [grid.x[0], grid.y[0]] + (shapes.center + _within_cell(rules)) * size
+    return InstanceAccident(tracks=InstanceTracks(identity=identity, center=center), contact=contact)
+
+
+def match_tracks(predicted: InstanceTracks, truth: InstanceTracks, gate: float) -> dict[int, int]:
+    """Instances with the same path, one to one: predicted id → true id.
+
+    The distance of two is the mean of that of their centres over the moments at which both are there. Of all ways to
+    match, as many pairs as possible within `gate`, and of those with as many the least sum of distances. (So a distant
+    pair cannot use up an instance that another one needs, as it does in the released code.)
+
+    Args:
+        predicted: over T moments.
+        truth: over the same.
+        gate: metres; pairs farther apart, and those that are never there together, are no match.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    apart = np.linalg.norm(predicted.center[:, :, None] - truth.center[:, None], axis=-1)
+    common = np.isfinite(apart)
+    sums = np.where(common, apart, 0).sum(axis=0)
+    distance = np.where(common.any(axis=0), even(sums / np.maximum(common.sum(axis=0), 1)), np.inf)
+    allowed = distance <= gate + TIE
+    # one more pair within the gate outweighs any sum of distances
+    refused = (gate + 1) * (min(distance.shape) + 1)
+    rows, columns = linear_sum_assignment(np.where(allowed, distance, refused))
+    return {
+        int(predicted.identity[row]): int(truth.identity[column])
+        for row, column in zip(rows.tolist(), columns.tolist(), strict=True)
+        if allowed[row, column]
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Shapes:
+    """N instances at frames, by frame and id; cells are counted along x forward and y left.
+
+    Attributes:
+        frame: (N,) int64.
+        identity: (N,) int64.
+        center: (N, 2) float64 mean of the cells.
+        low: (N, 2) int64 lowest cells.
+        high: (N, 2) int64 highest cells.
+        cells: (P, 2) int64, and `group` (P,) whose each is.
+    """
+
+    frame: IntArray
+    identity: IntArray
+    center: FloatArray
+    low: IntArray
+    high: IntArray
+    cells: IntArray
+    group: IntArray
+
+    def hulls(self, which: IntArray) -> FloatArray:
+        """(len(which), V, 2) the outlines of some, in cells."""
+        number = np.full(len(self.frame), -1)
+        number[which] = np.arange(len(which))
+        group = number[self.group]
+        return convex_hulls(self.cells[group >= 0], group[group >= 0])
+
+
+def _shapes(instance: AnyArray, orientation: Orientation) -> _Shapes:
+    rows, columns = instance.shape[1:]
+    flat = np.flatnonzero(instance > 0)  # of a mask: much faster than of integers
+    frame, cell = np.divmod(flat, rows * columns)
+    row, column = np.divmod(cell, columns)
+    y, x = cells_in(row, column, (rows, columns), orientation, "devkit")
+    identity = instance.reshape(-1)[flat].astype(np.int64)
+    key, group = np.unique(frame * (identity.max(initial=0) + 1) + identity, return_inverse=True)
+    count = np.bincount(group, minlength=len(key))
+    order = np.argsort(group, kind="stable")
+    begin = np.cumsum(count) - count
+    cells = np.stack([x, y], axis=1)
+    center = np.stack([np.bincount(group, along, len(key)) for along in cells.T], axis=1) / count[:, None]
+    of_each = cells[order]
+    return _Shapes(
+        frame=frame[order][begin],
+        identity=identity[order][begin],
+        center=center,
+        low=np.minimum.reduceat(of_each, begin) if len(key) else cells,
+        high=np.maximum.reduceat(of_each, begin) if len(key) else cells,
+        cells=cells,
+        group=group,
+    )
+
+
+def _contact(shapes: _Shapes, size: FloatArray, danger_distance: float) -> Contact | None:
+    first, second = _candidates(shapes, size, danger_distance)
+    if not len(first):
+        return None
+    which, place = np.unique(np.concatenate([first, second]), return_inverse=True)
+    unit = size.min()  # square cells stay whole numbers
+    hulls = shapes.hulls(which) * (size / unit)
+    distance = even(hull_distances(hulls[place[: len(first)]], hulls[place[len(first) :]]) * unit)
+    near = np.flatnonzero(distance < danger_distance)
+    if not len(near):
+        return None
+    first, second, distance = first[near], second[near], distance[near]
+    between = even(np.linalg.norm((shapes.center[first] - shapes.center[second]) * size, axis=1))
+    frame = shapes.frame[first]
+    best = np.lexsort((shapes.identity[second], shapes.identity[first], between, frame, distance))[0]
+    return Contact(
+        frame=int(frame[best]),
+        ids=(int(shapes.identity[first[best]]), int(shapes.identity[second[best]])),
+        distance=float(distance[best]),
+    )
+
+
+def _candidates(shapes: _Shapes, size: FloatArray, danger_distance: float) -> tuple[IntArray, IntArray]:
+    """Pairs of rows of one frame whose bounding boxes are nearer than the danger distance."""
+    firsts, seconds = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    starts = np.append(np.flatnonzero(np.diff(shapes.frame, prepend=-1)), len(shapes.frame))
+    for start, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+        low, high = shapes.low[start:end], shapes.high[start:end]
+        gap = np.maximum(low[:, None] - high, low - high[:, None])
+        near = np.hypot(*np.moveaxis(np.maximum(gap, 0) * size, -1, 0)) < danger_distance
+        first, second = np.nonzero(np.triu(near, 1))
+        firsts.append(first + start)
+        seconds.append(second + start)
+    return np.concatenate(firsts), np.concatenate(seconds)
+
+
+def _within_cell(rules: LabelProtocol | None) -> FloatArray:
+    """The point of a cell, in cells along x and y from its low corner, that its rasterised place stands for."""
+    return np.array([0.5, 0.5] if rules is None else rules.place_in_cell)

@@ -1,0 +1,347 @@
+"""`MotionEvaluator`: the motion metrics of any number of samples, the counts of each sample, and their protocol."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from types import MappingProxyType
+from typing import Any, ClassVar, Final
+
+from deepaccident_devkit.evaluation.choices import protocol_of
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.motion.overlaps import (
+    SegmentationCounts,
+    iou,
+    mask_counts,
+    panoptic_quality,
+    vpq_counts,
+)
+from deepaccident_devkit.evaluation.numbers import TaskResult
+from deepaccident_devkit.evaluation.predictions import (
+    MotionOutput,
+    cells_within,
+    check_output,
+    check_protocol,
+    checked_pair,
+    first_frames,
+    frames_there,
+    labels_at_present,
+)
+from deepaccident_devkit.evaluation.trajectories import (
+    instance_paths,
+    longest,
+    match_trajectories,
+    padded,
+    trajectory_errors,
+)
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import (
+    LABEL_PROTOCOLS,
+    POST_PROCESSING,
+    MotionHeads,
+    MotionLabels,
+    predict_instances,
+    trajectories,
+)
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, ShortRepr
+from deepaccident_devkit.support.text import settle_choices
+
+RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
+"""Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionProtocol:
+    """The choices of the motion metrics; the defaults are the released ones.
+
+    Sources: docs/released_code.md, Post-processing, IoU and VPQ, and Paths.
+
+    Attributes:
+        labels: protocol of the labels that are the truth, by name; others are refused. None for any labels.
+        nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
+    """
+
+    labels: str | None = "released"
+    nothing_is_zero: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError."""
+        settle_choices(self, {"labels": (None, *LABEL_PROTOCOLS)})
+
+
+MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
+    {"released": MotionProtocol(), "paper": MotionProtocol(nothing_is_zero=False)}
+)
+"""What the released code computes. The paper's text says no more of these metrics than their names, FIERY's and the
+ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not 0."""
+
+
+_READ_FOR_PATHS: Final = replace(POST_PROCESSING["accident"], redraw=False)
+"""How instances are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has these
+errors from the accident evaluation, which links and cuts out instances by other rules than VPQ's."""
+_PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
+_PATHS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
+_INSTANCE_MAPS: Final = (
+    "given as instance maps, and so compared with the labels' own instances, of paths too; those given as heads have "
+    "their paths compared with what is read off the labels as if a model had predicted them"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeResult(ShortRepr):
+    """Metrics within one range.
+
+    Attributes:
+        iou: intersection over union of the actors' cells, percent.
+        pq: video panoptic quality, percent.
+        sq: segmentation quality of the instances found, percent.
+        rq: recognition quality, percent.
+        true_positive: instances found, frame by frame.
+        false_positive: instances predicted without a true one.
+        false_negative: instances missed.
+    """
+
+    iou: float
+    pq: float
+    sq: float
+    rq: float
+    true_positive: int
+    false_positive: int
+    false_negative: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionResult(TaskResult):
+    """Motion metrics of some samples.
+
+    Attributes:
+        ranges: by name (`30x30`, `100x100`), of the last prediction, which in the released order is the mean.
+        min_ade: metres: mean error of the paths over their frames, of the best of all predictions; NaN without any.
+        min_fde: metres: their error at the last frame; likewise.
+        miss_rate: share of the paths that end too far away, in [0, 1]; likewise.
+        paths: how many true paths have a partner in some prediction: what the three are means over.
+        path_accuracy: tp / (tp + fp / 2 + fn / 2) of the last prediction's paths, in [0, 1]; NaN without any.
+        path_true_positive: paths of the last prediction that have a partner.
+        path_false_positive: those that have none.
+        path_false_negative: true paths without one.
+        samples: how many.
+        frames: compared, of all samples.
+        notes: sentences that a reader of the numbers should know.
+    """
+
+    task: ClassVar[str] = "motion"
+    ranges: Mapping[str, RangeResult]
+    min_ade: float
+    min_fde: float
+    miss_rate: float
+    paths: int
+    path_accuracy: float
+    path_true_positive: int
+    path_false_positive: int
+    path_false_negative: int
+    samples: int
+    frames: int
+    notes: tuple[str, ...] = ()
+
+
+class MotionEvaluator(Evaluator[MotionResult]):
+    """IoU and VPQ of the last prediction, and errors of the paths over all of them.
+
+    >>> evaluator = MotionEvaluator()
+    >>> evaluator.compute().ranges["30x30"].iou
+    0.0
+    """
+
+    def __init__(self, protocol: str | MotionProtocol = "released", *, trajectories: bool = True) -> None:
+        """Start without samples.
+
+        Args:
+            protocol: of `MOTION_PROTOCOLS` by name, or one with other fields.
+            trajectories: whether paths are compared too. Of heads that takes many times as long as all the rest, since
+                instances are read off all predictions and the labels for it.
+
+        Raises:
+            ChoiceError: no protocol has that name.
+        """
+        super().__init__()
+        self.protocol = protocol_of(protocol, MotionProtocol, MOTION_PROTOCOLS)
+        self.trajectories = trajectories
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The protocol's choices, and whether paths are compared."""
+        return {"protocol": asdict(self.protocol), "trajectories": self.trajectories}
+
+    def update(self, token: str, prediction: MotionOutput, label: MotionLabels) -> None:
+        """Count one sample.
+
+        Args:
+            token: of the sample.
+            prediction: what a model says, in any orientation.
+            label: the sample's labels, on the same ground; those still in their own frames are warped to the present.
+
+        Raises:
+            EvaluationError: there is no prediction or label, the labels are of another protocol, the prediction has
+                another grid or too few frames, or the sample came before with another outcome.
+        """
+        self.add(token, motion_counts(prediction, label, self.protocol, trajectories=self.trajectories))
+
+    def result_of(self, counts: Collection[Counts]) -> MotionResult:
+        """The metrics of some samples' counts, in any order."""
+        return self._result(counts, [each["vpq"] for each in counts])
+
+    def pooled(self, counts: Collection[Counts]) -> list[Counts]:
+        """The samples' counts as those of one sample of one frame, which have the same result."""
+        sums = {name: sum(each[name] for each in counts) for name in ("samples", "frames", "instance_maps")}
+        ranges = range(len(RANGES))
+        cells = [[sum(each["cells"][index][kind] for each in counts) for kind in range(3)] for index in ranges]
+        vpq = [
+            [[math.fsum(value for each in counts for value in each["vpq"][index][kind])] for kind in range(4)]
+            for index in ranges
+        ]
+        return [{**sums, "cells": cells, "vpq": vpq, "paths": _path_sums(counts)}]
+
+    def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
+        """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
+
+        A mistake that is kept for comparison: it has one entry a *frame*, of all samples one after the other, and takes
+        those whose number is a *sample's*, so that most of what it sums up belongs to others. `compute(selected)` is
+        the correct result.
+
+        Args:
+            order: all samples in the order evaluated.
+            selected: some of them.
+
+        Raises:
+            EvaluationError: one of them was not counted.
+        """
+        self.compute(order)  # refuses samples that were not counted
+        frames = [
+            [[[values[frame]] for values in each] for each in self._counts[token]["vpq"]]
+            for token in order
+            for frame in range(self._counts[token]["frames"])
+        ]
+        numbers = [number for number, token in enumerate(order) if token in set(selected)]
+        return self._result([self._counts[order[number]] for number in numbers], [frames[number] for number in numbers])
+
+    def _result(self, counts: Collection[Counts], vpq: Sequence[Any]) -> MotionResult:
+        paths = _path_sums(counts)
+        found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
+        samples, number = (sum(each[name] for each in counts) for name in ("samples", "instance_maps"))
+        return MotionResult(
+            ranges={
+                name: self._range_result([each["cells"][index] for each in counts], [each[index] for each in vpq])
+                for index, name in enumerate(RANGES)
+            },
+            min_ade=ratio(paths["ade"], paths["count"]),
+            min_fde=ratio(paths["fde"], paths["count"]),
+            miss_rate=ratio(paths["missed"], paths["count"]),
+            paths=int(paths["count"]),
+            path_accuracy=ratio(found, found + alarms / 2 + lost / 2),
+            path_true_positive=found,
+            path_false_positive=alarms,
+            path_false_negative=lost,
+            samples=samples,
+            frames=sum(each["frames"] for each in counts),
+            notes=(f"{number} of {samples} predictions: {_INSTANCE_MAPS}",) if number else (),
+        )
+
+    def _range_result(self, cells: Sequence[Any], vpq: Sequence[Any]) -> RangeResult:
+        """Of samples' [tp, fp, fn] cells, and of their four lists by frame."""
+        overlap, *numbers = (math.fsum(value for each in vpq for value in each[index]) for index in range(4))
+        found, alarms, missed = (int(number) for number in numbers)
+        quality = panoptic_quality(overlap, found, alarms, missed)
+        absent = 0.0 if self.protocol.nothing_is_zero else math.nan
+        percent = 100.0 if found or alarms or missed or self.protocol.nothing_is_zero else math.nan
+        classes = [
+            SegmentationCounts(true_positive=both, false_positive=mine, false_negative=true)
+            for both, mine, true in cells
+        ]
+        return RangeResult(
+            iou=100 * iou(classes, absent=absent),
+            pq=percent * quality.pq,
+            sq=percent * quality.sq,
+            rq=percent * quality.rq,
+            true_positive=found,
+            false_positive=alarms,
+            false_negative=missed,
+        )
+
+
+def motion_counts(
+    prediction: MotionOutput,
+    label: MotionLabels,
+    protocol: MotionProtocol | None = None,
+    *,
+    trajectories: bool = True,
+) -> Counts:
+    """What one sample adds, as JSON can hold it; arguments and errors as of `MotionEvaluator.update`.
+
+    Returns:
+        `samples`, 1; `frames` compared; `instance_maps`, 1 if the prediction was given so, else 0; by range, `cells`
+        [tp, fp, fn] and `vpq`, four lists by frame: the sum of the intersections over unions, and the numbers of true
+        positives, false positives and false negatives; `paths`, sums by name, or None.
+    """
+    rules = protocol or MotionProtocol()
+    prediction, label = checked_pair(prediction, label)
+    check_protocol(label, rules.labels)
+    frames = frames_there(label)
+    check_output(prediction, label, frames)
+    truth, grid = labels_at_present(label), label.config.grid
+    last = _last_maps(prediction, frames)
+    actors, instance = (prediction.grid.reorient(maps, grid.orientation) for maps in last)
+    true_actors, true_instance = truth.segmentation[:frames] == 1, truth.instance[:frames]
+    cells, vpq = [], []
+    for extent in RANGES.values():
+        within = (slice(None), *cells_within(grid, extent))
+        counted = mask_counts(actors[within], true_actors[within])
+        cells.append([counted.true_positive, counted.false_positive, counted.false_negative])
+        quality = vpq_counts(instance[within], true_instance[within])
+        by_name = (quality.iou, quality.true_positive, quality.false_positive, quality.false_negative)
+        vpq.append([values[:, 1].tolist() for values in by_name])
+    return {
+        "samples": 1,
+        "frames": frames,
+        "instance_maps": int(prediction.instances is not None),
+        "cells": cells,
+        "vpq": vpq,
+        "paths": _path_counts(prediction, truth, frames) if trajectories else None,
+    }
+
+
+def _last_maps(prediction: MotionOutput, frames: int) -> tuple[AnyArray, AnyArray]:
+    """(T, H, W) which cells are actors, and instances, of the last prediction, as it lies."""
+    if prediction.instances is not None:
+        instances = prediction.instances[-1, :frames]
+        return instances > 0, instances
+    heads = first_frames((prediction.heads or ())[-1], frames)
+    return heads.segmentation[:, 1] > heads.segmentation[:, 0], predict_instances(heads, "motion").instance
+
+
+def _path_counts(prediction: MotionOutput, truth: MotionLabels, frames: int) -> dict[str, float]:
+    grid = truth.config.grid
+    if prediction.instances is not None:
+        maps = [*((each, prediction.grid) for each in prediction.instances), (truth.instance, grid)]
+        *predicted, true = (instance_paths(each[:frames], cells) for each, cells in maps)
+    else:
+        heads = (*(prediction.heads or ()), MotionHeads.from_labels(truth))
+        *predicted, true = (_paths_of(first_frames(each, frames), grid) for each in heads)
+    length = longest(true)
+    *sides, true = (padded(each, length) for each in (*predicted, true))
+    matches = [match_trajectories(paths, true) for paths in sides]
+    errors = trajectory_errors(sides, true, matches)
+    last = matches[-1]
+    return asdict(errors) | {
+        "true_positive": len(last.pairs),
+        "false_positive": len(last.unmatched_prediction),
+        "false_negative": len(last.unmatched_truth),
+    }
+
+
+def _paths_of(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
+    return trajectories(predict_instances(heads, _READ_FOR_PATHS), grid, half_cell_shift=False)
+
+
+def _path_sums(counts: Collection[Counts]) -> dict[str, float]:
+    return {name: total((each["paths"] for each in counts if each["paths"]), name) for name in _PATHS}

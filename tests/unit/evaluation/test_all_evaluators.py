@@ -1,0 +1,296 @@
+"""What holds of every evaluator, on the labels of a synthetic release: order, parts, pauses, nothing and perfection."""
+
+import copy
+import json
+import math
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import EvaluationError, GeometryError
+from deepaccident_devkit.evaluation import (
+    AccidentEvaluator,
+    DetectedBoxes,
+    DetectionEvaluator,
+    Evaluator,
+    MotionEvaluator,
+    MotionOutput,
+    Resampling,
+    breakdown,
+    detection_truth,
+    instances_of,
+    sample_attributes,
+)
+from deepaccident_devkit.evaluation.accident import accident_context
+from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
+from deepaccident_devkit.evaluation.numbers import numbers_of
+from deepaccident_devkit.evaluation.runs.paired import Swaps, swapped_differences
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.motion import MotionHeads
+
+Arguments = Callable[[str], Sequence[Any]]
+MOTION: dict[str, Callable[[], Evaluator[Any]]] = {
+    "motion released": MotionEvaluator,
+    "motion paper": lambda: MotionEvaluator("paper"),
+}
+ACCIDENT = {f"accident {name}": lambda name=name: AccidentEvaluator(name) for name in ("released", "paper", "boxes")}
+DETECTION = {
+    **{f"detection {name}": lambda name=name: DetectionEvaluator(name) for name in DETECTION_PROTOCOLS},
+    "detection opencood by sample": lambda: DetectionEvaluator("opencood", global_sort=False),
+}
+ALL = {**MOTION, **ACCIDENT, **DETECTION}
+of_all = pytest.mark.parametrize("name", ALL)
+
+
+@pytest.fixture(scope="module")
+def tokens(da_motion: DeepAccident) -> list[str]:
+    """Of two agents, from 2 s to 0.5 s before the accident."""
+    return [
+        token
+        for token in da_motion.samples("train", "evaluate")
+        if token.split("/")[-2] in ("ego_vehicle", "infrastructure")
+    ]
+
+
+class Samples:
+    """What each kind of evaluator takes of a sample: good, empty and perfect predictions with the truth."""
+
+    def __init__(self, dataset: DeepAccident, tokens: Sequence[str]) -> None:
+        self.dataset = dataset
+        self.labels = {token: dataset.motion_labels(token).to_present("bilinear") for token in tokens}
+        self.contexts = {token: accident_context(dataset, token, 2.0) for token in tokens}
+
+    def some(self, name: str, token: str) -> Sequence[Any]:
+        """Neither right nor wrong: of another sample, or all a little off."""
+        if name in MOTION | ACCIDENT:
+            others = [self.labels[token], self.labels[min(self.labels)]]
+            heads = tuple(MotionHeads.from_labels(each) for each in others)
+            return self._motion(name, token, MotionOutput(grid=others[0].config.grid, heads=heads))
+        source = np.random.default_rng(list(self.labels).index(token))
+        truth = self._boxes(name, token)
+        keep = source.uniform(size=len(truth)) < 0.8
+        moved = truth.center[keep] + source.normal(0, 0.5, (keep.sum(), 3))
+        found = _detected(truth, keep, np.round(source.uniform(size=keep.sum()), 1), moved)
+        return found, truth
+
+    def empty(self, name: str, token: str) -> Sequence[Any]:
+        """Nothing is predicted."""
+        label = self.labels[token]
+        if name in MOTION | ACCIDENT:
+            return self._motion(name, token, instances_of(np.zeros_like(label.instance), label.config.grid))
+        truth = self._boxes(name, token)
+        return _detected(truth, np.zeros(len(truth), dtype=bool), np.zeros(0)), truth
+
+    def perfect(self, name: str, token: str) -> Sequence[Any]:
+        """The truth itself, motion as instance maps."""
+        label = self.labels[token]
+        if name in MOTION | ACCIDENT:
+            return self._motion(name, token, instances_of(label.instance, label.config.grid))
+        truth = self._boxes(name, token)
+        return _detected(truth, np.ones(len(truth), dtype=bool), np.ones(len(truth))), truth
+
+    def _motion(self, name: str, token: str, output: MotionOutput) -> Sequence[Any]:
+        return (output, self.labels[token], *([self.contexts[token]] if name in ACCIDENT else []))
+
+    def _boxes(self, name: str, token: str) -> Boxes:
+        return detection_truth(self.dataset, token, DETECTION[name]().protocol)
+
+
+@pytest.fixture(scope="module")
+def samples(da_motion: DeepAccident, tokens: list[str]) -> Samples:
+    return Samples(da_motion, tokens)
+
+
+@pytest.mark.slow
+@of_all
+def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str], name: str, tmp_path: Path) -> None:
+    arguments = {token: samples.some(name, token) for token in tokens}
+    whole = evaluated(name, tokens, arguments.__getitem__)
+    expected = bits(whole.compute())
+    shuffled = np.random.default_rng(1).permutation(tokens).tolist()
+    for parts in (1, 3, len(tokens)):
+        merged = ALL[name]()
+        for part in range(parts):
+            evaluator = ALL[name]()
+            for token in shuffled[part::parts]:
+                evaluator.update(token, *arguments[token])
+            path = evaluator.save(tmp_path / f"{part}.json")
+            merged.merge(ALL[name]().resume(path) if part % 2 == 0 else evaluator)
+        assert bits(merged.compute()) == expected
+        assert merged.compute(tokens[:3]) is not None
+        assert bits(merged.compute(tokens[:3])) == bits(whole.compute(tokens[:3]))
+        assert not merged.repeated
+    resumed = ALL[name]().resume(whole.save(tmp_path / "whole.json"))
+    resumed.update(tokens[0], *arguments[tokens[0]])
+    assert resumed.repeated == {tokens[0]}
+    assert bits(resumed.compute()) == expected
+
+
+@of_all
+def test_pooled_counts_have_the_same_result(samples: Samples, tokens: list[str], name: str) -> None:
+    evaluator = ALL[name]()
+    for token in tokens:
+        evaluator.update(token, *samples.some(name, token))
+    by_scenario = evaluator.pooled([evaluator.counts[token] for token in tokens])
+    assert bits(evaluator.result_of(by_scenario)) == bits(evaluator.compute())
+
+
+@pytest.mark.slow
+@of_all
+def test_two_runs_can_be_swapped(samples: Samples, tokens: list[str], name: str) -> None:
+    """Where nothing is swapped they differ as observed; where all is, by the same with the other sign."""
+    runs = [
+        evaluated(name, tokens, lambda token, given=given: given(name, token))
+        for given in (samples.some, samples.perfect)
+    ]
+    first, second = (numbers_of(run.compute()) for run in runs)
+    names = [path for path in first if path in second]
+    observed = np.array([second[path] - first[path] for path in names])
+    clusters = [[[run.counts[token]] for token in tokens] for run in runs]
+    swapped = np.array([[False] * len(tokens), [True] * len(tokens)])
+    made = swapped_differences(runs[0], clusters, Swaps(swapped=swapped, complete=False), names)
+    assert_allclose(made, [observed, -observed], atol=1e-12)
+
+
+@of_all
+def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: str) -> None:
+    evaluator = evaluated(name, tokens, lambda token: samples.empty(name, token))
+    result = evaluator.compute()
+    if name in MOTION:
+        assert [value for each in result.ranges.values() for value in (each.iou, each.pq, each.sq, each.rq)] == [0] * 8
+        assert (result.path_accuracy, result.paths) == (0, 0)
+    elif name in ACCIDENT:
+        assert result.positives > 0
+        assert result.apa == 0
+        assert all((each.tp, each.fp, each.fn) == (0, 0, result.positives) for each in result.within.values())
+    else:
+        assert result.mean_average_precision == 0
+    for some in ((), tokens[:1]):
+        evaluator.compute(some)  # of nothing at all, too
+    ALL[name]().compute()
+
+
+@pytest.mark.slow
+@of_all
+def test_results_can_be_copied_and_written(samples: Samples, tokens: list[str], name: str) -> None:
+    evaluator = evaluated(name, tokens, lambda token: samples.some(name, token))
+    attributes = sample_attributes(samples.dataset, tokens)
+    whole, resampling = evaluator.compute(), Resampling(resamples=2)
+    results = [whole, ALL[name]().compute(), breakdown(evaluator, attributes, "scenario_type", resampling)]
+    for result in results:
+        for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result), replace(result)):
+            assert bits(again) == bits(result)
+        described = asdict(result)
+        assert described.keys() == {field.name for field in fields(result)}
+        json.dumps(result.as_dict(), allow_nan=False)
+        assert len({result, result}) == 1
+        for frozen in mappings_of(result):
+            with pytest.raises(TypeError, match="cannot be changed"):
+                frozen["more"] = 1
+            with pytest.raises(TypeError, match="cannot be changed"):
+                frozen.update(more=1)
+
+
+@of_all
+def test_counts_are_json_and_nobody_changes_them(samples: Samples, tokens: list[str], name: str) -> None:
+    evaluator = evaluated(name, tokens[:1], lambda token: samples.some(name, token))
+    [handed_out] = evaluator.counts.values()
+    assert json.loads(json.dumps(handed_out, allow_nan=False)) == handed_out
+    expected = bits(evaluator.compute())
+    handed_out.clear()
+    for value in evaluator.counts[tokens[0]].values():
+        if isinstance(value, list):
+            value.append(1)
+    assert bits(evaluator.compute()) == expected
+    assert tokens[0] in evaluator.counts
+    assert "x" not in evaluator.counts
+
+
+@pytest.mark.parametrize("name", MOTION | DETECTION)
+@pytest.mark.parametrize("given", [None, np.zeros((2, 5, 200, 200), dtype=int)])
+def test_predictions_that_are_none(samples: Samples, tokens: list[str], name: str, given: object) -> None:
+    _, truth = samples.perfect(name, tokens[0])
+    with pytest.raises(EvaluationError, match=r"expected (a MotionOutput|DetectedBoxes).* found .*from_arrays\("):
+        ALL[name]().update(tokens[0], given, truth)
+    prediction, _ = samples.perfect(name, tokens[0])
+    with pytest.raises((EvaluationError, GeometryError), match=r"expected (MotionLabels|Boxes), found (None|nd)"):
+        ALL[name]().update(tokens[0], prediction, given)
+
+
+@pytest.mark.parametrize("name", MOTION | ACCIDENT)
+def test_empty_heads_score_0(samples: Samples, tokens: list[str], name: str) -> None:
+    """What a network says that sees nobody: no peak, background everywhere."""
+    token, label = tokens[0], samples.labels[tokens[0]]
+    nobody = MotionHeads.from_labels(label)
+    nobody = replace(
+        nobody,
+        segmentation=np.stack([nobody.segmentation[:, 0] * 0 + 5, nobody.segmentation[:, 0] * 0 - 5], axis=1),
+        centerness=np.zeros_like(nobody.centerness),
+    )
+    output = MotionOutput(grid=label.config.grid, heads=(nobody,) * 6)
+    evaluator = ALL[name]()
+    evaluator.update(token, output, *samples.perfect(name, token)[1:])
+    result = evaluator.compute()
+    assert (result.path_accuracy if name in MOTION else result.apa) == 0
+
+
+@of_all
+def test_perfect_predictions(samples: Samples, tokens: list[str], name: str) -> None:
+    result = evaluated(name, tokens, lambda token: samples.perfect(name, token)).compute()
+    if name in MOTION:
+        assert [value for each in result.ranges.values() for value in (each.iou, each.pq, each.sq, each.rq)] == [
+            100
+        ] * 8
+        assert (result.min_ade, result.min_fde, result.miss_rate, result.path_accuracy) == (0, 0, 0, 1)
+    elif name == "accident paper":
+        assert result.positives > 0
+        assert (result.apa, result.id_error, result.position_error, result.time_error) == (1, 0, 0, 0)
+        assert all((each.fp, each.fn) == (0, 0) for each in result.within.values())
+    elif name.startswith("detection opencood"):
+        assert result.mean_average_precision == pytest.approx(100, abs=1e-9)
+    elif name in DETECTION:
+        # The released curve counts what has no truth as 0, and no recall exceeds the last of its 36 points. So the mean
+        # says how many classes a scene has; each class that it has says what is lost.
+        assert result.average_precision[result.truths > 0].min() > 97
+
+
+def evaluated(name: str, tokens: Sequence[str], arguments: Arguments) -> Evaluator[Any]:
+    evaluator = ALL[name]()
+    for token in tokens:
+        evaluator.update(token, *arguments(token))
+    return evaluator
+
+
+def mappings_of(value: Any) -> list[Any]:
+    """All mappings in a result."""
+    parts = list(value.values()) if isinstance(value, dict) else list(value) if isinstance(value, tuple) else []
+    if is_dataclass(value):
+        parts = [getattr(value, field.name) for field in fields(value)]
+    return [*([value] if isinstance(value, dict) else []), *(each for part in parts for each in mappings_of(part))]
+
+
+def bits(value: Any) -> Any:
+    """A result to its last bit, whatever the order of its mappings."""
+    if is_dataclass(value):
+        return type(value).__name__, [(field.name, bits(getattr(value, field.name))) for field in fields(value)]
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype.str, value.tobytes()
+    if isinstance(value, dict):
+        return sorted((str(key), bits(each)) for key, each in value.items())
+    if isinstance(value, list | tuple):
+        return [bits(each) for each in value]
+    if isinstance(value, float):
+        return "nan" if math.isnan(value) else value.hex()
+    return value
+
+
+def _detected(truth: Boxes, keep: np.ndarray, scores: np.ndarray, center: np.ndarray | None = None) -> DetectedBoxes:
+    boxes = truth.select(keep)
+    return DetectedBoxes(boxes=boxes if center is None else replace(boxes, center=center), scores=scores)

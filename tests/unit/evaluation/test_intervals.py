@@ -1,0 +1,215 @@
+"""Intervals of numbers: by Student's t and Wilson's formula, and where there is none."""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.intervals import (
+    LEAST_CLUSTERS,
+    Intervals,
+    Resampling,
+    _notes,
+    difference_intervals,
+    few_clusters,
+    interval_ends,
+    intervals_of,
+    parts_of,
+    standard_errors,
+)
+
+
+@dataclass(frozen=True)
+class Ratio:
+    ratio: float
+    nothing: float = math.nan
+    median_of_all: float = 0.5
+
+
+class Ratios(Evaluator[Ratio]):
+    """The ratio of two sums."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    def update(self, token: str, *arguments: Any) -> None:
+        self.add(token, {"above": arguments[0], "below": arguments[1]})
+
+    def result_of(self, counts: Collection[Counts]) -> Ratio:
+        return Ratio(ratio(total(counts, "above"), total(counts, "below")))
+
+
+def made(
+    above: Sequence[float], below: Sequence[float] | None = None, resampling: Resampling | None = None
+) -> Intervals:
+    """Of one sample a cluster."""
+    given = zip(above, below or [1.0] * len(above), strict=True)
+    clusters = [[{"above": float(one), "below": float(other)}] for one, other in given]
+    evaluator = Ratios()
+    result = evaluator.result_of([sample for samples in clusters for sample in samples])
+    return intervals_of(evaluator, clusters, result, resampling)
+
+
+def wilson(share: float, count: float, t: float) -> tuple[float, float]:
+    """Wilson's interval of `count` independent draws."""
+    middle = (share + t**2 / 2 / count) / (1 + t**2 / count)
+    half = t / (1 + t**2 / count) * math.sqrt(share * (1 - share) / count + t**2 / 4 / count**2)
+    return middle - half, middle + half
+
+
+@pytest.mark.parametrize(("confidence", "t"), [(0.95, 2.0930), (0.9, 1.7291)])
+def test_a_share_of_independent_clusters_is_wilsons(confidence: float, t: float) -> None:
+    """Of 10 of 20: as many draws as clusters but for n / (n − 1), and 19 degrees of freedom."""
+    ends = made([0, 1] * 10, resampling=Resampling(confidence=confidence)).ends["ratio"]
+    assert ends == pytest.approx(wilson(0.5, 19, t), abs=1e-4)
+
+
+@pytest.mark.parametrize(("hit", "at"), [(0.0, 0), (1.0, 1)])
+def test_a_share_that_all_clusters_agree_on_is_not_sure(hit: float, at: int) -> None:
+    """Not [0, 0] nor [1, 1]: it is as of one draw a cluster, however many samples these have."""
+    for samples in (1.0, 20.0):
+        ends = made([hit * samples] * 12, [samples] * 12).ends["ratio"]
+        assert ends == pytest.approx(wilson(hit, 12, 2.2010), abs=1e-4)
+        assert ends[at] == hit
+        assert abs(ends[1 - at] - hit) > 0.25
+    few = made([hit] * 8 + [0] * 50, [1] * 8 + [0] * 50).ends["ratio"]  # 50 clusters have nothing to count
+    assert few == pytest.approx(wilson(hit, 8, 2.3646), abs=1e-4)
+
+
+def test_a_mean_from_0_on_has_an_interval_by_factors() -> None:
+    low, high = made([1.0, 3.0] * 10).ends["ratio"]
+    assert low * high == pytest.approx(2.0**2)
+    assert math.log(high / 2) == pytest.approx(2.0930 * math.sqrt(1 / 19) / 2, abs=1e-4)
+
+
+def test_a_mean_of_both_signs_has_a_symmetric_one() -> None:
+    low, high = made([-1.0, 3.0] * 10).ends["ratio"]
+    assert (low, high) == pytest.approx((1 - 2.0930 * 2 / math.sqrt(19), 1 + 2.0930 * 2 / math.sqrt(19)), abs=1e-3)
+
+
+def test_errors_of_numbers_that_hang_on_one_cluster_are_uncertain() -> None:
+    even, mostly_one = np.array([[1.0], [-1.0]] * 10), np.where(np.arange(20) == 3, 10.0, 0.1)[:, None]
+    assert standard_errors(np.zeros(1), even)[1] == 19
+    assert standard_errors(np.zeros(1), mostly_one)[1] == pytest.approx(20 / 19, abs=0.01)
+
+
+class TestNone:
+    def test_of_few_clusters(self) -> None:
+        few = made([0.0, 1.0] * 2 + [1.0])
+        text = "no intervals: of 5 clusters (an accident and its twin are one); at least 6 are needed"
+        assert (few.ends, few.notes) == ({}, (text,))
+        assert made([0.0, 1.0] * 3).ends
+
+    def test_of_a_number_that_few_clusters_have(self) -> None:
+        few = made([0.3, 0.4, 0.5, 0.2, 0.1] + [0] * 20, [1] * 5 + [0] * 20)
+        assert few.ends == {}
+        assert few.notes == ("no interval of ratio: fewer than 6 clusters have such a number",)
+
+    def test_of_a_length_that_is_the_same_everywhere(self) -> None:
+        same = made([2.5] * 20)
+        assert same.ends == {}
+        assert same.notes == ("no interval of ratio: fewer than 6 clusters change it",)
+
+    def test_of_rounding(self) -> None:
+        assert made([0.1 * 3, 0.3] * 10, [0.1, 0.1] * 10).ends == {}
+
+    def test_of_nan_and_of_medians(self) -> None:
+        assert set(made([0.0, 1.0] * 10).ends) == {"ratio"}
+
+    def test_without_resamples(self) -> None:
+        assert made([0, 1] * 10, resampling=Resampling(resamples=0)) == Intervals(ends={}, notes=())
+
+
+def test_many_clusters_are_joined() -> None:
+    clusters = [[{"number": number}] for number in range(345)]
+    parts = parts_of(clusters, Resampling())
+    assert [len(part) for part in parts] == [4] * 45 + [3] * 55
+    assert sorted(each["number"] for part in parts for each in part) == list(range(345))
+    assert parts == parts_of(clusters, Resampling()) != parts_of(clusters, Resampling(seed=1))
+    assert len(parts_of(clusters, Resampling(resamples=40))) == 40
+    assert len(parts_of(clusters, Resampling(resamples=2))) == LEAST_CLUSTERS
+    assert parts_of(clusters[:100], Resampling()) == clusters[:100]
+    assert len(parts_of(clusters[:101], Resampling())) == 100
+
+
+def test_intervals_of_joined_clusters_are_nearly_the_same() -> None:
+    above = np.random.default_rng(0).uniform(size=345).round(3).tolist()
+    joined, errors = made(above).ends["ratio"], np.std(above) / math.sqrt(345)
+    assert joined == pytest.approx((np.mean(above) - 1.97 * errors, np.mean(above) + 1.97 * errors), abs=0.012)
+
+
+def test_each_number_for_itself() -> None:
+    """Several numbers at once have the intervals of each alone."""
+    left_out = np.random.default_rng(0).uniform(0.4, 0.6, (20, 3))
+    values, ranges = np.full(3, 0.5), np.array([[0, 1], [0, math.inf], [-math.inf, math.inf]])
+    together = interval_ends(values, left_out, ranges, 0.95)
+    for at in range(3):
+        alone = interval_ends(values[at : at + 1], left_out[:, at : at + 1], ranges[at : at + 1], 0.95)
+        assert_array_equal(np.ravel(alone), [together[0][at], together[1][at]])
+    assert_allclose(interval_ends(values * 100, left_out * 100, ranges * [1, 100], 0.95)[0][0], 100 * together[0][0])
+
+
+@pytest.mark.parametrize(("share", "end"), [(0.0, 0), (1.0, 1)])
+def test_a_share_of_none_or_all_ends_there_exactly(share: float, end: int) -> None:
+    for count in range(LEAST_CLUSTERS, 400):
+        ends = interval_ends(np.array([share]), np.full((count, 1), share), np.array([[0, 1]]), 0.95)
+        assert ends[end] == share
+        assert ends[1 - end] != share
+
+
+def test_at_the_least_number_of_clusters_it_is_that_they_are_alike() -> None:
+    few, alike = _notes({"few": LEAST_CLUSTERS - 1, "alike": LEAST_CLUSTERS})
+    assert few.startswith("no interval of few: fewer than")
+    assert alike == f"no interval of alike: fewer than {LEAST_CLUSTERS} clusters change it"
+    (four,) = _notes(dict.fromkeys("abcd", 0))
+    (three,) = _notes(dict.fromkeys("abc", 0))
+    assert (four[:32], three[:27]) == ("no interval of a, b, c and 1 oth", "no interval of a, b, c: few")
+
+
+def test_how_few_clusters_there_are_is_said_in_good_words() -> None:
+    assert few_clusters(1) == "of 1 cluster (an accident and its twin are one); at least 6 are needed"
+
+
+def test_settings_and_their_edges() -> None:
+    assert Resampling() == Resampling(resamples=1000, confidence=0.95, seed=0)
+    assert Resampling(resamples=100_000, confidence=0.001).seed == 0
+    for settings, words in (
+        ({"resamples": 100_001}, "resamples: expected a whole number from 0 to 100,000, found 100001"),
+        ({"resamples": -1}, "resamples"),
+        ({"resamples": True}, "resamples"),
+        ({"resamples": 10.0}, "resamples"),
+        ({"seed": -1}, "seed: expected a whole number from 0, found -1"),
+        ({"seed": 1.0}, "seed"),
+        ({"confidence": 0}, "confidence: expected a share between 0 and 1, such as 0.95, found 0"),
+        ({"confidence": 1}, "confidence"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            Resampling(**settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("changing", [1, 5, 6, 10])
+def test_a_number_that_few_parts_change_has_no_interval(changing: int) -> None:
+    left_out = 1.0 + 0.1 * (np.arange(20) < changing)[:, None] * (-1) ** np.arange(20)[:, None]
+    low, high = interval_ends(np.ones(1), left_out, np.array([[-math.inf, math.inf]]), 0.95)
+    assert (np.isnan(low[0]), np.isnan(high[0])) == (changing < LEAST_CLUSTERS,) * 2
+
+
+def test_the_difference_of_two_runs_has_its_own_interval() -> None:
+    first, second = ([[{"above": hit, "below": 1.0}] for hit in run] for run in ([0.5] * 20, [-0.5, 3.5] * 10))
+    made = difference_intervals(Ratios(), (first, second), {"ratio": 1.0, "median_of_all": 0.0}, Resampling())
+    error = 2 / math.sqrt(19)
+    assert_allclose(made, [[1 - 2.0930 * error, math.nan], [1 + 2.0930 * error, math.nan], [error, 0]], atol=1e-3)
+
+
+def test_a_share_that_hangs_on_one_part_is_no_less_sure_than_as_many_draws_as_parts() -> None:
+    """With a degree of freedom t is 12.7, and the interval would be much wider."""
+    left_out = np.array([0.55, *[0.5 + 1e-7, 0.5 - 1e-7] * 9, 0.5 + 1e-7])[:, None]
+    ends = interval_ends(np.array([0.5]), left_out, np.array([[0, 1]]), 0.95)
+    assert np.ravel(ends) == pytest.approx(wilson(0.5, 20, 2.0930), abs=1e-4)

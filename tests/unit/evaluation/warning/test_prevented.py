@@ -1,0 +1,337 @@
+"""Prevented accidents of recordings made by hand, whose ends are known for each frame of the first alarm."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.numbers import numbers_of
+from deepaccident_devkit.evaluation.warning import (
+    AccidentOutcomes,
+    CleanWarnings,
+    OutcomeTable,
+    PreventedEvaluator,
+    PreventedResult,
+    anticipation,
+)
+from deepaccident_devkit.evaluation.warning.prevention import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.warning.recordings import REFERENCES, TRIVIAL
+from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Skipped
+
+FRAMES = np.arange(1, 62, 5)
+IMPACT = 61
+AVOIDED, STOPPED, MITIGATED, UNCHANGED, WORSENED = range(5)
+GROUP = "ego_involved"
+Scores = Sequence[float | None]
+"""A score a frame of `FRAMES`; None for no alarm."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_draws() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(anticipation, "RANDOM_DRAWS", 2)
+        yield
+
+
+def end_of(frame: float, reaction: float, deceleration: float, latency: float = 0.0) -> int:
+    """What becomes of an accident: who brakes early and hard enough stops in time."""
+    left = (IMPACT - frame) / 10 - reaction - latency
+    return AVOIDED if left >= 12 / deceleration else MITIGATED if left >= 6 / deceleration else UNCHANGED
+
+
+def table(latencies: tuple[float, ...] = (0.0,), *, pedestrian: bool = False) -> OutcomeTable:
+    outcome = np.array(
+        [
+            [
+                *([end_of(frame, each.reaction, each.deceleration, latency) for each in BRAKINGS] for frame in FRAMES),
+                [UNCHANGED] * len(BRAKINGS),
+            ]
+            for latency in latencies
+        ],
+        dtype=np.int8,
+    )
+    extrapolated = outcome == MITIGATED
+    return OutcomeTable(
+        frame=FRAMES, outcome=outcome, extrapolated=extrapolated, latencies=latencies, pedestrian=pedestrian
+    )
+
+
+def counts(recording: str, frame: int, score: float | None, *, crash: bool, right: bool = True, **more: Any) -> Any:
+    """What `sample_counts` says of a sample."""
+    return {
+        "recording": recording,
+        "frame": frame,
+        "kind": "accident" if crash else "twins",
+        "involvement": GROUP,
+        "ahead": IMPACT - frame if crash else None,
+        "to_end": IMPACT - frame,
+        "alarms": [] if score is None else [[score, int(crash and right)]],
+        "unjudged": [],
+        "beyond": 0,
+        "references": [[None, None], [None, None]],
+        **more,
+    }
+
+
+def evaluated(
+    accidents: Sequence[Scores],
+    normal: Sequence[Scores],
+    outcomes: AccidentOutcomes | None = None,
+    agent: str = "ego_vehicle",
+    rules: CleanWarnings | None = None,
+    **more: Any,
+) -> PreventedEvaluator:
+    """Recordings of 6 s, two samples a second, each accident with the same table unless told otherwise."""
+    names = [f"type1_subtype1_accident/s{number}/{agent}" for number in range(len(accidents))]
+    made = PreventedEvaluator(outcomes or AccidentOutcomes(tables=dict.fromkeys(names, table())), rules or "clean")
+    others = [name.replace("accident", "normal") for name in names] + [
+        f"type1_subtype1_normal/s{number}/{agent}" for number in range(len(names), len(normal))
+    ]
+    for crash, recordings, scores in ((True, names, accidents), (False, others, normal)):
+        for name, given_scores in zip(recordings, scores, strict=False):
+            for frame, score in zip(FRAMES.tolist(), given_scores, strict=False):
+                made.add(f"{name}/{frame:03d}", counts(name, frame, score, crash=crash, **more))
+    return made
+
+
+def at(threshold: float) -> CleanWarnings:
+    return CleanWarnings(threshold=threshold)
+
+
+def shares(result: PreventedResult, setting: str = NOMINAL, alarms: str = "right") -> dict[str, float]:
+    return dict(getattr(result.groups[GROUP], alarms)[0.0][setting].shares)
+
+
+def alarm_from(frame: int, score: float = 0.9) -> Scores:
+    """No alarm, and from a frame on one."""
+    return [score if each >= frame else None for each in FRAMES]
+
+
+def test_ends_that_are_known() -> None:
+    """At 1 s and 6 m/s² 3 s before the impact is enough, 2 s mitigates, 1.5 s does nothing; the fourth is missed."""
+    result = evaluated([alarm_from(31), alarm_from(41), alarm_from(46), [None] * 13], [[]], rules=at(0.5)).compute()
+    figures = result.groups[GROUP].right[0.0][NOMINAL]
+    assert figures.counts == {"avoided": 1, "stopped": 0, "mitigated": 1, "unchanged": 2, "worsened": 0}
+    assert figures.shares == {"avoided": 0.25, "stopped": 0.0, "mitigated": 0.25, "unchanged": 0.5, "worsened": 0.0}
+    assert (figures.warned, figures.extrapolated) == (0.75, 0.25)
+    assert result.avoided(GROUP) == 0.25
+    for setting, braking in zip(SETTINGS, BRAKINGS, strict=True):
+        expected = [end_of(frame, braking.reaction, braking.deceleration) for frame in (31, 41, 46, math.inf)]
+        known = {name: expected.count(code) / 4 for code, name in enumerate(OUTCOMES)}
+        assert shares(result, setting) == known, setting
+
+
+def test_the_cost_is_of_normal_recordings_alone() -> None:
+    """Six seconds each, cut at the twin's impact: two alarms of 1 s and one of 2 s in 12 s."""
+    flicker: Scores = [0.9, 0.9, None, 0.9, 0.9, None] + [None] * 7
+    result = evaluated([alarm_from(1)] * 2, [flicker, [None] * 8 + [0.9] * 5], rules=at(0.5)).compute()
+    cost = {name: each.braking_seconds_per_minute for name, each in result.groups[GROUP].right[0.0].items()}
+    assert result.groups[GROUP].minutes == pytest.approx(0.2)
+    assert cost["0.5 s, 4 m/s²"] == pytest.approx((0.5 + 0.5 + 1.5) * 5)
+    assert cost[NOMINAL] == pytest.approx(1.0 * 5)
+    assert cost["1.5 s, 8 m/s²"] == pytest.approx(0.5 * 5)
+
+
+def random_scores(seed: int, many: int = 5) -> list[Scores]:
+    source = np.random.default_rng(seed)
+    return [[round(each, 1) if each > 0.2 else None for each in source.random(13).tolist()] for _ in range(many)]
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 10_000))
+def test_a_siren_prevents_and_costs_the_most_and_silence_nothing(seed: int) -> None:
+    result = evaluated(random_scores(seed), random_scores(seed + 1), rules=at(0.6)).compute()
+    siren, silence = (result.references[name][GROUP] for name in ("always", "never"))
+    for setting in SETTINGS:
+        one, other, none = (each.right[0.0][setting] for each in (siren, result.groups[GROUP], silence))
+        assert one.shares["avoided"] >= other.shares["avoided"] >= none.shares["avoided"] == 0
+        assert one.braking_seconds_per_minute >= other.braking_seconds_per_minute
+        assert none.braking_seconds_per_minute == 0
+        assert none.shares["unchanged"] == 1
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 10_000))
+def test_a_higher_threshold_never_prevents_or_costs_more(seed: int) -> None:
+    curve = evaluated(random_scores(seed), random_scores(seed + 1)).compute().curves[GROUP]
+    assert curve.threshold[0] == math.inf
+    assert (np.diff(curve.threshold) < 0).all()
+    assert (np.diff(curve.avoided, axis=0) >= 0).all()
+    assert (np.diff(curve.avoided + curve.mitigated, axis=0) >= 0).all()
+    assert (np.diff(curve.braking_seconds_per_minute, axis=0) >= 0).all()
+    assert (curve.braking_seconds_per_minute[0] == 0).all()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_curve_is_made_of_operating_points(seed: int) -> None:
+    accidents, normal = random_scores(seed), random_scores(seed + 1)
+    curve = evaluated(accidents, normal).compute().curves[GROUP]
+    for row in (1, len(curve.threshold) // 2, len(curve.threshold) - 1):
+        made = evaluated(accidents, normal, rules=at(float(curve.threshold[row])))
+        result = made.compute(made.tokens)
+        for column, setting in enumerate(SETTINGS):
+            figures = result.groups[GROUP].right[0.0][setting]
+            assert figures.shares["avoided"] == curve.avoided[row, column]
+            assert figures.shares["mitigated"] == curve.mitigated[row, column]
+            assert figures.braking_seconds_per_minute == curve.braking_seconds_per_minute[row, column]
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 10_000))
+def test_without_a_threshold_it_is_the_lowest_within_the_budget(seed: int) -> None:
+    result = evaluated(random_scores(seed, 2), random_scores(seed + 1, 8)).compute()
+    figures, curve = result.groups[GROUP], result.curves[GROUP]
+    cost = curve.braking_seconds_per_minute[:, SETTINGS.index(NOMINAL)]
+    assert figures.threshold == figures.quiet_braking == curve.threshold[cost <= 1.0].min()
+    assert result.operating_by == "budget"
+    assert any("on these very recordings" in note for note in result.notes)
+
+
+def test_a_budget_that_any_alarm_exceeds_leaves_none() -> None:
+    result = evaluated([alarm_from(1, 0.5)] * 2, [alarm_from(1, 0.5)]).compute()
+    assert result.groups[GROUP].threshold == math.inf
+    assert shares(result)["unchanged"] == 1
+    assert result.as_dict()["groups"][GROUP]["threshold"] is None
+
+
+def test_order_and_parts_change_no_bit() -> None:
+    whole = evaluated(random_scores(1), random_scores(2))
+    told = str(whole.compute().as_dict())
+    tokens = sorted(whole.tokens, key=lambda token: token[::-1])
+    for chosen in (tokens, tokens[::-1]):
+        parts = whole.fresh(), whole.fresh()
+        for number, token in enumerate(chosen):
+            parts[number % 2].add(token, whole.counts[token])
+        assert str(parts[0].merge(parts[1]).compute().as_dict()) == told
+
+
+def test_draws_count_as_often_as_they_say() -> None:
+    whole = evaluated(random_scores(3, 3), random_scores(4, 3), rules=at(0.6))
+    parts = [[each for token, each in whole.counts.items() if f"/s{number}/" in token] for number in range(3)]
+    once, twice = whole.resampled(parts, np.array([[1, 1, 1], [0, 2, 1]]))
+    assert numbers_of(once) == numbers_of(whole.result_of([each for part in parts for each in part]))
+    assert once.references == {}
+    assert once.curves == {}
+    alone = [whole.result_of(part).groups[GROUP].right[0.0][NOMINAL] for part in parts]
+    drawn = twice.groups[GROUP].right[0.0][NOMINAL]
+    for name in OUTCOMES:
+        assert drawn.shares[name] == pytest.approx((2 * alone[1].shares[name] + alone[2].shares[name]) / 3)
+    assert twice.groups[GROUP].accidents == 3
+
+
+def test_any_alarm_warns_too_and_alone_where_nobody_is_named() -> None:
+    """An alarm that is not right prevents nothing, unless the predictor names nobody."""
+    how: dict[str, Any] = {"accidents": [alarm_from(1)], "normal": [[None] * 13], "right": False}
+    result = evaluated(rules=at(0.5), **how).compute()
+    assert (shares(result)["avoided"], shares(result, alarms="any_alarm")["avoided"]) == (0, 1)
+    assert (result.alarms, result.avoided(GROUP)) == ("right", 0)
+    result = evaluated(rules=CleanWarnings(threshold=0.5, scores_of="recording"), **how).compute()
+    assert (result.alarms, result.avoided(GROUP)) == ("any_alarm", 1)
+    assert shares(result, alarms="lasting")["avoided"] == 1
+
+
+def test_alarms_that_flicker_prevent_for_free_unless_they_must_last() -> None:
+    flicker: Scores = [0.9, 0.9, None] * 4 + [None]
+    result = evaluated([flicker] * 3, [flicker] * 3, rules=at(0.5)).compute()
+    assert result.groups[GROUP].right[0.0][NOMINAL].braking_seconds_per_minute == 0
+    assert (shares(result)["avoided"], shares(result, alarms="lasting")["avoided"]) == (1, 0)
+    assert shares(result, "0.5 s, 6 m/s²", "lasting")["avoided"] == 1
+    chances = [f"{name}{end}" for name in TRIVIAL[2:] for end in ("", ", quiet")]
+    assert list(result.references) == [*TRIVIAL[:2], *chances, *REFERENCES]
+    assert result.notes[0].startswith("an alarm that is over before the driver brakes costs nothing")
+    siren = result.references["always"][GROUP]
+    assert siren.lasting[0.0][NOMINAL].shares["avoided"] == 1
+    chance = result.references["random per frame, quiet"][GROUP]
+    assert chance.right[0.0][NOMINAL].shares["avoided"] > chance.lasting[0.0][NOMINAL].shares["avoided"]
+    assert chance.right[0.0][NOMINAL].counts == {}
+
+
+def test_a_latency_is_less_time_to_brake() -> None:
+    outcomes = AccidentOutcomes(tables={"type1_subtype1_accident/s0/infrastructure": table((0.0, 0.1, 0.3))})
+    made = evaluated([alarm_from(31)], [[None] * 13], outcomes, "infrastructure", at(0.5))
+    result = made.compute()
+    found = {latency: settings[NOMINAL].shares["avoided"] for latency, settings in result.groups[GROUP].right.items()}
+    assert found == {0.0: 1, 0.1: 0, 0.3: 0}
+
+
+def test_accidents_without_a_table_are_left_out_and_named() -> None:
+    name = "type1_subtype1_accident/s1/ego_vehicle"
+    outcomes = AccidentOutcomes(
+        tables={name: table()},
+        dropped=(Skipped(scenario="type1_subtype1_accident/s0", reason="2 m apart"),),
+        skipped=(Skipped(scenario="type1_subtype1_accident/s2", reason="no labels"),),
+    )
+    result = evaluated([alarm_from(1)] * 3, [[None] * 13], outcomes, rules=at(0.5)).compute()
+    assert result.groups[GROUP].accidents == 1
+    assert "the self-check drops type1_subtype1_accident/s0: 2 m apart" in result.notes
+    assert "not judged type1_subtype1_accident/s2: no labels" in result.notes
+    assert result.as_dict()["dropped"] == [{"scenario": "type1_subtype1_accident/s0", "reason": "2 m apart"}]
+
+
+def test_pedestrians_are_apart_with_the_same_normal_recordings() -> None:
+    names = [f"type1_subtype1_accident/s{number}/ego_vehicle" for number in range(3)]
+    outcomes = AccidentOutcomes(
+        tables={name: table(pedestrian=number == 0) for number, name in enumerate(names)},
+    )
+    scores = [alarm_from(1), alarm_from(41), alarm_from(61)]
+    result = evaluated(scores, [[None] * 13] * 3, outcomes, rules=at(0.5)).compute()
+    assert {name: each.accidents for name, each in result.groups.items()} == {GROUP: 2, f"{GROUP}, pedestrian": 1}
+    assert [each.recordings for each in result.groups.values()] == [3, 3]
+    assert (result.avoided(GROUP), result.avoided(f"{GROUP}, pedestrian")) == (0, 1)
+
+
+def test_nothing_to_count_is_no_number() -> None:
+    result = evaluated([], [alarm_from(1)], rules=at(0.5)).compute()
+    figures = result.groups[GROUP].right[0.0][NOMINAL]
+    assert all(math.isnan(each) for each in (figures.warned, figures.extrapolated, *figures.shares.values()))
+    assert figures.braking_seconds_per_minute == pytest.approx(5.0 * 10)
+    assert any("no accident is judged" in note for note in result.notes)
+    result = evaluated([alarm_from(1)], [], rules=at(0.5)).compute()
+    assert shares(result)["avoided"] == 1
+    assert math.isnan(result.groups[GROUP].right[0.0][NOMINAL].braking_seconds_per_minute)
+    assert any("no recording without an accident" in note for note in result.notes)
+    result = evaluated([alarm_from(1)], []).compute()
+    assert math.isnan(result.groups[GROUP].threshold)
+    assert math.isnan(result.avoided(GROUP))
+    nothing = evaluated([], []).compute()
+    assert (nothing.groups, nothing.notes) == ({}, ())
+
+
+def test_no_alarm_at_the_impact_or_after_it_warns() -> None:
+    result = evaluated([[None] * 12 + [0.9]], [[None] * 13], rules=at(0.5)).compute()
+    assert result.groups[GROUP].right[0.0][NOMINAL].warned == 0
+
+
+def test_other_protocols_have_no_scores_of_recordings() -> None:
+    with pytest.raises(EvaluationError, match="counted by the protocol clean, found FieldWarnings"):
+        PreventedEvaluator(AccidentOutcomes(), "field")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda each: {"outcome": each.outcome[:, 1:]}, r"outcome: expected shape \(1, 14, 9\), found \(1, 13, 9\)"),
+        (lambda each: {"extrapolated": each.extrapolated[..., 0]}, r"extrapolated: expected shape \(1, 14, 9\)"),
+        (lambda each: {"outcome": each.outcome + 3}, "expected positions in OUTCOMES, 0 to 4"),
+        (lambda each: {"frame": each.frame[::-1]}, "expected ascending frame numbers"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_refused(change: Callable[[OutcomeTable], dict[str, Any]], sentence: str) -> None:
+    whole = table()
+    with pytest.raises(EvaluationError, match=sentence):
+        replace(whole, **change(whole))
+
+
+def test_rows_of_frames_and_of_none() -> None:
+    assert table().rows(np.array([1, 2, 6, 61, 66, -1])).tolist() == [0, 13, 1, 12, 13, 13]
+    nothing = replace(
+        table(), frame=FRAMES[:0], outcome=table().outcome[:, -1:], extrapolated=table().extrapolated[:, :1]
+    )
+    assert nothing.rows(np.array([1, 6])).tolist() == [0, 0]
+    assert replace(table(), frame=np.arange(13)).rows(np.array([0, 12, 13])).tolist() == [0, 12, 13]
