@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.measure import Figure, best_of, one_core
-from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
+from deepaccident_devkit.exact.polygon_fill import filled_cells
 from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import predict_instances
 

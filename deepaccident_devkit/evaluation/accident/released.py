@@ -15,7 +15,6 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.accident.outlines import pair_gaps
 from deepaccident_devkit.evaluation.accident.scoring import (
     DISTANCES,
     ERRORS,
@@ -39,6 +38,8 @@ from deepaccident_devkit.evaluation.predictions import (
     labels_at_present,
 )
 from deepaccident_devkit.evaluation.trajectories import Paths, instance_paths, longest, match_trajectories, padded
+from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
+from deepaccident_devkit.exact.outlines import pair_gaps
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     MotionHeads,
@@ -47,7 +48,6 @@ from deepaccident_devkit.motion import (
     trajectories,
 )
 from deepaccident_devkit.motion.orientations import to_orientation
-from deepaccident_devkit.motion.postprocessing.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 Pair = tuple[int, int]

@@ -14,12 +14,12 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.exact import single_precision
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
-from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.exact.polygon_fill import topmost
 from deepaccident_devkit.geometry.bev_grid import Axis
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes, FramePolygons, box_polygons
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
 from deepaccident_devkit.motion.drawing.next_centers import Footprints, following_centers
-from deepaccident_devkit.motion.drawing.polygon_fill import topmost
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import axes_of
 from deepaccident_devkit.motion.protocols import LabelProtocol

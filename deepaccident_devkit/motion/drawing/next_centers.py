@@ -10,11 +10,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from deepaccident_devkit.exact.single_precision import SamplingLine
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells
 from deepaccident_devkit.motion.protocols import LabelProtocol
-from deepaccident_devkit.motion.warps.warping import SamplingLine, nearest_indices, sampling_lines
+from deepaccident_devkit.motion.warps.warping import nearest_indices, sampling_lines
 from deepaccident_devkit.support.arrays import AnyArray, Float32Array, FloatArray, IntArray
 
 _MARGIN: Final = 0.75

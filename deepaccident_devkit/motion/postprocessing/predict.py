@@ -11,15 +11,15 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
+from deepaccident_devkit.exact.peaks import find_peaks
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.motion.postprocessing.grouping import (
     LABEL_LOGIT,
     FrameGroups,
     MotionHeads,
-    find_peaks,
     group_cells,
     link_frames,
     sums_by,

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.exact.single_precision import OUTSIDE, CellIndices, blend_cells, take_cells
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.motion.augmentation import Augmentation
@@ -13,15 +14,11 @@ from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol
 from deepaccident_devkit.motion.warps.chains import ego_from_agents, present_from_frames, present_from_past
 from deepaccident_devkit.motion.warps.warping import (
-    OUTSIDE,
-    CellIndices,
     WarpMode,
-    blend_cells,
     checked_mode,
     rounded_points,
     sample_points,
     sampling_matrix,
-    take_cells,
     warp,
 )
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, as_numbers, checked

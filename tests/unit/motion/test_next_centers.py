@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
+from deepaccident_devkit.exact.polygon_fill import topmost
 from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig
 from deepaccident_devkit.motion.drawing import next_centers
 from deepaccident_devkit.motion.drawing.next_centers import Footprints, following_centers
-from deepaccident_devkit.motion.drawing.polygon_fill import topmost
 from deepaccident_devkit.motion.warps.warping import sampling_matrix
 
 CONFIG = MotionLabelConfig(grid=BevGrid((-20, 20, 0.5), (-15, 15, 0.5)), receptive_field=1, future_frames=1)

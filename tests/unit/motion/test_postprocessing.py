@@ -8,10 +8,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
+from deepaccident_devkit.exact.contours import redrawn_cells
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.postprocessing.contours import redrawn_cells
 from deepaccident_devkit.motion.postprocessing.grouping import LABEL_LOGIT, MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import (
     FOREGROUND_THRESHOLD,

@@ -9,12 +9,12 @@ from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError
+from deepaccident_devkit.exact import single_precision
 from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
-from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
 from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
 from deepaccident_devkit.motion.warps.warping import nearest_indices, rounded_points, sampling_matrix, warp
