@@ -12,8 +12,8 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.geometry import six_vectors
-from deepaccident_devkit.geometry.se3 import inverses, stored_transforms
+from deepaccident_devkit.geometry import conventions
+from deepaccident_devkit.geometry.conventions import inverses, stored_transforms
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes
 from deepaccident_devkit.motion.drawing.from_boxes import motion_labels_from_boxes
@@ -100,8 +100,8 @@ def _frames(
     ego_from_lidar = stored_transforms(dataset.columns("sample_data")["matrix"][lidars])
     if config.rules.pose == "yaw":
         world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
-        world_from_level = six_vectors.from_matrices(world_from_ego) * (1, 1, 1, 0, 0, 1)
-        ego_from_lidar = inverses(six_vectors.to_matrices(world_from_level)) @ world_from_ego @ ego_from_lidar
+        world_from_level = conventions.six_vectors_of(world_from_ego) * (1, 1, 1, 0, 0, 1)
+        ego_from_lidar = inverses(conventions.matrices_of_six(world_from_level)) @ world_from_ego @ ego_from_lidar
     return [
         FrameBoxes(
             center=boxes["translation"][one],

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from deepaccident_devkit.errors import MOST_TOLD, SensorFileError, shortened
 from deepaccident_devkit.geometry import LidarPointCloud
-from deepaccident_devkit.geometry.handedness import flip_points
+from deepaccident_devkit.geometry.conventions import flip_points
 from deepaccident_devkit.release._content import REMEDY, in_range, read_content
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_member

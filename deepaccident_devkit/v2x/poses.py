@@ -1,7 +1,7 @@
 """Poses of agents, and transforms between them.
 
 See docs/released_code.md, Poses. Every function works for both kinds of handedness: right-handed poses (the devkit's)
-give right-handed 6-vectors, CARLA's raw poses give those of the released code; `geometry.handedness.flip_six_vector`
+give right-handed 6-vectors, CARLA's raw poses give those of the released code; `geometry.conventions.flip_six_vector`
 converts one into the other.
 """
 
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, GeometryError
-from deepaccident_devkit.geometry import SE3, six_vectors
-from deepaccident_devkit.geometry.se3 import inverses
+from deepaccident_devkit.geometry import SE3, conventions
+from deepaccident_devkit.geometry.conventions import inverses
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, checked
 
 Poses = Sequence[SE3] | ArrayLike
@@ -66,7 +66,7 @@ def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:
     poses = _stacked("world_from_agent", world_from_agent)
     if not len(poses):
         raise GeometryError("world_from_agent: expected the ego's pose and its partners', found none")
-    return six_vectors.from_matrices(inverses(poses[:1]) @ poses)
+    return conventions.six_vectors_of(inverses(poses[:1]) @ poses)
 
 
 def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> FloatArray:
@@ -93,7 +93,7 @@ def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> F
     known: BoolArray = checked("valid", np.ones(len(poses)) if valid is None else valid, (len(poses),), np.bool_)
     both = known[:-1] & known[1:]
     motion = np.zeros((len(poses) - 1, 6))
-    motion[both] = six_vectors.from_matrices(inverses(poses[1:][both]) @ poses[:-1][both])
+    motion[both] = conventions.six_vectors_of(inverses(poses[1:][both]) @ poses[:-1][both])
     return motion
 
 

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from deepaccident_devkit.errors import shortened
-from deepaccident_devkit.geometry.footprints import gaps
+from deepaccident_devkit.geometry.box_arrays import gaps
 from deepaccident_devkit.release import Collision, Meta
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import Finding

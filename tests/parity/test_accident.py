@@ -27,8 +27,8 @@ from deepaccident_devkit.evaluation.accident.released import (
 )
 from deepaccident_devkit.evaluation.predictions import MotionOutput, first_frames
 from deepaccident_devkit.exact.outlines import pair_gaps
+from deepaccident_devkit.geometry.bev_grid import cells_in, to_orientation
 from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabelConfig, MotionLabels, predict_instances
-from deepaccident_devkit.motion.orientations import cells_in, to_orientation
 
 ACCIDENT, RULES = POST_PROCESSING["accident"], ReleasedAccidents()
 COUNTS = ("tp", "fp", "fn", "id", "position", "time")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.motion.orientations import cells_in, to_orientation
+from deepaccident_devkit.geometry.bev_grid import cells_in, to_orientation
 from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import LinkedInstances, predict_instances
 

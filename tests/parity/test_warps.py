@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.handedness import flip_pose, flip_six_vector
+from deepaccident_devkit.geometry.bev_grid import to_orientation
+from deepaccident_devkit.geometry.conventions import flip_pose, flip_six_vector
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.orientations import to_orientation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
 from deepaccident_devkit.motion.warps.chains import present_from_frames
 from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present

@@ -9,8 +9,7 @@ from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.exact.peaks import find_peaks, nearest_peaks
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
-from deepaccident_devkit.motion.orientations import to_orientation
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, to_orientation
 from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import (
     POST_PROCESSING,

@@ -14,8 +14,7 @@ from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation.alarms.reading import InstanceTracks
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.geometry.conflicts import time_to_collision
-from deepaccident_devkit.geometry.footprints import gaps
+from deepaccident_devkit.geometry.box_arrays import gaps, time_to_collision
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr

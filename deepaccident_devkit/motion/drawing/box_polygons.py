@@ -16,7 +16,7 @@ import numpy as np
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.exact import single_precision
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.geometry.handedness import flip_pose
+from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig

@@ -14,13 +14,12 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.exact.polygon_fill import topmost
-from deepaccident_devkit.geometry.bev_grid import Axis
+from deepaccident_devkit.geometry.bev_grid import Axis, axes_of
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes, FramePolygons, box_polygons
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
 from deepaccident_devkit.motion.drawing.next_centers import Footprints, following_centers
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.orientations import axes_of
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.settings import count
 from deepaccident_devkit.motion.warps.chains import frames_from_next

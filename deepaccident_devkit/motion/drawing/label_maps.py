@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
+from deepaccident_devkit.geometry.bev_grid import cells_in, vectors_in
 from deepaccident_devkit.motion.config import MotionLabelConfig
-from deepaccident_devkit.motion.orientations import cells_in, vectors_in
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, Float32Array, IntArray
 
 _VANISHED: Final = 104.0

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.exact.peaks import nearest_peaks
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, to_orientation
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.orientations import to_orientation
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     FloatArray,

@@ -14,8 +14,7 @@ from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.exact.peaks import find_peaks
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
-from deepaccident_devkit.motion.orientations import cells_in, to_orientation
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, cells_in, to_orientation
 from deepaccident_devkit.motion.postprocessing.grouping import (
     LABEL_LOGIT,
     FrameGroups,

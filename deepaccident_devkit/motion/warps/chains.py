@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.exact import single_precision
-from deepaccident_devkit.geometry import six_vectors
-from deepaccident_devkit.geometry.handedness import flip_pose, flip_six_vector
+from deepaccident_devkit.geometry import conventions
+from deepaccident_devkit.geometry.conventions import flip_pose, flip_six_vector
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.support.arrays import AnyArray, checked
@@ -30,7 +30,7 @@ class _Arithmetic(NamedTuple):
 _SINGLE = _Arithmetic(
     single_precision.pose_matrices, single_precision.rigid_inverse, single_precision.inverse, single_precision.product
 )
-_DOUBLE = _Arithmetic(six_vectors.to_matrices, np.linalg.inv, np.linalg.inv, np.matmul)
+_DOUBLE = _Arithmetic(conventions.matrices_of_six, np.linalg.inv, np.linalg.inv, np.matmul)
 
 
 def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol) -> AnyArray:
@@ -60,7 +60,7 @@ def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol)
     # torch's atan2 is not correctly rounded, so its angles can differ in the last bit: at a tie, where a sample point
     # lies on a border between cells, a cell can (one in three of about 330 warped outputs of the released code)
     next_from_this = single_precision.fused_product(next_from_world, poses[:-1][both])
-    motion[both] = six_vectors.from_matrices(next_from_this).astype(np.float32)
+    motion[both] = conventions.six_vectors_of(next_from_this).astype(np.float32)
     return motion
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.exact.single_precision import OUTSIDE, CellIndices, blend_cells, take_cells
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.handedness import flip_pose
+from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol

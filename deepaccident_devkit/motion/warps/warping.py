@@ -39,9 +39,8 @@ from deepaccident_devkit.exact.single_precision import (
     stretched_lines,
     take_cells,
 )
-from deepaccident_devkit.geometry import BevGrid, six_vectors
-from deepaccident_devkit.geometry.bev_grid import Orientation
-from deepaccident_devkit.motion.orientations import axes_of
+from deepaccident_devkit.geometry import BevGrid, conventions
+from deepaccident_devkit.geometry.bev_grid import Orientation, axes_of
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, checked
 from deepaccident_devkit.support.text import choice
@@ -171,7 +170,7 @@ def sample_points(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProt
 def sampling_lines(matrices: AnyArray, grid: BevGrid, rules: LabelProtocol) -> tuple[SamplingLine, SamplingLine]:
     """What `sample_points` computes its rows and columns from, for matrices (N, 4, 4): to sample only some cells."""
     if rules.warp == "fiery":
-        numbers = six_vectors.from_matrices(np.linalg.inv(matrices)).astype(np.float32).T[..., None]
+        numbers = conventions.six_vectors_of(np.linalg.inv(matrices)).astype(np.float32).T[..., None]
         return fiery_lines(numbers[0], numbers[1], numbers[5], grid.x, grid.y)
     native = grid.with_orientation(rules.native)
     order = [0, 1] if native.orientation == "fiery" else [1, 0]

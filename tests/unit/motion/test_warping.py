@@ -10,7 +10,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError
 from deepaccident_devkit.exact import single_precision
-from deepaccident_devkit.geometry import BevGrid, six_vectors
+from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
@@ -122,7 +122,7 @@ def test_past_motions_are_multiplied_in_the_order_of_time_as_released_and_rightl
     exact = present_from_past([first, second], CLEAN)
     released = present_from_past([first, second], RELEASED)
     # left-handed: turning is the other way round
-    ahead, turn = six_vectors.to_matrices(first), six_vectors.to_matrices(np.negative(second))
+    ahead, turn = conventions.matrices_of_six(first), conventions.matrices_of_six(np.negative(second))
     np.testing.assert_allclose(exact, [turn @ ahead, turn], atol=1e-12)
     np.testing.assert_allclose(released, [ahead @ turn, turn], atol=1e-6)
     assert present_from_past(np.zeros((0, 6)), RELEASED).shape == (0, 4, 4)
@@ -146,7 +146,7 @@ def test_single_precision_inverses_are_inverses() -> None:
     six = np.random.default_rng(1).normal(0, (8, 8, 1, 0.1, 0.1, 1), (50, 6))
     matrices = single_precision.pose_matrices(six)
     assert matrices.dtype == np.float32
-    np.testing.assert_allclose(matrices, six_vectors.to_matrices(six), atol=1e-6)
+    np.testing.assert_allclose(matrices, conventions.matrices_of_six(six), atol=1e-6)
     for inverse in (single_precision.inverse, single_precision.rigid_inverse):
         np.testing.assert_allclose(
             single_precision.product(inverse(matrices), matrices), np.tile(np.eye(4), (50, 1, 1)), atol=1e-5
