@@ -19,7 +19,7 @@ from deepaccident_devkit.motion import (
     motion_labels_from_boxes,
     write_label_files,
 )
-from deepaccident_devkit.motion.drawing.label_maps import LabelMaps
+from deepaccident_devkit.motion.drawing import LabelMaps
 
 OBJECTS, STEP = 30, 0.5
 RELEASED_MS = 112

@@ -5,7 +5,7 @@ last bit of the matrix decides. So the labels' warps repeat each rounding: produ
 without fused multiply-add, the inverse by elimination as LAPACK's getrf and getrs do it, and sine and cosine by a
 polynomial. Checked against torch 2.13 on random poses: all bits are equal.
 
-Where target cells sample comes from a protocol's rule (`motion.warps.warping` has their story): `stretched_lines`,
+Where target cells sample comes from a protocol's rule (`motion.warping` has their story): `stretched_lines`,
 `exact_lines` or `fiery_lines`.
 """
 

@@ -48,7 +48,7 @@ from deepaccident_devkit.taxonomy import (
     UNTRACKED_ID,
     VEHICLE_AGENTS,
 )
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord

@@ -84,8 +84,6 @@ def category_codes(category: ArrayLike) -> AnyArray:
     return np.array([CATEGORIES.index(name) for name in names], dtype=np.int8).reshape(given.shape)
 
 
-
-
 def intersection_areas(first: FloatArray, second: FloatArray) -> FloatArray:
     """Common areas of each of N footprints with each of M: (N, 5) and (M, 5) → (N, M), m²."""
     reach = np.hypot(first[:, 2], first[:, 3])[:, None] + np.hypot(second[:, 2], second[:, 3])
@@ -280,8 +278,6 @@ def half_extents(boxes: FloatArray, directions: FloatArray) -> FloatArray:
     lengthwise, across = (np.abs(along(directions, normals(yaw))) for yaw in np.moveaxis(side_yaws(boxes), -1, 0))
     result: FloatArray = lengthwise * boxes[..., 2, None] / 2 + across * boxes[..., 3, None] / 2
     return result
-
-
 
 
 def points_in_boxes(

@@ -1,10 +1,10 @@
 """Transforms between frames of moments and agents, and BEV feature maps in another frame, with gradients.
 
-The sibling of `geometry.conventions` and `motion.warps.chains`, for whole batches. Nothing here depends on the
+The sibling of `geometry.conventions` and `motion.warping`, for whole batches. Nothing here depends on the
 handedness, so long as all that goes in has the same. Products are written as sums, because `autocast` would
 round a matrix product to bfloat16, and metres need more digits than that.
 
-The torch sibling of `motion.warps.warping`, for whole batches. Maps lie [row = y ascending, column = x ascending], and
+The torch sibling of `motion.warping`, for whole batches. Maps lie [row = y ascending, column = x ascending], and
 transforms have the maps' handedness; nothing here depends on which it is.
 """
 
@@ -106,7 +106,7 @@ def warp_features(
     """Feature maps as the target's frame sees them; zero outside the source's grid.
 
     `exact` samples at the centres of the target's cells. `stretched` is the released FeatureWarper's rule, which
-    blurs by up to half a cell even without motion (`motion.warps.warping`). Points lie on the plane z = 0; of the
+    blurs by up to half a cell even without motion (`motion.warping`). Points lie on the plane z = 0; of the
     inverse transform only rows x, y and columns x, y and translation count.
 
     Args:

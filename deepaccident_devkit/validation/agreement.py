@@ -22,7 +22,7 @@ from deepaccident_devkit.taxonomy import (
     VEHICLE_AGENTS,
     WEATHERS,
 )
-from deepaccident_devkit.v2x.accident_visibility import SHEER_CURTAINS
+from deepaccident_devkit.v2x.agents import SHEER_CURTAINS
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.validation.subject import Subject, actors_text, frames_text, near_pairs
 

@@ -23,7 +23,7 @@ from deepaccident_devkit.motion import (
     MotionLabels,
     motion_labels_from_boxes,
 )
-from deepaccident_devkit.motion.drawing.box_polygons import box_polygons
+from deepaccident_devkit.motion.box_polygons import box_polygons
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE
 

@@ -8,10 +8,16 @@ from strategies import grids
 
 from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
-from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
-from deepaccident_devkit.motion.warps.to_present import agents_to_ego
-from deepaccident_devkit.motion.warps.warping import nearest_indices, sample_points, sampling_matrix, warp
+from deepaccident_devkit.motion.config import LABEL_PROTOCOLS
+from deepaccident_devkit.motion.warping import (
+    agents_to_ego,
+    nearest_indices,
+    present_from_frames,
+    present_from_past,
+    sample_points,
+    sampling_matrix,
+    warp,
+)
 
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
 RULES = st.sampled_from(list(LABEL_PROTOCOLS.values()))

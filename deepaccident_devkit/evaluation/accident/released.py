@@ -1,6 +1,6 @@
 """Accidents as the released code evaluates them, bugs included (protocol `released`; docs/released_code.md, Accidents).
 
-Bugs of other functions: `motion.postprocessing.contours` (boxes of 5 m × 2 m at most, rasterised into the wrong frame
+Bugs of other functions: `exact.contours` (boxes of 5 m × 2 m at most, rasterised into the wrong frame
 after a gap, and of the first frame's instances alone), `outlines.first_outline` (of an instance in several parts, one
 counts), `trajectories.padded` and `match_trajectories`.
 """

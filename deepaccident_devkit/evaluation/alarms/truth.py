@@ -20,7 +20,7 @@ from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.collisions import labelled_pair
-from deepaccident_devkit.v2x.seen import seen_actors
+from deepaccident_devkit.v2x.cooperation import seen_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 RELEASED_HORIZON: Final = 2.0

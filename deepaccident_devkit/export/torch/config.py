@@ -21,12 +21,12 @@ from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid, Boxes, LidarPointCloud, conventions
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
-from deepaccident_devkit.motion.warps.warping import WarpMode
+from deepaccident_devkit.motion.warping import WarpMode
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, as_floats, checked, checked_number, checked_whole
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import OnError
 from deepaccident_devkit.v2x import Agents, Link
-from deepaccident_devkit.v2x.link import checked_link
+from deepaccident_devkit.v2x.messages import checked_link
 
 BoxSource = Literal["sample", "cooperative"]
 AugmentationSource = Augmentation | Callable[[np.random.Generator], Augmentation]

@@ -16,7 +16,7 @@ from deepaccident_devkit.motion import (
     MotionLabelConfig,
     motion_labels_from_boxes,
 )
-from deepaccident_devkit.motion.drawing.box_polygons import box_polygons
+from deepaccident_devkit.motion.box_polygons import box_polygons
 
 STILL = np.zeros((7, 6))
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]

@@ -12,12 +12,18 @@ from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableE
 from deepaccident_devkit.exact import single_precision
 from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.config import LABEL_PROTOCOLS, LabelProtocol, MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
-from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
-from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
-from deepaccident_devkit.motion.warps.warping import nearest_indices, rounded_points, sampling_matrix, warp
+from deepaccident_devkit.motion.warping import (
+    agents_to_ego,
+    nearest_indices,
+    past_to_present,
+    present_from_frames,
+    present_from_past,
+    rounded_points,
+    sampling_matrix,
+    warp,
+)
 
 GRID = BevGrid((-4, 4, 1), (-4, 4, 1))
 RELEASED, CLEAN, FIERY = (LABEL_PROTOCOLS[name] for name in ("released", "clean", "fiery"))
