@@ -21,7 +21,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export import bulk
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.parallel import cluster_executor, run_batch, store
-from deepaccident_devkit.parallel.pool import own_workers
+from deepaccident_devkit.parallel.executors import own_workers
 
 WARMING_S = 0.5
 

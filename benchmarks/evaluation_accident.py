@@ -7,7 +7,7 @@ from benchmarks.measure import Figure, best_of, one_core
 from deepaccident_devkit.evaluation.accident import PROTOCOLS, AccidentContext, AccidentProtocol
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
-from deepaccident_devkit.motion.drawing.from_boxes import motion_labels_from_boxes
+from deepaccident_devkit.motion.drawing import motion_labels_from_boxes
 
 PREDICTIONS, REPEATS = 6, 20
 

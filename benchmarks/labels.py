@@ -10,6 +10,7 @@ from benchmarks import labels_postprocess, labels_warp
 from benchmarks.measure import Figure, best_of, one_core
 from benchmarks.releases import labels_only_release
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.exact.polygon_fill import filled_cells
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
     FrameBoxes,
@@ -18,8 +19,7 @@ from deepaccident_devkit.motion import (
     motion_labels_from_boxes,
     write_label_files,
 )
-from deepaccident_devkit.motion.drawing.label_maps import LabelMaps
-from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
+from deepaccident_devkit.motion.drawing import LabelMaps
 
 OBJECTS, STEP = 30, 0.5
 RELEASED_MS = 112

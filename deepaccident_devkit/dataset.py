@@ -11,7 +11,8 @@ import numpy as np
 from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.geometry.boxes import trusted_boxes
-from deepaccident_devkit.geometry.se3 import stored_transforms, trusted_se3
+from deepaccident_devkit.geometry.conventions import stored_transforms
+from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.support import nuscenes_names

@@ -14,7 +14,7 @@ from deepaccident_devkit.errors import IndexStoreError, escaped
 from deepaccident_devkit.interactions import interactions as interactions_of_scenario
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
-from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.files import path_of, writable_folder, write_bytes
+from deepaccident_devkit.support.files import writable_folder, write_bytes
 from deepaccident_devkit.support.pages import rendered
-from deepaccident_devkit.support.text import columns_text
+from deepaccident_devkit.support.text import columns_text, path_of
 
 Row = Sequence[object]
 

@@ -15,8 +15,8 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.release import write_split_file
 from deepaccident_devkit.reports import Report
-from deepaccident_devkit.support.files import path_of, replacing
-from deepaccident_devkit.support.text import columns_text, natural_order, share_text
+from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.text import columns_text, natural_order, path_of, share_text
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SCENARIO_ATTRIBUTES, SPLITS, VEHICLE_AGENTS
 
 if TYPE_CHECKING:

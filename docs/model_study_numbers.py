@@ -17,7 +17,7 @@ from deepaccident_devkit.evaluation.numbers import numbers_of
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
-from deepaccident_devkit.v2x.seen import seen_actors
+from deepaccident_devkit.v2x.cooperation import seen_actors
 
 NEAR: Final = 2.0
 """Metres, from a box's centre to an actor's: so near, the actor is detected."""

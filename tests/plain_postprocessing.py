@@ -8,8 +8,8 @@ import math
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
-from deepaccident_devkit.motion.postprocessing.predict import FOREGROUND_THRESHOLD, PostProcessing
+from deepaccident_devkit.motion.grouping import MotionHeads
+from deepaccident_devkit.motion.instances import FOREGROUND_THRESHOLD, PostProcessing
 
 F = np.float32
 

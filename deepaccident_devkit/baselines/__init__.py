@@ -15,7 +15,7 @@ from deepaccident_devkit.baselines.outlook import (
 )
 from deepaccident_devkit.baselines.predict import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.baselines.predict_results import Baseline, predict_results
-from deepaccident_devkit.v2x.seen import SeenActors, seen_actors
+from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
 __all__ = [
     "MOTION_MODELS",

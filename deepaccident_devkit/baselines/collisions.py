@@ -8,7 +8,7 @@ import numpy as np
 
 from deepaccident_devkit.baselines.outlook import Outlook
 from deepaccident_devkit.evaluation import Accident
-from deepaccident_devkit.geometry.footprints import gaps_of_pairs
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, OWN_ACTOR_ID
 

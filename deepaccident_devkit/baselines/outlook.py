@@ -1,7 +1,7 @@
 """`Outlook`: where an agent and its partners expect the actors that they see now.
 
-Who is seen, and where, is by the labels (`v2x.seen`): an oracle. Actors go on at a constant velocity, or at a constant
-turn rate besides.
+Who is seen, and where, is by the labels (`v2x.cooperation`): an oracle. Actors go on at a constant velocity, or at a
+constant turn rate besides.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Link
-from deepaccident_devkit.v2x.seen import SeenActors, seen_actors
+from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
 MotionModel = Literal["constant_velocity", "constant_turn_rate"]
 MOTION_MODELS: Final[tuple[MotionModel, ...]] = get_args(MotionModel)

@@ -21,7 +21,7 @@ from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, motion_lab
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import Agents, Link, future_egomotion
-from deepaccident_devkit.v2x.seen import SeenActors, seen_actors
+from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
 _ENOUGH_POINTS = 10.0
 """LiDAR points that add to a score half of what any number of them can add."""
@@ -47,7 +47,7 @@ def predict_motion(
         config: of the labels; None for the released ones. Its `agents` and `filter_invisible` have no effect.
 
     Raises:
-        DeepAccidentError: as of `v2x.seen.seen_actors`; no such model.
+        DeepAccidentError: as of `v2x.cooperation.seen_actors`; no such model.
     """
     chosen = config or MotionLabelConfig()
     ahead = outlook(dataset, sample, agents=agents, model=model, link=link)
@@ -151,7 +151,7 @@ def predict_detections(
         link: what happens to the partners' data.
 
     Raises:
-        DeepAccidentError: as of `v2x.seen.seen_actors`.
+        DeepAccidentError: as of `v2x.cooperation.seen_actors`.
     """
     seen = seen_actors(dataset, sample, agents=agents, link=link, frame="world")
     watchers = np.unpackbits(seen.seen_by[:, None], axis=1).sum(axis=1)

@@ -22,8 +22,7 @@ from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, r
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
-from deepaccident_devkit.support.files import path_of
-from deepaccident_devkit.support.text import choice, settle_choices
+from deepaccident_devkit.support.text import choice, path_of, settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link, cooperating_agents
 

@@ -17,9 +17,9 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
 from deepaccident_devkit.motion.batch_names import BatchNames
+from deepaccident_devkit.motion.config import slip_names
 from deepaccident_devkit.motion.label_folder import Manifest, folder_path
-from deepaccident_devkit.motion.protocols import slip_names
-from deepaccident_devkit.motion.sample_lists import Purpose
+from deepaccident_devkit.motion.sample_labels import Purpose
 from deepaccident_devkit.v2x import AGENT_SETS
 
 _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")

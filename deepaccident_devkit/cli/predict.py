@@ -24,7 +24,7 @@ from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
-from deepaccident_devkit.motion.sample_lists import no_samples_text
+from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.v2x import Link

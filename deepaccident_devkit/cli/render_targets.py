@@ -12,8 +12,8 @@ from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES
 from deepaccident_devkit.render.roles import collider_ids
 from deepaccident_devkit.tables.tokens import annotation_token, frame_token, instance_token, sample_token
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import default_scenario, first_accident
-from deepaccident_devkit.v2x.configurations import agents_of
 
 _SECONDS_BEFORE = 1.0
 _CAMERA = "Camera_Front"

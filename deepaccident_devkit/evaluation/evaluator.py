@@ -18,9 +18,10 @@ from typing import Any, Generic, TypeVar
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.support.arrays import IntArray
-from deepaccident_devkit.support.files import path_of, write_bytes
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 
 Counts = Mapping[str, Any]
 """What one sample adds: names → whole numbers, floats, None, or nested lists of them; as JSON holds it."""

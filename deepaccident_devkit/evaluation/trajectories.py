@@ -23,7 +23,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion.orientations import cells_in
+from deepaccident_devkit.geometry.bev_grid import cells_in
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray
 
 Paths = Mapping[int, FloatArray]

@@ -28,7 +28,7 @@ from deepaccident_devkit.render.replay.recording import Recording
 from deepaccident_devkit.render.roles import actor_color, recorders_of
 from deepaccident_devkit.support.arrays import as_floats
 from deepaccident_devkit.taxonomy import CAMERAS
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:

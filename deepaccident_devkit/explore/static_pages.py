@@ -32,7 +32,6 @@ from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.selection import find
 from deepaccident_devkit.selection.fields import measures_of_moving_pairs
 from deepaccident_devkit.support.files import (
-    path_of,
     plain_names,
     replacing_folder,
     temporary_path,
@@ -41,6 +40,7 @@ from deepaccident_devkit.support.files import (
 )
 from deepaccident_devkit.support.pages import rendered
 from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.text import path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

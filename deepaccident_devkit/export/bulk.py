@@ -32,9 +32,10 @@ from deepaccident_devkit.parallel import Engine, Failure, Places, Store, Tried, 
 from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders, sensor_digest
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
-from deepaccident_devkit.support.files import path_of, place_in, remove_in, remove_leftovers, temporary_of, write_bytes
+from deepaccident_devkit.support.files import place_in, remove_in, remove_leftovers, temporary_of, write_bytes
 from deepaccident_devkit.support.json_text import parsed_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -29,13 +29,12 @@ from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image, encode_jpeg
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray, IntArray
-from deepaccident_devkit.support.files import path_of
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import check_size, fault_text, open_file
-from deepaccident_devkit.support.text import settle_choices, size_text
+from deepaccident_devkit.support.text import path_of, settle_choices, size_text
 from deepaccident_devkit.tables.tokens import sample_data_token, sample_token
 from deepaccident_devkit.taxonomy import AgentName
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 
 __all__ = ["CachedImages", "Codec", "ImageCache"]
 

@@ -26,9 +26,8 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.format import Format, Output, Unit, some_of
 from deepaccident_devkit.export.sensor_files import sensor_files, stored_camera
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.geometry.handedness import camera_from_lidar_to_raw, flip_pose
+from deepaccident_devkit.geometry.conventions import camera_from_lidar_to_raw, flip_pose, inverses, stored_transforms
 from deepaccident_devkit.geometry.quaternions import to_matrix
-from deepaccident_devkit.geometry.se3 import inverses, stored_transforms
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
@@ -49,7 +48,7 @@ from deepaccident_devkit.taxonomy import (
     UNTRACKED_ID,
     VEHICLE_AGENTS,
 )
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord

@@ -30,7 +30,7 @@ from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, CHANNEL_FORMAT, CHANNELS, LIDAR
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 
 logger = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CATEGORIES, CHANNELS, LIDAR
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset

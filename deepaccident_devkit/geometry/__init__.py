@@ -1,9 +1,9 @@
 """Geometry in one right-handed convention: x forward, y left, z up, yaw counter-clockwise; metres, radians."""
 
 from deepaccident_devkit.geometry.bev_grid import BevGrid
+from deepaccident_devkit.geometry.box_arrays import time_to_collision
 from deepaccident_devkit.geometry.boxes import Box, Boxes
 from deepaccident_devkit.geometry.camera import BoxVisibility, PinholeCamera
-from deepaccident_devkit.geometry.conflicts import time_to_collision
 from deepaccident_devkit.geometry.pointcloud import LidarPointCloud
 from deepaccident_devkit.geometry.se3 import SE3
 

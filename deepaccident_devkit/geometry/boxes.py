@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.geometry.box_columns import COLUMNS, category_codes, check_numbers, unit
-from deepaccident_devkit.geometry.footprints import gaps, intersection_areas
-from deepaccident_devkit.geometry.frames import checked_frame
-from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
+from deepaccident_devkit.geometry import box_arrays, quaternions
+from deepaccident_devkit.geometry.box_arrays import COLUMNS
+from deepaccident_devkit.geometry.conventions import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.support.arrays import (
     AnyArray,
@@ -82,10 +80,10 @@ class Boxes(FrozenArrays, Pictured):
         count = len(checked("Boxes.center", self.center, (None, 3)))
         columns: dict[str, AnyArray] = {}
         for name, (shape, dtype) in COLUMNS.items():
-            given = category_codes(self.category) if name == "category" else getattr(self, name)
+            given = box_arrays.category_codes(self.category) if name == "category" else getattr(self, name)
             columns[name] = checked(f"Boxes.{name}", given, (count, *shape[1:]), dtype).copy()
-        check_numbers(columns)
-        columns["rotation"] = unit(columns["rotation"])
+        box_arrays.check_numbers(columns)
+        columns["rotation"] = box_arrays.unit_quaternions(columns["rotation"])
         for name, array in columns.items():
             object.__setattr__(self, name, readonly(array))
 
@@ -144,8 +142,11 @@ class Boxes(FrozenArrays, Pictured):
         """
         if isinstance(which, slice):
             return self._picked(which)
-        number = _number_of(which)
-        if number is None:
+        try:
+            number = operator.index(which)
+        except TypeError:
+            return self.select(which)
+        if isinstance(which, bool):
             return self.select(which)
         if not -len(self) <= number < len(self):
             raise IndexError(f"there are {len(self)} boxes, asked for box {number}")
@@ -249,8 +250,8 @@ class Boxes(FrozenArrays, Pictured):
             GeometryError: the frames differ, or are a camera's (whose z points forward).
         """
         self._check_ground(other)
-        common = intersection_areas(self._footprints(), other._footprints())
-        return _over_union(common, _product(self.size[:, :2]), _product(other.size[:, :2]))
+        common = box_arrays.intersection_areas(self._footprints(), other._footprints())
+        return _over_union(common, self.size[:, :2], other.size[:, :2])
 
     def iou_3d(self, other: Boxes) -> FloatArray:
         """Intersection over union of the volumes of these N boxes and M others: (N, M) in [0, 1].
@@ -263,10 +264,10 @@ class Boxes(FrozenArrays, Pictured):
             GeometryError: the frames differ, or are a camera's (whose z points forward).
         """
         self._check_ground(other)
-        common = intersection_areas(self._footprints(), other._footprints())
+        common = box_arrays.intersection_areas(self._footprints(), other._footprints())
         (low, high), (other_low, other_high) = self._heights(), other._heights()
         shared = np.minimum(high[:, None], other_high) - np.maximum(low[:, None], other_low)
-        return _over_union(common * np.maximum(shared, 0), _product(self.size), _product(other.size))
+        return _over_union(common * np.maximum(shared, 0), self.size, other.size)
 
     def distance_bev(self, other: Boxes) -> FloatArray:
         """The gap between the footprints of these N boxes and M others: (N, M) metres, 0 if they touch or overlap.
@@ -274,7 +275,7 @@ class Boxes(FrozenArrays, Pictured):
         Footprints and errors are those of `iou_bev`.
         """
         self._check_ground(other)
-        return gaps(self._footprints(), other._footprints())
+        return box_arrays.gaps(self._footprints(), other._footprints())
 
     def _picked(self, which: slice | AnyArray) -> Boxes:
         """The boxes of a slice, a mask or an array of rows; raises numpy's IndexError."""
@@ -282,7 +283,7 @@ class Boxes(FrozenArrays, Pictured):
 
     def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
         """Rows of boxes and rows of points (P, 3), one pair for each point in a box."""
-        return points_in_boxes(points, self.center, self.size / 2, quaternions.to_matrix(self.rotation))
+        return box_arrays.points_in_boxes(points, self.center, self.size / 2, quaternions.to_matrix(self.rotation))
 
     def _footprints(self) -> FloatArray:
         return np.column_stack([self.center[:, :2], self.size[:, :2], self.yaw])
@@ -331,21 +332,10 @@ def concatenate(parts: list[Boxes], frame: str) -> Boxes:
     )
 
 
-def _number_of(which: object) -> int | None:
-    """A single whole number, numpy's among them; None of all else."""
-    try:
-        return None if isinstance(which, bool) else operator.index(which)  # type: ignore[arg-type]  # all else: TypeError
-    except TypeError:
-        return None
-
-
 def _over_union(common: FloatArray, mine: FloatArray, theirs: FloatArray) -> FloatArray:
-    union = mine[:, None] + theirs - common
+    """The shares (N, M) that common parts have of the unions of two sets of sizes, (N, axes) and (M, axes)."""
+    union = mine.prod(axis=1)[:, None] + theirs.prod(axis=1) - common
     return as_floats(np.divide(common, union, out=np.zeros_like(common), where=union > 0).clip(0, 1))
-
-
-def _product(sizes: FloatArray) -> FloatArray:
-    return as_floats(sizes.prod(axis=1))
 
 
 def checked_boxes(name: str, boxes: object) -> Boxes:

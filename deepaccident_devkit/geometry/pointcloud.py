@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry.bev_grid import BevGrid
-from deepaccident_devkit.geometry.frames import checked_frame
+from deepaccident_devkit.geometry.conventions import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.support.arrays import (
     AnyArray,

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import quaternions, six_vectors
+from deepaccident_devkit.geometry import conventions, quaternions
+from deepaccident_devkit.geometry.conventions import LAST_ROW, inverses
 from deepaccident_devkit.support.arrays import (
-    AnyArray,
     FloatArray,
     FrozenArrays,
     as_numbers,
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 RIGID_TOLERANCE = 1e-3
 """How far a rotation may be from an orthonormal one: files have poses in single precision, or rounded ones."""
-LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 @runtime_checkable
@@ -103,12 +102,12 @@ class SE3(FrozenArrays):
         """From (6,) tx, ty, tz, rx, ry, rz: metres and radians, R = Rx(rx) · Ry(ry) · Rz(rz).
 
         See docs/released_code.md, Poses. The vector is right-handed, like all of SE3; convert one of the released code
-        with `handedness.flip_six_vector` first. Raises GeometryError if a number is not finite.
+        with `conventions.flip_six_vector` first. Raises GeometryError if a number is not finite.
         """
         six = checked("vector", vector, (6,))
         if not np.isfinite(six).all():
             raise GeometryError(f"vector: {six.tolist()} holds NaN or infinity")
-        return trusted_se3(six_vectors.to_matrices(six))
+        return trusted_se3(conventions.matrices_of_six(six))
 
     @property
     def rotation(self) -> FloatArray:
@@ -138,7 +137,7 @@ class SE3(FrozenArrays):
         ry is in [−π/2, π/2]; at its ends (the source's x axis points straight up or down) there are many pairs of rx
         and rz for the same rotation.
         """
-        return six_vectors.from_matrices(self.matrix)
+        return conventions.six_vectors_of(self.matrix)
 
     def inverse(self) -> SE3:
         """The inverse transform, `source_from_target`."""
@@ -201,34 +200,11 @@ class SE3(FrozenArrays):
         return f"SE3(translation=[{x:.3f}, {y:.3f}, {z:.3f}], yaw={self.yaw:.4f})"
 
 
-def stored_transforms(numbers: FloatArray) -> FloatArray:
-    """Transforms stored as 12 or 16 numbers, (…, 12 or 16), as a new array (…, 4, 4) whose last row is exact."""
-    transforms = np.empty((*numbers.shape[:-1], 4, 4))
-    transforms[..., :3, :] = numbers[..., :12].reshape(*numbers.shape[:-1], 3, 4)
-    transforms[..., 3, :] = LAST_ROW
-    return transforms
-
-
 def trusted_se3(matrix: FloatArray) -> SE3:
     """An SE3 of a new matrix, without checks: it must be surely rigid, or checked when it was read."""
     result = object.__new__(SE3)
     matrix.setflags(write=False)
     object.__setattr__(result, "matrix", matrix)
-    return result
-
-
-def inverses(matrix: AnyArray) -> AnyArray:
-    """The inverses of transforms (…, 4, 4), right for slightly wrong rotations too; raises GeometryError.
-
-    To transpose a rotation with an error of 1e-3 would move a point 600 m away by 60 cm.
-    """
-    result = np.zeros_like(matrix)
-    try:
-        result[..., :3, :3] = turned_back = np.linalg.inv(matrix[..., :3, :3])
-    except np.linalg.LinAlgError:
-        raise GeometryError("a transform has no inverse: its rotation is no rotation") from None
-    result[..., :3, 3] = -(turned_back @ matrix[..., :3, 3, None])[..., 0]
-    result[..., 3, 3] = 1
     return result
 
 

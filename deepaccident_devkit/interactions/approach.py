@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from deepaccident_devkit.geometry import time_to_collision
-from deepaccident_devkit.geometry.conflicts import along, normals, side_gaps
-from deepaccident_devkit.geometry.footprints import corner_offsets, gaps_of_pairs
+from deepaccident_devkit.geometry.box_arrays import along, corner_offsets, gaps_of_pairs, normals, side_gaps
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray
 
 _TOLERANCE = 1e-9

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deepaccident_devkit.geometry import time_to_collision
-from deepaccident_devkit.geometry.conflicts import normals
-from deepaccident_devkit.geometry.footprints import gaps_of_pairs
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs, normals
 from deepaccident_devkit.interactions.approach import modified_ttc
 from deepaccident_devkit.interactions.config import InteractionConfig, masses_of
 from deepaccident_devkit.interactions.encroachment import pieces_of, recorded_pet

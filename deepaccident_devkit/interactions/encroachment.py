@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.geometry.conflicts import along, half_extents, normals, side_gaps, side_yaws
+from deepaccident_devkit.geometry.box_arrays import along, half_extents, normals, side_gaps, side_yaws
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 

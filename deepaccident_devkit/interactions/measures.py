@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from deepaccident_devkit.geometry import time_to_collision
-from deepaccident_devkit.geometry.conflicts import normals
-from deepaccident_devkit.geometry.footprints import separations_of_pairs
+from deepaccident_devkit.geometry.box_arrays import normals, separations_of_pairs
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, MissingFileError, SensorFileError
-from deepaccident_devkit.geometry.se3 import stored_transforms
+from deepaccident_devkit.geometry.conventions import stored_transforms
 from deepaccident_devkit.release import read_bev
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import ReleasePath

@@ -28,10 +28,9 @@ from deepaccident_devkit.maps.counting import (
 from deepaccident_devkit.maps.hidden import hidden_ground
 from deepaccident_devkit.maps.town_map import TownMap, classes_of
 from deepaccident_devkit.parallel import Places, Store, run_unordered
-from deepaccident_devkit.support.archives import open_zip, read_array
 from deepaccident_devkit.support.arrays import IntArray, as_floats
 from deepaccident_devkit.support.files import place_in
-from deepaccident_devkit.support.reading import limit_of
+from deepaccident_devkit.support.reading import limit_of, open_zip, read_array
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import BEV_CAMERA
 

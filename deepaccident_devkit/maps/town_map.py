@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from deepaccident_devkit.maps.counting import GROUND_CLASSES
 from deepaccident_devkit.maps.polygons import AREAS, Area, geojson_of, outlines, simplified
 from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, as_floats, checked
-from deepaccident_devkit.support.files import path_of, write_bytes
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.text import choice, path_of
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon

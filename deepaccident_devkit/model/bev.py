@@ -14,8 +14,7 @@ from torch.nn import functional
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.bev_grid import Axis
-from deepaccident_devkit.motion.orientations import axes_of
+from deepaccident_devkit.geometry.bev_grid import Axis, axes_of
 from deepaccident_devkit.support.arrays import check_least
 
 

@@ -24,9 +24,10 @@ from deepaccident_devkit.errors import MOST_TOLD, ConfigError, shortened
 from deepaccident_devkit.model.images import from_official
 from deepaccident_devkit.release.checkpoints import FAULTS, SIZES, Storages, StoredTensor, read_checkpoint
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.files import path_of, write_bytes
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import as_record, parsed_json, parsed_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 
 BEST: Final = "best.safetensors"
 FINAL: Final = "final.safetensors"

@@ -4,21 +4,18 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 
 | step | from → to | where |
 |---|---|---|
-| what a sample shows | tables → `FrameBoxes`, ego motion | `sample_labels` (and `sample_lists`: which samples) |
-| who is rasterised, and where | boxes → `FramePolygons` | `drawing.box_polygons` |
-| which cells those are | polygons → cells | `drawing.polygon_fill` |
-| ids, centres, flow | cells → centres here and at the next frame | `drawing.from_boxes` |
-| maps | cells and centres → `MotionLabels` | `drawing.label_maps`, `labels` |
-| all frames in the present ego frame | `MotionLabels` → the same, warped | `warps.to_present` |
+| which samples, and what one shows | tables → `FrameBoxes`, ego motion | `sample_labels` |
+| who is rasterised, and where | boxes → `FramePolygons` → `Footprints` | `box_polygons`, `exact.polygon_fill` |
+| ids, centres, flow, maps | footprints → centres here and at the next frame → `MotionLabels` | `drawing`, `labels` |
+| all frames in the present ego frame | `MotionLabels` → the same, warped | `labels`, `warping` |
 | to another code, to disk | `MotionLabels` → batches; files | `batch_names`; `label_files` |
-| a prediction | arrays → `MotionHeads` | `postprocessing.grouping` |
-| instances of a frame | heads → centres, and cells by centre | `postprocessing.grouping` |
-| the same id in all frames | instances → `LinkedInstances` | `postprocessing.grouping`, `postprocessing.predict` |
-| boxes along the paths | linked instances → their redrawn maps | `postprocessing.contours` |
+| a prediction, and the instances of a frame | arrays → `MotionHeads` → cells by centre | `grouping` |
+| the same id in all frames | instances → `LinkedInstances` | `instances` |
+| boxes along the paths | linked instances → their redrawn maps | `exact.contours` |
 
-A `MotionLabelConfig` (`config`) says what is rasterised, a `LabelProtocol` how (`protocols`: every quirk of the
-released code is a switch), and a grid's orientation how cells lie (`orientations`). `warps.to_present` also warps
-a model's own maps as labels are warped.
+A `MotionLabelConfig` says what is rasterised, a `LabelProtocol` how (both in `config`: every quirk of the released
+code is a switch), and a grid's orientation how cells lie (`geometry.bev_grid`). `warping` also warps a model's own maps
+as labels are warped.
 """
 
 from deepaccident_devkit.motion.augmentation import Augmentation
@@ -29,13 +26,11 @@ from deepaccident_devkit.motion.bev_segmentation import (
     bev_segmentation,
     segmentation_of,
 )
-from deepaccident_devkit.motion.config import PRESETS, MotionLabelConfig
-from deepaccident_devkit.motion.drawing.box_polygons import OWN_BOX_ID, FrameBoxes, FramePolygons
-from deepaccident_devkit.motion.drawing.from_boxes import labels_from_polygons, motion_labels_from_boxes
-from deepaccident_devkit.motion.label_files import LabelFiles, LabelsWritten, write_label_files
-from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
-from deepaccident_devkit.motion.postprocessing.predict import (
+from deepaccident_devkit.motion.box_polygons import OWN_BOX_ID, FrameBoxes, FramePolygons
+from deepaccident_devkit.motion.config import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig
+from deepaccident_devkit.motion.drawing import labels_from_polygons, motion_labels_from_boxes
+from deepaccident_devkit.motion.grouping import MotionHeads
+from deepaccident_devkit.motion.instances import (
     POST_PROCESSING,
     InstancePath,
     LinkedInstances,
@@ -43,10 +38,10 @@ from deepaccident_devkit.motion.postprocessing.predict import (
     predict_instances,
     trajectories,
 )
-from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
-from deepaccident_devkit.motion.sample_labels import motion_labels
-from deepaccident_devkit.motion.sample_lists import evaluation_samples, samples, training_samples
-from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
+from deepaccident_devkit.motion.label_files import LabelFiles, LabelsWritten, write_label_files
+from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.sample_labels import evaluation_samples, motion_labels, samples, training_samples
+from deepaccident_devkit.motion.warping import agents_to_ego, past_to_present
 
 __all__ = [
     "BEV_CLASSES",

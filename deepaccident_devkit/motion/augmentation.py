@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.motion.settings import flag, number
-from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.arrays import FloatArray, checked_flag, checked_setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,13 +30,13 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         """Check the values; raises ConfigError."""
-        rotation = number("augmentation: rotation", self.rotation, "finite radians")
-        scale = number("augmentation: scale", self.scale, "a factor above 0, 1 for none")
+        rotation = checked_setting("augmentation: rotation", self.rotation, "finite radians")
+        scale = checked_setting("augmentation: scale", self.scale, "a factor above 0, 1 for none")
         if scale <= 0:
             raise ConfigError(f"augmentation: scale: expected a factor above 0, 1 for none, found {self.scale!r}")
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "scale", scale)
-        object.__setattr__(self, "flip", flag("augmentation: flip", self.flip))
+        object.__setattr__(self, "flip", checked_flag("augmentation: flip", self.flip))
 
     @property
     def matrix(self) -> FloatArray:

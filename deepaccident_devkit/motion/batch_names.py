@@ -28,10 +28,9 @@ import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, FieldError
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.bev_grid import Orientation
-from deepaccident_devkit.geometry.handedness import flip_six_vector
+from deepaccident_devkit.geometry.bev_grid import Orientation, to_orientation
+from deepaccident_devkit.geometry.conventions import flip_six_vector
 from deepaccident_devkit.motion.config import MotionLabelConfig
-from deepaccident_devkit.motion.orientations import to_orientation
 from deepaccident_devkit.support.arrays import AnyArray, checked
 from deepaccident_devkit.support.text import choice
 

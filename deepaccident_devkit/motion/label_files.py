@@ -39,9 +39,9 @@ from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.parallel import Places
 from deepaccident_devkit.release.fingerprints import digest_of
-from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import place_in, replacing
+from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR

@@ -16,17 +16,17 @@ from typing import Any, Final, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, GeometryError, LabelFilesError, shortened
+from deepaccident_devkit.geometry.bev_grid import cells_in, vectors_in
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig
-from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
+from deepaccident_devkit.motion.drawing import CoveredCells, label_maps
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.orientations import cells_in, vectors_in
 from deepaccident_devkit.parallel import Store
-from deepaccident_devkit.support.archives import read_array
 from deepaccident_devkit.support.arrays import AnyArray, IntArray, ShortRepr, checked
-from deepaccident_devkit.support.files import path_of, place_in, temporary_of, write_bytes
+from deepaccident_devkit.support.files import place_in, temporary_of, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.support.reading import check_size, fault_text, read_bytes
+from deepaccident_devkit.support.reading import check_size, fault_text, read_array, read_bytes
+from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.taxonomy import AGENTS
 
 NOWHERE: Final = -32768

@@ -10,10 +10,19 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.exact.single_precision import OUTSIDE, CellIndices, blend_cells, take_cells
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.motion.batch_names import MAPS, BatchNames, from_batch, to_batch
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
-from deepaccident_devkit.motion.warps.to_present import maps_to_present
-from deepaccident_devkit.motion.warps.warping import WarpMode
+from deepaccident_devkit.motion.warping import (
+    WarpMode,
+    checked_mode,
+    present_from_frames,
+    rounded_points,
+    sample_points,
+    sampling_matrix,
+)
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.support.text import Pictured
 
@@ -88,7 +97,7 @@ class MotionLabels(FrozenArrays, Pictured):
     def to_present(self, centerness: WarpMode = "nearest") -> MotionLabels:
         """The labels with every frame in the present ego frame, as in training and evaluation.
 
-        `motion.warps.to_present` says how. Labels that are not warped equal the released code's in every cell; warped
+        `maps_to_present` says how. Labels that are not warped equal the released code's in every cell; warped
         ones can differ in single cells, at ties of the sampling (docs/motion_labels.md, "How equal they are").
 
         Args:
@@ -152,3 +161,118 @@ class MotionLabels(FrozenArrays, Pictured):
 
 def _remade(values: dict[str, Any]) -> MotionLabels:
     return MotionLabels(**values)
+
+
+def maps_to_present(
+    maps: Mapping[str, AnyArray],
+    label_egomotion: AnyArray,
+    missing: BoolArray,
+    config: MotionLabelConfig,
+    centerness: WarpMode,
+) -> dict[str, AnyArray]:
+    """The maps of `MotionLabels` with every frame warped to the present ego frame; the present itself stays as it is.
+
+    Segmentation, instance, offset and flow take the nearest cell's values. The protocol says how (`warp`), what value
+    cells from outside the grid have (`outside_is_zero`) and whether offset and flow turn with the frame
+    (`vectors_not_rotated`). An augmentation of the configuration counts on both sides: A C A⁻¹ (docs/released_code.md,
+    Warps). A missing frame that is all `ignore_index` (not `missing_frames_are_empty`) is not warped.
+
+    Args:
+        maps: segmentation, instance, centerness, offset and flow, each frame in its own ego frame.
+        label_egomotion: (T, 6) right-handed 6-vectors from the present on.
+        missing: (T,) which frames are not in the recording.
+        config: of the labels.
+        centerness: how to sample it.
+
+    Raises:
+        ChoiceError: no such mode.
+    """
+    centerness = checked_mode(centerness)
+    rules = config.rules
+    transforms = present_from_frames(label_egomotion, rules, config.augmentation)
+    ignored = np.zeros_like(missing) if rules.missing_frames_are_empty else missing
+    warped = _empty_like(maps)
+    for name, given in maps.items():
+        warped[name][:1] = given[:1]
+        warped[name][ignored] = config.ignore_index
+    matrices = sampling_matrix(transforms, rules)
+    for frame in np.flatnonzero(~ignored[1:]) + 1:
+        points = sample_points(matrices[frame], config.grid, rules)
+        indices = rounded_points(points, config.grid, rules, config.grid.orientation)
+        source, target = ({name: array[frame] for name, array in each.items()} for each in (maps, warped))
+        _warp_instances(source, target, indices, config)
+        if centerness == "nearest":
+            target["centerness"][...] = _taken(source["centerness"], indices)
+        else:
+            _blend(source["centerness"], target["centerness"], points, config)
+        if not rules.vectors_not_rotated:
+            turn = _vector_turn(transforms[frame], config)
+            here = target["instance"] != 0
+            for name in ("offset", "flow"):
+                _turn_vectors(target[name], here, turn, config.ignore_index)
+    return warped
+
+
+def _empty_like(maps: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
+    """Arrays of these shapes in one block, which the allocator keeps for the next sample.
+
+    Separate arrays would be returned to the system each time, and to get their pages again costs more than the warps.
+    """
+    block = np.empty(sum(given.nbytes for given in maps.values()), dtype=np.uint8)
+    result, start = {}, 0
+    for name, given in sorted(maps.items(), key=lambda item: -item[1].itemsize):  # so that all are aligned
+        end = start + given.nbytes
+        result[name] = block[start:end].view(given.dtype).reshape(given.shape)
+        start = end
+    return result
+
+
+def _warp_instances(
+    source: dict[str, AnyArray], target: dict[str, AnyArray], indices: CellIndices, config: MotionLabelConfig
+) -> None:
+    """Fill one frame's instance, segmentation, offset and flow; the last three differ from the background on few cells.
+
+    Outside instances segmentation is 0, offset and flow are `ignore_index` (see `MotionLabels`), so only the cells of
+    instances are fetched.
+    """
+    target["instance"][...] = _taken(source["instance"], indices)
+    on_instance = np.flatnonzero(target["instance"] != 0)  # seven times as fast on a mask as on integers
+    fetched = indices[on_instance]
+    background = np.full(indices.size, config.ignore_index, dtype=target["offset"].dtype)
+    if config.rules.outside_is_zero:
+        background *= indices != OUTSIDE
+    for name, beside in (("segmentation", 0), ("offset", background), ("flow", background)):
+        cells, filled = (each[name].reshape(-1, indices.size) for each in (source, target))
+        filled[...] = beside
+        for channel, values in zip(filled, cells, strict=True):
+            channel[on_instance] = values[fetched]
+
+
+def _taken(raster: AnyArray, indices: CellIndices) -> AnyArray:
+    return take_cells(raster.reshape(-1), indices).reshape(raster.shape)
+
+
+def _blend(source: AnyArray, target: AnyArray, points: tuple[AnyArray, AnyArray], config: MotionLabelConfig) -> None:
+    given, filled = (config.grid.reorient(raster, config.rules.native) for raster in (source, target))
+    filled[...] = blend_cells(given, points)
+
+
+def _vector_turn(present_from_frame: AnyArray, config: MotionLabelConfig) -> FloatArray:
+    """(2, 2) how offset and flow (rows, columns) of a frame turn when it is warped to the present."""
+    transform = present_from_frame if config.rules.right_handed else flip_pose(present_from_frame)
+    metres_from_cells = _metres_from_cells(config.grid)
+    turn: FloatArray = np.linalg.inv(metres_from_cells) @ transform[:2, :2] @ metres_from_cells
+    return turn
+
+
+def _metres_from_cells(grid: BevGrid) -> FloatArray:
+    """(2, 2) steps of a row and of a column → right-handed metres x and y."""
+    x, y = grid.x[2], grid.y[2]
+    if grid.orientation == "fiery":
+        return np.diag([x, y])
+    return np.array([[0, x], [y if grid.orientation == "devkit" else -y, 0]])
+
+
+def _turn_vectors(vectors: AnyArray, here: AnyArray, turn: FloatArray, ignore: int) -> None:
+    known = here & (vectors != ignore).any(axis=0)
+    vectors[:, known] = turn @ vectors[:, known]

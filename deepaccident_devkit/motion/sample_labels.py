@@ -1,30 +1,148 @@
-"""Motion labels of a sample of a release, from its boxes at each label frame and the ego's motion in the tables.
-
-The columns are read as they are, all frames at once: records and `Boxes` would take as long as rasterising.
-"""
+"""The motion labels of samples of a release, and which samples models are trained on and evaluated at."""
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.geometry import six_vectors
-from deepaccident_devkit.geometry.se3 import inverses, stored_transforms
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.geometry import conventions
+from deepaccident_devkit.geometry.conventions import inverses, stored_transforms
+from deepaccident_devkit.motion.box_polygons import FrameBoxes
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
-from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes
-from deepaccident_devkit.motion.drawing.from_boxes import motion_labels_from_boxes
+from deepaccident_devkit.motion.drawing import motion_labels_from_boxes
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.warps.chains import egomotion
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.motion.warping import egomotion
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked_number
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables import visible_mask
-from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CHANNELS,
+    FRAME_PERIOD,
+    INFRASTRUCTURE,
+    LIDAR,
+    OWN_ACTOR_ID,
+    UNTRACKED_ID,
+)
 from deepaccident_devkit.v2x import cooperating_agents
 
+Purpose = Literal["train", "evaluate", "all", "every"]
+SampleProtocol = Literal["released", "paper"]
+Scope = Literal["accident", "all"]
+_KEY_STEP: Final = 5
+"""Recorded frames from one key frame to the next, counted back from a scenario's last frame."""
+_STEPS: Final = {"train": 10, "evaluate": _KEY_STEP, "all": _KEY_STEP, "every": 1}
+_RELEASED_HORIZON: Final = 2.0
 _VISIBILITY_COLUMNS: Final = ("translation", "category", "num_lidar_pts", "camera_visible")
+
+
+def samples(
+    dataset: Dataset,
+    split: str | os.PathLike[str],
+    purpose: Purpose,
+    protocol: SampleProtocol = "released",
+    *,
+    horizon: float = _RELEASED_HORIZON,
+    scope: Scope = "accident",
+) -> list[str]:
+    """The labelled samples of a split that a model is trained on or evaluated at, of all agents.
+
+    Frames are counted back from a scenario's last one, which in an accident scenario is the collision:
+
+    - `train`: one a second, of normal and accident scenarios;
+    - `evaluate`: two a second within the last `horizon` seconds except the last frame, of scenarios designed to end
+      in an accident (`_accident` in their folder); `scope="all"` adds the normal ones;
+    - `all`: two a second, the whole of every scenario;
+    - `every`: all samples, ten a second.
+
+    The released V2X class stops after 50 samples of a list in an unknown order; this function does not.
+
+    Args:
+        dataset: the release.
+        split: `train`, `val`, … or a split file, as `Dataset.split_scenarios` takes it.
+        purpose: `train`, `evaluate`, `all` or `every`.
+        protocol: `released` has only a horizon of 2 s and accident scenarios; `paper` allows others.
+        horizon: seconds before the end, a multiple of 0.5; only for `evaluate`.
+        scope: `accident` or `all`; only for `evaluate`.
+
+    Returns:
+        Tokens by scenario, agent and time.
+
+    Raises:
+        ChoiceError: no such split, purpose, protocol or scope.
+        ConfigError: a horizon that is no multiple of 0.5 s, or one that the released protocol does not have.
+        NotAvailableError: the split is unknown, this release has no scenario of it, or none of its samples has labels
+            (the test split has none).
+    """
+    listed: str = choice("purpose", purpose, _STEPS)
+    protocol = choice("protocol", protocol, get_args(SampleProtocol))
+    scope = choice("scope", scope, get_args(Scope))
+    seconds = checked_number("horizon", horizon, "a number of seconds", ConfigError)
+    steps = seconds / (_KEY_STEP * FRAME_PERIOD)
+    if not (1 <= steps < float("inf") and abs(steps - round(steps)) < 1e-6):
+        raise ConfigError(f"horizon: {horizon} s is no multiple of 0.5 s; choose 0.5, 1, 1.5, …")
+    if protocol == "released" and (seconds != _RELEASED_HORIZON or scope != "accident"):
+        raise ConfigError("the released protocol looks 2 s ahead in accident scenarios; choose protocol='paper'")
+
+    scenario_tokens = dataset.split_scenarios(split)
+    if not scenario_tokens:
+        raise NotAvailableError(
+            f"{split}: no scenario of this split is in {dataset.dataroot}; unpack that part of the release, or choose "
+            f"another split: it has {_splits_text(dataset)}"
+        )
+    wanted = np.isin(np.arange(len(dataset.scenario)), [dataset.getind("scenario", one) for one in scenario_tokens])
+    columns, scenarios = dataset.columns("sample"), dataset.columns("scenario")
+    row = columns["scenario_row"]
+    in_split = wanted[row] & columns["labelled"][:]
+    if not in_split.any():
+        raise NotAvailableError(f"{split}: none of its samples here has labels (the test split has none)")
+    to_end = scenarios["num_frames"][row] - (columns["frame_row"] - scenarios["first_frame_row"][row] + 1)
+    chosen = to_end % _STEPS[listed] == 0
+    if listed == "evaluate":
+        chosen &= (to_end > 0) & (to_end <= round(seconds / FRAME_PERIOD))
+        if scope == "accident":
+            chosen &= scenarios["designed_accident"][:][row]
+    return [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]
+
+
+def no_samples_text(dataset: Dataset, split: str | os.PathLike[str], scope: Scope) -> str:
+    """What to do where a split of a release has labelled samples, but a list has none of them."""
+    scenarios = [dataset.get("scenario", token) for token in sorted(dataset.split_scenarios(split))]
+    if scope == "accident" and not any(scenario["designed_accident"] for scenario in scenarios):
+        return (
+            f"the scope accident, which is the default, leaves out all {len(scenarios)} of its scenarios, since none "
+            "was designed to end in an accident; use scope='all' (--scope all)"
+        )
+    return "choose others"
+
+
+def _splits_text(dataset: Dataset) -> str:
+    """`train: 2 scenarios, split unknown: 1 scenario`."""
+    counts = Counter(scenario["split"] or "split unknown" for scenario in dataset.scenario)
+    return ", ".join(f"{name}: {count} scenario{'s' * (count != 1)}" for name, count in counts.items())
+
+
+def training_samples(dataset: Dataset, split: str | os.PathLike[str]) -> list[str]:
+    """The samples that a model is trained on, one a second: `samples` for the purpose `train`; see there."""
+    return samples(dataset, split, "train")
+
+
+def evaluation_samples(
+    dataset: Dataset,
+    split: str | os.PathLike[str],
+    protocol: SampleProtocol = "released",
+    *,
+    horizon: float = _RELEASED_HORIZON,
+    scope: Scope = "accident",
+) -> list[str]:
+    """The samples that a model is evaluated at: `samples` for the purpose `evaluate`; see there."""
+    return samples(dataset, split, "evaluate", protocol, horizon=horizon, scope=scope)
 
 
 def motion_labels(
@@ -100,8 +218,8 @@ def _frames(
     ego_from_lidar = stored_transforms(dataset.columns("sample_data")["matrix"][lidars])
     if config.rules.pose == "yaw":
         world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
-        world_from_level = six_vectors.from_matrices(world_from_ego) * (1, 1, 1, 0, 0, 1)
-        ego_from_lidar = inverses(six_vectors.to_matrices(world_from_level)) @ world_from_ego @ ego_from_lidar
+        world_from_level = conventions.six_vectors_of(world_from_ego) * (1, 1, 1, 0, 0, 1)
+        ego_from_lidar = inverses(conventions.matrices_of_six(world_from_level)) @ world_from_ego @ ego_from_lidar
     return [
         FrameBoxes(
             center=boxes["translation"][one],

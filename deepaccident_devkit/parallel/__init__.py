@@ -3,11 +3,9 @@
 Every function that works on many scenarios or samples takes `workers` and `executor`; none has a pool of its own.
 """
 
-from deepaccident_devkit.parallel.batches import Engine, Progress, in_order, run_batch, run_unordered
-from deepaccident_devkit.parallel.calls import Places
-from deepaccident_devkit.parallel.executors import cluster_executor
+from deepaccident_devkit.parallel.batches import Engine, Places, Progress, in_order, run_batch, run_unordered
+from deepaccident_devkit.parallel.executors import cluster_executor, own_threads
 from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
-from deepaccident_devkit.parallel.pool import own_threads
 from deepaccident_devkit.parallel.store import Store, unfinished_folder
 
 __all__ = [

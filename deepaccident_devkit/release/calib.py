@@ -9,7 +9,7 @@ from typing import Any, Literal, overload
 import numpy as np
 
 from deepaccident_devkit.errors import CalibError
-from deepaccident_devkit.geometry import SE3, handedness
+from deepaccident_devkit.geometry import SE3, conventions
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
 from deepaccident_devkit.release._content import LARGEST, REMEDY, in_range, read_content
 from deepaccident_devkit.release.pickles import load_arrays, pickled
@@ -109,12 +109,12 @@ def read_calibs(paths: Sequence[ReleasePath]) -> Calibs:
 def write_calib(path: Path, calib: Calib) -> None:
     """Write one calibration with CARLA's signs and axes; see `write_raw_calib`."""
     raw: dict[str, AnyArray] = {
-        "lidar_to_ego": handedness.flip_pose(calib.ego_from_lidar.matrix),
-        "ego_to_world": handedness.flip_pose(calib.world_from_ego.matrix),
+        "lidar_to_ego": conventions.flip_pose(calib.ego_from_lidar.matrix),
+        "ego_to_world": conventions.flip_pose(calib.world_from_ego.matrix),
     }
     for camera in CAMERAS:
-        raw[f"lidar_to_{camera}"] = handedness.camera_from_lidar_to_raw(calib.camera_from_lidar[camera].matrix)
-        raw[f"intrinsic_{camera}"] = handedness.intrinsic_to_raw(calib.intrinsic[camera])
+        raw[f"lidar_to_{camera}"] = conventions.camera_from_lidar_to_raw(calib.camera_from_lidar[camera].matrix)
+        raw[f"intrinsic_{camera}"] = conventions.intrinsic_to_raw(calib.intrinsic[camera])
     write_raw_calib(path, raw)
 
 
@@ -169,12 +169,12 @@ def _converted(paths: Sequence[ReleasePath], files: Sequence[Mapping[str, AnyArr
         fault = _first_value_fault(poses[index], intrinsics[index])
         if fault:
             raise CalibError(f"{paths[index]}: {fault}; {REMEDY}")
-    ego = handedness.flip_pose(poses[:, :2])
+    ego = conventions.flip_pose(poses[:, :2])
     return Calibs(
         ego_from_lidar=ego[:, 0],
         world_from_ego=ego[:, 1],
-        camera_from_lidar=handedness.camera_from_lidar(poses[:, 2:]),
-        intrinsic=handedness.intrinsic(intrinsics),
+        camera_from_lidar=conventions.camera_from_lidar(poses[:, 2:]),
+        intrinsic=conventions.intrinsic(intrinsics),
     )
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from deepaccident_devkit.release._unpickle import Machine, dict_of
-from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, open_zip, read_member
+from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_member
 
 FAULTS: Final = (pickle.UnpicklingError, TypeError, AttributeError, IndexError, Warning, *DAMAGED_ARCHIVE)
 """What a file that is no checkpoint, a damaged or a hostile one can raise; a Warning where warnings are errors."""

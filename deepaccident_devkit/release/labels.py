@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit.errors import LabelError, shortened
-from deepaccident_devkit.geometry import Boxes, handedness, quaternions
+from deepaccident_devkit.geometry import Boxes, conventions, quaternions
 from deepaccident_devkit.release._content import LARGEST, in_range, integer_of, number_of, read_content
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, readonly
@@ -111,10 +111,10 @@ class Labels(ShortRepr):
 
     def boxes(self) -> Boxes:
         """The boxes in the LiDAR frame, with the label's velocity; right-handed, whatever `raw` was."""
-        sign = handedness.flip_yaw if self.raw else np.asarray
+        sign = conventions.flip_yaw if self.raw else np.asarray
         center, velocity = self.center, self.velocity
         if self.raw:
-            center, velocity = handedness.flip_points(center), handedness.flip_vectors2(velocity)
+            center, velocity = conventions.flip_points(center), conventions.flip_vectors2(velocity)
         return Boxes(
             frame="lidar",
             center=center,
@@ -200,10 +200,10 @@ def write_label(path: Path, labels: Labels) -> None:
 def _labels(columns: dict[str, AnyArray], *, raw: bool) -> Labels:
     """The columns as the files say them, or right-handed."""
     if not raw:
-        columns["agent_velocity"] = handedness.flip_vectors2(columns["agent_velocity"])
-        columns["center"] = handedness.flip_points(columns["center"])
-        columns["velocity"] = handedness.flip_vectors2(columns["velocity"])
-        columns["yaw"] = handedness.flip_yaw(columns["yaw"])
+        columns["agent_velocity"] = conventions.flip_vectors2(columns["agent_velocity"])
+        columns["center"] = conventions.flip_points(columns["center"])
+        columns["velocity"] = conventions.flip_vectors2(columns["velocity"])
+        columns["yaw"] = conventions.flip_yaw(columns["yaw"])
     return Labels(raw=raw, **columns)
 
 

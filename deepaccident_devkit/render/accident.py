@@ -19,8 +19,8 @@ from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP
-from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

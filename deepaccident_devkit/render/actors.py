@@ -27,7 +27,7 @@ from deepaccident_devkit.tables.tokens import instance_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, OWN_ACTOR_ID, frame_timestamp, short_name
 from deepaccident_devkit.v2x import Agents, cooperating_agents
 from deepaccident_devkit.v2x.cooperation import visible_actors
-from deepaccident_devkit.v2x.projection import camera_of
+from deepaccident_devkit.v2x.poses import camera_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from deepaccident_devkit.render.boxes import bounds_in_image
 from deepaccident_devkit.render.legends import is_there
 from deepaccident_devkit.support.arrays import FloatArray, as_floats
 from deepaccident_devkit.taxonomy import CAMERAS
-from deepaccident_devkit.v2x.projection import camera_of
+from deepaccident_devkit.v2x.poses import camera_of
 
 _STEPS: Final = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 1, 3)
 _LATTICE: Final = ((1 + CORNER_SIGNS * _STEPS) / 2).prod(axis=2)

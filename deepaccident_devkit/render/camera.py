@@ -35,7 +35,7 @@ from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
-from deepaccident_devkit.v2x.projection import ImagePoints, camera_of
+from deepaccident_devkit.v2x.poses import ImagePoints, camera_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

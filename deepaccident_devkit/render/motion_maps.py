@@ -12,8 +12,8 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.trajectories import instance_paths
 from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import to_orientation
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionHeads, MotionLabels, PostProcessing, predict_instances
-from deepaccident_devkit.motion.orientations import to_orientation
 from deepaccident_devkit.render.axes import Layer, with_light_grid
 from deepaccident_devkit.render.chips import place_chips
 from deepaccident_devkit.render.colors import (

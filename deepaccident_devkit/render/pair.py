@@ -28,8 +28,8 @@ from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, FRAME_PERIOD
 from deepaccident_devkit.v2x import Contact
-from deepaccident_devkit.v2x.configurations import agents_of
-from deepaccident_devkit.v2x.projection import camera_of
+from deepaccident_devkit.v2x.agents import agents_of
+from deepaccident_devkit.v2x.poses import camera_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:

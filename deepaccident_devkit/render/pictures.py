@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.axes import detached_figure, settled
 from deepaccident_devkit.render.styles import current_style
-from deepaccident_devkit.support.files import path_of, replacing
+from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.text import path_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COL
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, AgentName, short_name
 from deepaccident_devkit.v2x import Contact
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 
 
 def collider_ids(dataset: Dataset, sample: RowArgument) -> set[int]:

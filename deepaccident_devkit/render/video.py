@@ -33,8 +33,8 @@ from deepaccident_devkit.render.pictures import figure_of_pixels
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
 from deepaccident_devkit.support.arrays import ByteArray
-from deepaccident_devkit.support.files import path_of, replacing
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.text import choice, path_of
 from deepaccident_devkit.tables.tokens import frame_token, sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x import Agents, cooperating_agents

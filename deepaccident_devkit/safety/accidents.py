@@ -16,8 +16,8 @@ from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.reports import Row
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, AgentName
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import colliding_pair
-from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.geometry.footprints import gaps_of_pairs
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.safety.accidents import Accident, recorded_path
 from deepaccident_devkit.safety.replay import (
     HORIZON,

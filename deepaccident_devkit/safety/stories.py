@@ -29,8 +29,8 @@ from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoid
 from deepaccident_devkit.safety.observation import observed_actors
 from deepaccident_devkit.support.arrays import ShortRepr, known
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import Contact, collision
-from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -12,7 +12,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import AgentName
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 MatchedBy = Literal["agent", "id", "start"]

@@ -14,7 +14,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError, TokenError
-from deepaccident_devkit.geometry.footprints import gaps_of_pairs
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.accidents import (
     Skipped,

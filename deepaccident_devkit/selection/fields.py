@@ -18,7 +18,7 @@ from deepaccident_devkit.support.text import columns_text, possible_text
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
 from deepaccident_devkit.tables.records import table_spec
 from deepaccident_devkit.v2x import accident_visibility, collision
-from deepaccident_devkit.v2x.accident_visibility import VISIBILITIES
+from deepaccident_devkit.v2x.agents import VISIBILITIES
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord

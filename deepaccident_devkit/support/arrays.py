@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
@@ -161,6 +162,30 @@ def checked_whole(
         return operator.index(value)  # type: ignore[arg-type]  # everything else is refused
     except TypeError:
         raise error(f"{name}: expected {expected}, found {value!r}") from None
+
+
+def checked_flag(name: str, value: object) -> bool:
+    """True or False, or ConfigError."""
+    if not isinstance(value, bool | np.bool_):
+        raise ConfigError(f"{name}: expected True or False, found {value!r}")
+    return bool(value)
+
+
+def checked_count(name: str, value: object, what: str, most: int) -> int:
+    """A whole number from 1 to `most`, or ConfigError, which says what it counts."""
+    expected = f"a whole number from 1 to {most:,} ({what})"
+    found = 0 if isinstance(value, bool | np.bool_) else checked_whole(name, value, expected, ConfigError)
+    if not 1 <= found <= most:
+        raise ConfigError(f"{name}: expected {expected}, found {value!r}")
+    return found
+
+
+def checked_setting(name: str, value: object, expected: str, least: float = -math.inf, most: float = math.inf) -> float:
+    """A finite number from `least` to `most`, or ConfigError."""
+    found = math.nan if isinstance(value, bool | np.bool_) else checked_number(name, value, expected, ConfigError)
+    if not (math.isfinite(found) and least <= found <= most):
+        raise ConfigError(f"{name}: expected {expected}, found {value!r}")
+    return found
 
 
 def check_least(record: object, **least: float) -> None:

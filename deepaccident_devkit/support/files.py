@@ -25,7 +25,8 @@ from functools import cache, lru_cache
 from pathlib import Path, PurePath
 from typing import Final
 
-from deepaccident_devkit.errors import ConfigError, DeepAccidentError, OutputFolderError, shortened
+from deepaccident_devkit.errors import ConfigError, OutputFolderError
+from deepaccident_devkit.support.text import path_of
 
 logger = logging.getLogger(__name__)
 
@@ -240,30 +241,6 @@ def is_writable_folder(path: Path) -> bool:
             return True
     except OSError:
         return False
-
-
-def path_text(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> str:
-    """The text of what a caller gives as a path.
-
-    Args:
-        given: a text, or a path object of one.
-        expected: how the message begins, such as `out: expected a folder`.
-        error: the kind of error.
-
-    Raises:
-        ConfigError: it is something else, or empty, or no file can have this name (or the other kind).
-    """
-    with suppress(TypeError, ValueError, RuntimeError):  # no path; half a character; `~` of nobody
-        text = os.fspath(given)  # type: ignore[call-overload]
-        if isinstance(text, str) and text and b"\0" not in os.fsencode(Path(text).expanduser()):
-            return text
-    found = "an empty path; give '.' for the current one" if given == "" else shortened(repr(given))
-    raise error(f"{expected}, found {found}")
-
-
-def path_of(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> Path:
-    """What a caller gives as a path, with `~` for the home folder; takes and raises what `path_text` does."""
-    return Path(path_text(given, expected, error=error)).expanduser()
 
 
 def writable_folder(folder: str | os.PathLike[str]) -> Path:

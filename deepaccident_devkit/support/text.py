@@ -1,14 +1,16 @@
-"""Text for people and by them: columns, numbers, words in any case, what was probably meant."""
+"""Text for people and by them: columns, numbers, words in any case, paths, what was probably meant."""
 
 import base64
 import math
+import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from html import escape
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from deepaccident_devkit.errors import ChoiceError, DeepAccidentError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, shortened
 
 Word = TypeVar("Word", bound=str | None)
 _LISTED = 20
@@ -138,3 +140,27 @@ def settle_choices(
     """Give fields of a frozen dataclass, while it is made, the spelling of their words; the errors are `choice`'s."""
     for name, possible in words.items():
         object.__setattr__(record, name, choice(name, getattr(record, name), possible, error=error))
+
+
+def path_text(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> str:
+    """The text of what a caller gives as a path.
+
+    Args:
+        given: a text, or a path object of one.
+        expected: how the message begins, such as `out: expected a folder`.
+        error: the kind of error.
+
+    Raises:
+        ConfigError: it is something else, or empty, or no file can have this name (or the other kind).
+    """
+    with suppress(TypeError, ValueError, RuntimeError):  # no path; half a character; `~` of nobody
+        text = os.fspath(given)  # type: ignore[call-overload]
+        if isinstance(text, str) and text and b"\0" not in os.fsencode(Path(text).expanduser()):
+            return text
+    found = "an empty path; give '.' for the current one" if given == "" else shortened(repr(given))
+    raise error(f"{expected}, found {found}")
+
+
+def path_of(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> Path:
+    """What a caller gives as a path, with `~` for the home folder; takes and raises what `path_text` does."""
+    return Path(path_text(given, expected, error=error)).expanduser()

@@ -18,16 +18,10 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.parallel import Places, Progress, Store
 from deepaccident_devkit.release.store.names import SPLIT_FILE_FOLDER
-from deepaccident_devkit.support.files import (
-    is_writable_folder,
-    path_of,
-    place_in,
-    remove_in,
-    temporary_of,
-    write_bytes,
-)
+from deepaccident_devkit.support.files import is_writable_folder, place_in, remove_in, temporary_of, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios, plan_splits
 from deepaccident_devkit.synth.recording import RecordingJob, forget_scenario, parts_of, record_scenario

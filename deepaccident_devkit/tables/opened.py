@@ -14,8 +14,7 @@ import numpy as np
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.release.store import ReleasePath, places_of
-from deepaccident_devkit.support.files import path_of
-from deepaccident_devkit.support.text import choice, spelled
+from deepaccident_devkit.support.text import choice, path_of, spelled
 from deepaccident_devkit.tables.index import Problem
 from deepaccident_devkit.tables.tables import Table, Tables, table_names
 from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS, OnError

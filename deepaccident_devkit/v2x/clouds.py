@@ -13,9 +13,8 @@ from deepaccident_devkit.geometry.pointcloud import concatenate
 from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.support.arrays import FloatArray, checked_whole
 from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OnError
-from deepaccident_devkit.v2x.configurations import Agents
-from deepaccident_devkit.v2x.link import Link
-from deepaccident_devkit.v2x.messages import Message, messages
+from deepaccident_devkit.v2x.agents import Agents
+from deepaccident_devkit.v2x.messages import Link, Message, messages
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 

@@ -15,7 +15,7 @@ from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.tables.tokens import frame_token, instance_token
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:

@@ -1,24 +1,188 @@
-"""Messages between agents, and how large they are."""
+"""Messages between agents: how large they are, and what a real link does to them: wrong poses, delay, loss."""
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Final
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release.missing_files import MissingFiles
-from deepaccident_devkit.support.arrays import checked_whole
+from deepaccident_devkit.support.arrays import FloatArray, checked_number, checked_whole
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, AgentName, OnError
-from deepaccident_devkit.v2x.configurations import Agents, cooperating_agents
-from deepaccident_devkit.v2x.link import Link, checked_link
+from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName, OnError
+from deepaccident_devkit.v2x.agents import Agents, cooperating_agents
+
+_NORMAL: Final = NormalDist()
+_LONGEST: Final = 20.0
+"""Seconds: no scenario is longer, so a longer latency is in milliseconds."""
+_FRAME_TOLERANCE: Final = 1e-6
+"""The largest distance of a latency from a whole number of frames, in frames."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseNoise:
+    """The error of a partner's own pose: one draw for each partner and frame.
+
+    The error of the position is a distance from a normal distribution of `mean` and `std`. The paper studies means of
+    0.1 to 0.5 m with σ = 0.02 m and does not name the direction; ours is horizontal and uniform over all directions.
+
+    Attributes:
+        mean: metres.
+        std: standard deviation, metres.
+        heading_std: standard deviation of the heading about the vertical, radians; its mean is 0.
+    """
+
+    mean: float = 0.0
+    std: float = 0.02
+    heading_std: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the numbers; raises ConfigError."""
+        for name in ("mean", "std", "heading_std"):
+            value = checked_number(f"pose noise: {name}", getattr(self, name), "a number from 0", ConfigError)
+            if not 0 <= value < math.inf:
+                raise ConfigError(f"pose noise: {name} is {value:g}; choose a finite number of at least 0")
+            object.__setattr__(self, name, value)
+        if self.heading_std > math.pi:
+            radians = math.radians(self.heading_std)
+            raise ConfigError(
+                f"pose noise: heading_std is {self.heading_std:g} radians, over half a turn; if these are degrees, "
+                f"give {radians:.4g}"
+            )
+
+    def draw(self, key: str) -> tuple[float, float, float]:
+        """The error of one partner at one frame: x and y in world, metres, and heading, radians; `key` decides it."""
+        turn, distance, _, heading = uniforms(f"{key}/pose")
+        off, direction = self.mean + self.std * _NORMAL.inv_cdf(distance), 2 * math.pi * turn
+        return off * math.cos(direction), off * math.sin(direction), self.heading_std * _NORMAL.inv_cdf(heading)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Link:
+    """What happens to the data of partners on their way to the ego; the ego's own data are never changed.
+
+    Every draw depends only on the seed, the scenario, the partner and the frame at which the ego receives: not on the
+    order of calls, on other agents or on the other effects.
+
+    Attributes:
+        latency: delay of partners' data, seconds, a multiple of 0.1 (the paper: 0.1 to 0.5). They are those of an
+            earlier frame, placed by the pose at that time: standing actors are right, moving ones are where they were.
+        pose_noise: mean position error of partners' poses, metres. A number is `PoseNoise(mean=…)`; None for exact
+            poses.
+        packet_loss: probability in [0, 1] that a partner's data do not arrive at a frame.
+        seed: seed of all that is drawn.
+    """
+
+    latency: float = 0.0
+    pose_noise: PoseNoise | float | None = None
+    packet_loss: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers and convert them to Python's types; raises ConfigError."""
+        loss = checked_number("packet_loss", self.packet_loss, "a probability from 0 to 1", ConfigError)
+        if not 0 <= loss <= 1:
+            raise ConfigError(f"packet_loss: {loss:g} is no probability; choose a number from 0 to 1")
+        checked = {
+            "latency": _whole_frames(self.latency),
+            "pose_noise": _noise(self.pose_noise),
+            "packet_loss": loss,
+            "seed": checked_whole("seed", self.seed, "a whole number", ConfigError),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def latency_frames(self) -> int:
+        """The latency in frames of 0.1 s."""
+        return round(self.latency / FRAME_PERIOD)
+
+    def frame_sent(self, scenario: str, index: int) -> int:
+        """The number of the frame whose data arrive at frame `index` of a scenario.
+
+        Raises:
+            ConfigError: that frame would be before the recording began.
+        """
+        sent = index - self.latency_frames
+        if sent < 1:
+            raise ConfigError(
+                f"latency: {self.latency} s reaches back before the first frame of {scenario} from frame {index:03d}; "
+                f"the longest possible is {(index - 1) / 10} s, and this latency works from frame "
+                f"{self.latency_frames + 1:03d} on"
+            )
+        return sent
+
+    def loses(self, scenario: str, partner: str, index: int) -> bool:
+        """Whether a partner's data do not arrive at frame number `index`."""
+        return self.packet_loss > 0 and uniforms(f"{self._key(scenario, partner, index)}/loss")[0] < self.packet_loss
+
+    def pose_error(self, scenario: str, partner: str, index: int, position: FloatArray) -> SE3 | None:
+        """From true places to those where the ego puts the partner's data: `claimed_from_world`; None without noise.
+
+        Args:
+            scenario: token.
+            partner: the agent's name.
+            index: number of the frame at which the ego receives.
+            position: (3,) the partner's true position, world, metres: the error of the heading turns about this point.
+        """
+        if not isinstance(self.pose_noise, PoseNoise):
+            return None
+        x, y, heading = self.pose_noise.draw(self._key(scenario, partner, index))
+        turn = SE3.from_yaw(heading)
+        return SE3.from_rotation(turn.rotation, position + np.array([x, y, 0.0]) - turn.rotate(position))
+
+    def _key(self, scenario: str, partner: str, index: int) -> str:
+        return f"{self.seed}/{scenario}/{partner}/{index}"
+
+
+def checked_link(link: object) -> Link | None:
+    """The `link=` of a call, checked; raises ConfigError."""
+    if link is None or isinstance(link, Link):
+        return link
+    raise ConfigError(f"link: expected a Link, such as Link(latency=0.2, pose_noise=0.3), or None, found {link!r}")
+
+
+def _whole_frames(latency: object) -> float:
+    """The latency in seconds, as exactly a whole number of frames."""
+    seconds = checked_number("latency", latency, "seconds from 0", ConfigError)
+    if not 0 <= seconds < math.inf:
+        raise ConfigError(f"latency: {seconds} is not possible; choose a finite number of seconds from 0")
+    if seconds > _LONGEST:
+        raise ConfigError(
+            f"latency: {seconds:g} s is longer than any scenario; if these are milliseconds, give {seconds / 1000:g}"
+        )
+    frames = seconds / FRAME_PERIOD
+    if abs(frames - round(frames)) > _FRAME_TOLERANCE:
+        below, above = math.floor(frames) / 10, math.ceil(frames) / 10
+        raise ConfigError(
+            f"latency: {seconds} s is no multiple of a frame ({FRAME_PERIOD} s); "
+            f"the nearest are {below} s and {above} s"
+        )
+    return round(frames) / 10
+
+
+def _noise(noise: object) -> PoseNoise | None:
+    if noise is None or isinstance(noise, PoseNoise):
+        return noise
+    return PoseNoise(mean=checked_number("pose_noise", noise, "metres or a PoseNoise", ConfigError))
+
+
+def uniforms(key: str) -> tuple[float, float, float, float]:
+    """Four numbers between 0 and 1 (both excluded) from a text, the same on every machine and with every numpy."""
+    digest = hashlib.sha256(key.encode()).digest()
+    numbers = [int.from_bytes(digest[start : start + 8], "big") >> 12 for start in range(0, 32, 8)]
+    first, second, third, fourth = ((number + 0.5) / 2**52 for number in numbers)
+    return first, second, third, fourth
+
 
 POINT_BYTES: Final = 4 * 4
 """x, y, z and intensity in single precision."""

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from deepaccident_devkit.errors import shortened
-from deepaccident_devkit.geometry.footprints import gaps
+from deepaccident_devkit.geometry.box_arrays import gaps
 from deepaccident_devkit.release import Collision, Meta
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import Finding
@@ -22,7 +22,7 @@ from deepaccident_devkit.taxonomy import (
     VEHICLE_AGENTS,
     WEATHERS,
 )
-from deepaccident_devkit.v2x.accident_visibility import SHEER_CURTAINS
+from deepaccident_devkit.v2x.agents import SHEER_CURTAINS
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.validation.subject import Subject, actors_text, frames_text, near_pairs
 

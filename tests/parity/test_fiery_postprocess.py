@@ -7,9 +7,9 @@ there are FIERY's, rows along x. Every cell and number equal. Each case also run
 import numpy as np
 import pytest
 
-from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
-from deepaccident_devkit.motion.postprocessing.predict import predict_instances
+from deepaccident_devkit.geometry.bev_grid import cells_in, to_orientation
+from deepaccident_devkit.motion.grouping import MotionHeads
+from deepaccident_devkit.motion.instances import predict_instances
 
 pytestmark = pytest.mark.golden_cases("h_fiery", "cases")
 

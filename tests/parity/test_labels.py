@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.geometry.handedness import flip_points, flip_pose, flip_six_vector
+from deepaccident_devkit.geometry.bev_grid import to_orientation
+from deepaccident_devkit.geometry.conventions import flip_points, flip_pose, flip_six_vector
 from deepaccident_devkit.motion import (
     OWN_BOX_ID,
     Augmentation,
@@ -22,8 +23,7 @@ from deepaccident_devkit.motion import (
     MotionLabels,
     motion_labels_from_boxes,
 )
-from deepaccident_devkit.motion.drawing.box_polygons import box_polygons
-from deepaccident_devkit.motion.orientations import to_orientation
+from deepaccident_devkit.motion.box_polygons import box_polygons
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE
 

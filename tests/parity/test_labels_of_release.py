@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.geometry.handedness import flip_six_vector
+from deepaccident_devkit.geometry.conventions import flip_six_vector
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES
 from tests.parity.test_labels import LABEL_FRAMES, PRESENT, Scene, config_of
 

@@ -18,7 +18,7 @@ import torch
 from golden_model import GoldenModel, check_close
 
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.handedness import flip_pose
+from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.model import warps
 from deepaccident_devkit.model.bev import BevEncode, BevEncodeConfig, crop
 from deepaccident_devkit.model.checkpoint import Weights, load_weights

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from deepaccident_devkit.geometry import six_vectors
-from deepaccident_devkit.geometry.handedness import flip_pose, flip_six_vector
+from deepaccident_devkit.geometry import conventions
+from deepaccident_devkit.geometry.conventions import flip_pose, flip_six_vector
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import future_egomotion, relative_pose_to_ego
 
@@ -30,7 +30,7 @@ def test_relative_poses_equal_the_released_codes(golden_row) -> None:
 
 @pytest.mark.golden_rows("g_poses", "pose_vec2mat")
 def test_matrices_of_six_vectors_equal_the_released_codes(golden_row) -> None:
-    matrices = six_vectors.to_matrices(golden_row["relative_pose_to_ego"])
+    matrices = conventions.matrices_of_six(golden_row["relative_pose_to_ego"])
     assert_allclose(matrices, golden_row["pose_vec2mat"], rtol=0, atol=TOLERANCE)
 
 

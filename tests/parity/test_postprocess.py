@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
-from deepaccident_devkit.motion.postprocessing.predict import LinkedInstances, predict_instances
+from deepaccident_devkit.geometry.bev_grid import cells_in, to_orientation
+from deepaccident_devkit.motion.grouping import MotionHeads
+from deepaccident_devkit.motion.instances import LinkedInstances, predict_instances
 
 pytestmark = [
     pytest.mark.golden_cases("c_postprocess", "cases"),

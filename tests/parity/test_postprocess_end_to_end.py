@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from parity.test_labels import Scene, labels_of
 
+from deepaccident_devkit.geometry.bev_grid import cells_in, to_orientation
+from deepaccident_devkit.motion.grouping import MotionHeads
+from deepaccident_devkit.motion.instances import predict_instances
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.grouping import MotionHeads
-from deepaccident_devkit.motion.postprocessing.predict import predict_instances
 
 pytestmark = pytest.mark.golden_cases("a_labels", "scenes")
 

@@ -12,15 +12,19 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.handedness import flip_pose, flip_six_vector
+from deepaccident_devkit.geometry.bev_grid import to_orientation
+from deepaccident_devkit.geometry.conventions import flip_pose, flip_six_vector
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.config import LABEL_PROTOCOLS, MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.orientations import to_orientation
-from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
-from deepaccident_devkit.motion.warps.chains import present_from_frames
-from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
-from deepaccident_devkit.motion.warps.warping import sample_points, sampling_matrix, warp
+from deepaccident_devkit.motion.warping import (
+    agents_to_ego,
+    past_to_present,
+    present_from_frames,
+    sample_points,
+    sampling_matrix,
+    warp,
+)
 
 RELEASED = BevGrid(orientation="released")
 PROTOCOL = LABEL_PROTOCOLS["released"]

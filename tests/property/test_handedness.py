@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import ANGLES, arrays, matrices
 
-from deepaccident_devkit.geometry import SE3, PinholeCamera, handedness
+from deepaccident_devkit.geometry import SE3, PinholeCamera, conventions
 from deepaccident_devkit.release import read_calib, read_label, read_lidar, write_lidar
 from deepaccident_devkit.release.calib import KEYS
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -22,11 +22,11 @@ FOCAL = dict.fromkeys(CAMERAS, 1142.5184) | {"Camera_Back": 560.166}
 @pytest.mark.parametrize(
     ("flip", "shape"),
     [
-        (handedness.flip_points, (4, 3)),
-        (handedness.flip_vectors2, (4, 2)),
-        (handedness.flip_yaw, (4,)),
-        (handedness.flip_pose, (2, 4, 4)),
-        (handedness.flip_six_vector, (4, 6)),
+        (conventions.flip_points, (4, 3)),
+        (conventions.flip_vectors2, (4, 2)),
+        (conventions.flip_yaw, (4,)),
+        (conventions.flip_pose, (2, 4, 4)),
+        (conventions.flip_six_vector, (4, 6)),
     ],
 )
 @given(data=st.data())
@@ -45,24 +45,24 @@ def test_flipping_twice_is_identity_and_changes_no_argument(flip, shape, data) -
 
 @given(arrays((2, 4, 4), 1e3), arrays((2, 3, 3), 2e3))
 def test_cameras_and_intrinsics_come_back(camera: np.ndarray, raw_intrinsic: np.ndarray) -> None:
-    assert_array_equal(handedness.camera_from_lidar_to_raw(handedness.camera_from_lidar(camera)), camera)
-    assert_array_equal(handedness.camera_from_lidar(handedness.camera_from_lidar_to_raw(camera)), camera)
-    assert_array_equal(handedness.intrinsic_to_raw(handedness.intrinsic(raw_intrinsic)), raw_intrinsic)
-    assert_array_equal(handedness.intrinsic(handedness.intrinsic_to_raw(raw_intrinsic)), raw_intrinsic)
+    assert_array_equal(conventions.camera_from_lidar_to_raw(conventions.camera_from_lidar(camera)), camera)
+    assert_array_equal(conventions.camera_from_lidar(conventions.camera_from_lidar_to_raw(camera)), camera)
+    assert_array_equal(conventions.intrinsic_to_raw(conventions.intrinsic(raw_intrinsic)), raw_intrinsic)
+    assert_array_equal(conventions.intrinsic(conventions.intrinsic_to_raw(raw_intrinsic)), raw_intrinsic)
 
 
 @given(matrices(), arrays((5, 3), 100))
 def test_flipped_pose_moves_flipped_points(pose: np.ndarray, points: np.ndarray) -> None:
     raw = (pose @ np.column_stack([points, np.ones(5)]).T).T[:, :3]
-    flipped = SE3(handedness.flip_pose(pose)).apply(handedness.flip_points(points))
+    flipped = SE3(conventions.flip_pose(pose)).apply(conventions.flip_points(points))
     assert_allclose(flipped * [1, -1, 1], raw, atol=1e-9)
 
 
 @given(ANGLES)
 def test_clockwise_yaw_becomes_counter_clockwise(raw_yaw: float) -> None:
     # clockwise seen from above, towards y right
-    ahead = handedness.flip_points([np.cos(raw_yaw), np.sin(raw_yaw), 0.0])
-    assert_allclose(SE3.from_yaw(float(handedness.flip_yaw(raw_yaw))).apply([1.0, 0.0, 0.0]), ahead, atol=1e-12)
+    ahead = conventions.flip_points([np.cos(raw_yaw), np.sin(raw_yaw), 0.0])
+    assert_allclose(SE3.from_yaw(float(conventions.flip_yaw(raw_yaw))).apply([1.0, 0.0, 0.0]), ahead, atol=1e-12)
 
 
 @given(ANGLES, ANGLES, ANGLES, arrays((3,), 100))
@@ -81,7 +81,7 @@ def test_six_vector_flips_as_its_pose_does(rx: float, ry: float, rz: float, tran
         return pose
 
     six = np.array([*translation, rx, ry, rz])
-    assert_allclose(pose_of(handedness.flip_six_vector(six)), handedness.flip_pose(pose_of(six)), atol=1e-12)
+    assert_allclose(pose_of(conventions.flip_six_vector(six)), conventions.flip_pose(pose_of(six)), atol=1e-12)
 
 
 def carla_matrix(location: np.ndarray, yaw: float, pitch: float, roll: float) -> np.ndarray:

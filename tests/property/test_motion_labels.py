@@ -7,10 +7,9 @@ from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import ANGLES, grids, numbers
 
-from deepaccident_devkit.geometry import SE3, BevGrid, six_vectors
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
+from deepaccident_devkit.geometry import SE3, BevGrid, conventions
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, cells_in, to_orientation, vectors_in
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, FrameBoxes, MotionLabelConfig, motion_labels_from_boxes
-from deepaccident_devkit.motion.orientations import cells_in, to_orientation, vectors_in
 
 CELL = 0.5
 orientations = st.sampled_from(ORIENTATIONS)
@@ -132,7 +131,7 @@ def test_the_released_flow_of_what_stands_still_is_the_egos_motion(box, ahead, t
     """Whatever the ego does, what stands still in the world has no flow, to the cells' accuracy."""
     center, size, yaw = box
     motion = np.array([-ahead / 10, 0, 0, 0, 0, turn / 5])
-    next_from_this = SE3(six_vectors.to_matrices(motion))
+    next_from_this = SE3(conventions.matrices_of_six(motion))
     seen = next_from_this.apply(center[None])[0]
     frames = [frame(center, size, yaw), frame(seen, size, yaw + turn / 5)]
     made = labels(frames, np.stack([motion, np.zeros(6)]), "released", "released")

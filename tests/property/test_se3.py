@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pyquaternion import Quaternion
 from strategies import ANGLES, arrays, boxes, points, poses
 
-from deepaccident_devkit.geometry import SE3, Boxes, handedness, quaternions, six_vectors
+from deepaccident_devkit.geometry import SE3, Boxes, conventions, quaternions
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 
 
@@ -113,5 +113,5 @@ def test_six_turns_about_z_then_y_then_x(translation: np.ndarray, rx: float, ry:
 
 @given(poses())
 def test_a_flipped_six_vector_is_the_flipped_poses(pose: SE3) -> None:
-    flipped = handedness.flip_six_vector(pose.to_six())
-    assert_allclose(six_vectors.to_matrices(flipped), handedness.flip_pose(pose.matrix), atol=1e-7)
+    flipped = conventions.flip_six_vector(pose.to_six())
+    assert_allclose(conventions.matrices_of_six(flipped), conventions.flip_pose(pose.matrix), atol=1e-7)

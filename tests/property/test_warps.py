@@ -6,12 +6,18 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import grids
 
-from deepaccident_devkit.geometry import BevGrid, six_vectors
+from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
-from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
-from deepaccident_devkit.motion.warps.to_present import agents_to_ego
-from deepaccident_devkit.motion.warps.warping import nearest_indices, sample_points, sampling_matrix, warp
+from deepaccident_devkit.motion.config import LABEL_PROTOCOLS
+from deepaccident_devkit.motion.warping import (
+    agents_to_ego,
+    nearest_indices,
+    present_from_frames,
+    present_from_past,
+    sample_points,
+    sampling_matrix,
+    warp,
+)
 
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
 RULES = st.sampled_from(list(LABEL_PROTOCOLS.values()))
@@ -42,7 +48,7 @@ def test_standing_still_samples_at_most_half_a_cell_away_as_released(grid) -> No
 @given(STEPS, RULES, ORIENTATIONS)
 def test_all_orientations_warp_alike(step, rules, orientation) -> None:
     grid = BevGrid((-10, 10, 0.5), (-10, 10, 0.5))
-    matrix = sampling_matrix(six_vectors.to_matrices(step)[None], rules)[0]
+    matrix = sampling_matrix(conventions.matrices_of_six(step)[None], rules)[0]
     native, raster = nearest_indices(matrix, grid, rules), noise(grid)
     lying = rules.native
     expected = warp(grid.reorient(raster, lying), matrix, grid, rules)
@@ -55,7 +61,7 @@ def test_all_orientations_warp_alike(step, rules, orientation) -> None:
 def test_there_and_back_brings_smooth_maps_home(step) -> None:
     """Within what half a cell of rounding, twice, changes in a map that rises by 1 a cell."""
     grid = BevGrid((-20, 20, 0.5), (-20, 20, 0.5), "released")
-    there = six_vectors.to_matrices(step)
+    there = conventions.matrices_of_six(step)
     column = np.broadcast_to(np.arange(grid.shape[1], dtype=np.float64) + 1000, grid.shape)
     away = warp(column, there, grid, CLEAN, orientation="released")
     home = warp(away, np.linalg.inv(there), grid, CLEAN, orientation="released")
@@ -87,5 +93,5 @@ def test_a_cell_lands_where_its_centre_goes(step, orientation) -> None:
     grid = BevGrid((-20, 20, 0.5), (-20, 20, 0.5), orientation)
     blob = np.linalg.norm(grid.centers() - (3.25, -2.25), axis=-1) < 1.1
     found = agents_to_ego(np.stack([blob] * 2), [[0] * 6, step], grid=grid, protocol="clean")[1]
-    expected = (six_vectors.to_matrices(step) @ [3.25, -2.25, 0, 1])[:2]
+    expected = (conventions.matrices_of_six(step) @ [3.25, -2.25, 0, 1])[:2]
     assert_allclose(grid.centers()[found].mean(axis=0), expected, atol=0.26)

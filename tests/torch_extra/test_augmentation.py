@@ -13,7 +13,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.torch import ImageConfig, RandomAugmentation, V2XConfig, V2XDataset
 from deepaccident_devkit.export.torch.config import augmented_boxes, augmented_pose, augmented_six_vectors
-from deepaccident_devkit.geometry import BevGrid, Boxes, six_vectors
+from deepaccident_devkit.geometry import BevGrid, Boxes, conventions
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
 
@@ -59,10 +59,10 @@ def test_a_box_is_the_hull_of_its_augmented_corners(augmentation: Augmentation) 
 
 @given(augmentations, st.lists(st.floats(-1, 1), min_size=6, max_size=6))
 def test_six_vectors_are_those_of_the_augmented_poses(augmentation: Augmentation, six: list[float]) -> None:
-    pose = augmented_pose(six_vectors.to_matrices(six), augmentation)
-    assert_allclose(six_vectors.to_matrices(augmented_six_vectors(six, augmentation)), pose, atol=1e-9)
+    pose = augmented_pose(conventions.matrices_of_six(six), augmentation)
+    assert_allclose(conventions.matrices_of_six(augmented_six_vectors(six, augmentation)), pose, atol=1e-9)
     point = np.array([3.0, -2, 1, 1])
-    there = six_vectors.to_matrices(six) @ point
+    there = conventions.matrices_of_six(six) @ point
     assert_allclose(pose @ (augmentation.matrix @ point), augmentation.matrix @ there, atol=1e-9)
 
 

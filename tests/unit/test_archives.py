@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 
-from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_array, read_member
+from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, array_of, open_zip, read_array, read_member
 
 ARRAY = np.arange(12, dtype=np.float32).reshape(3, 4)
 MOST_MEMORY = 100 << 20

@@ -15,7 +15,7 @@ from deepaccident_devkit.selection import Filter, fields, parse_where
 from deepaccident_devkit.selection.fields import FIELDS, group_texts
 from deepaccident_devkit.tables.records import CollisionRecord, ScenarioRecord
 from deepaccident_devkit.v2x import accident_visibility, accident_visible
-from deepaccident_devkit.v2x.accident_visibility import SHEER_CURTAINS
+from deepaccident_devkit.v2x.agents import SHEER_CURTAINS
 
 QUIET = "ClearNight -1 -1 -1 -1 -1 -1 -1 15\n"
 NORMAL = "type1_subtype2_normal"

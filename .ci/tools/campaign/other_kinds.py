@@ -17,7 +17,7 @@ from deepaccident_devkit.errors import WorkerError
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.questions import read_answers, results_of_answers
-from deepaccident_devkit.parallel import cluster_executor, scheduler_file
+from deepaccident_devkit.parallel import cluster_executor, executors
 from deepaccident_devkit.validation import validate_release
 
 assert other_mutations  # made for these
@@ -106,7 +106,7 @@ def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
 def _scheduled(room: Room) -> str:
     """Nobody listens at the healthy address, and it is right to say so."""
     try:
-        with patch.object(scheduler_file, "_SECONDS", 0.2), cluster_executor(scheduler_file=room.victim):
+        with patch.object(executors, "_SECONDS", 0.2), cluster_executor(scheduler_file=room.victim):
             return "a scheduler"
     except WorkerError:
         same = room.victim.is_file() and room.victim.stat().st_size == room.healthy.stat().st_size

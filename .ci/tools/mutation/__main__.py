@@ -16,7 +16,7 @@ _PLANTED = ("killed", "timed out", "survived", "not reached")
 @click.command()
 @click.option("--count", default=1500, help="How many mutants are drawn.")
 @click.option("--seed", default=17, help="Of the drawing.")
-@click.option("--only", multiple=True, metavar="PATH", help="Run those of the files that begin so, as motion/warps.")
+@click.option("--only", multiple=True, metavar="PATH", help="Run those of the files that begin so, as motion/warping.")
 @click.option("--again", is_flag=True, help="Run those that survived once more.")
 @click.option(
     "--results", type=click.Path(path_type=Path), default="build/mutants.jsonl", help="What came of each; it grows."

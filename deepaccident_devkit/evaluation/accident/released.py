@@ -1,6 +1,6 @@
 """Accidents as the released code evaluates them, bugs included (protocol `released`; docs/released_code.md, Accidents).
 
-Bugs of other functions: `motion.postprocessing.contours` (boxes of 5 m × 2 m at most, rasterised into the wrong frame
+Bugs of other functions: `exact.contours` (boxes of 5 m × 2 m at most, rasterised into the wrong frame
 after a gap, and of the first frame's instances alone), `outlines.first_outline` (of an instance in several parts, one
 counts), `trajectories.padded` and `match_trajectories`.
 """
@@ -15,7 +15,6 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.accident.outlines import pair_gaps
 from deepaccident_devkit.evaluation.accident.scoring import (
     DISTANCES,
     ERRORS,
@@ -39,15 +38,16 @@ from deepaccident_devkit.evaluation.predictions import (
     labels_at_present,
 )
 from deepaccident_devkit.evaluation.trajectories import Paths, instance_paths, longest, match_trajectories, padded
+from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
+from deepaccident_devkit.exact.outlines import pair_gaps
 from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import to_orientation
 from deepaccident_devkit.motion import (
     MotionHeads,
     MotionLabels,
     predict_instances,
     trajectories,
 )
-from deepaccident_devkit.motion.orientations import to_orientation
-from deepaccident_devkit.motion.postprocessing.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 Pair = tuple[int, int]

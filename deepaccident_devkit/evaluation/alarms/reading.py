@@ -13,9 +13,8 @@ import numpy as np
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.alarms.hulls import convex_hulls, hull_distances
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.bev_grid import Orientation
+from deepaccident_devkit.geometry.bev_grid import Orientation, cells_in
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
-from deepaccident_devkit.motion.orientations import cells_in
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 
 TIE: Final = 1e-9

@@ -14,14 +14,13 @@ from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation.alarms.reading import InstanceTracks
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.geometry.conflicts import time_to_collision
-from deepaccident_devkit.geometry.footprints import gaps
+from deepaccident_devkit.geometry.box_arrays import gaps, time_to_collision
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.collisions import labelled_pair
-from deepaccident_devkit.v2x.seen import seen_actors
+from deepaccident_devkit.v2x.cooperation import seen_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 RELEASED_HORIZON: Final = 2.0

@@ -141,7 +141,7 @@ class BoxColumns:
 
     @property
     def footprint(self) -> FloatArray:
-        """(N, 5) float64, x, y, length, width, yaw, as geometry.footprints takes them."""
+        """(N, 5) float64, x, y, length, width, yaw, as geometry.box_arrays takes them."""
         return np.column_stack([self.center[:, :2], self.size[:, :2], self.yaw]).astype(np.float64)
 
 

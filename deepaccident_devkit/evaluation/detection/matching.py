@@ -15,7 +15,7 @@ import numpy as np
 
 from deepaccident_devkit.evaluation.detection.boxes import BoxColumns
 from deepaccident_devkit.evaluation.detection.protocols import DetectionProtocol
-from deepaccident_devkit.geometry.footprints import intersection_areas
+from deepaccident_devkit.geometry.box_arrays import intersection_areas
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, as_floats
 
 Reach = Mapping[int, Sequence[tuple[int, int]]]

@@ -17,8 +17,8 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.results.header import ContentError, MotionForm, at
 from deepaccident_devkit.motion import predict_instances
-from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, array_of, read_member
 from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, array_of, read_member
 
 _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 _WIDEST: Final = 8

@@ -37,8 +37,8 @@ from deepaccident_devkit.evaluation.results.motion_arrays import stored_output
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, MotionFile, ResultsFile, ResultsTask
 from deepaccident_devkit.evaluation.results.shards import check_shard, read_manifest, shared_archive
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.support.files import path_of
 from deepaccident_devkit.support.reading import NO_NAME, fault_text, irregular_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -34,9 +34,8 @@ from deepaccident_devkit.evaluation.results.motion_arrays import (
 )
 from deepaccident_devkit.evaluation.results.records import MotionFile, Shard, Stored
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, open_zip
 from deepaccident_devkit.support.arrays import AnyArray
-from deepaccident_devkit.support.reading import check_size, file_checksum, irregular_text
+from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, check_size, file_checksum, irregular_text, open_zip
 
 
 def read_manifest(document: MotionFile, root: Path) -> tuple[MotionForm, dict[str, Shard]]:

@@ -17,8 +17,8 @@ from deepaccident_devkit.evaluation.results.header import ContentError, MotionFo
 from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, ResultsTask, Stored
 from deepaccident_devkit.evaluation.results.shards import ShardWriter
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.support.files import path_of, replacing, replacing_folder
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.files import replacing, replacing_folder
+from deepaccident_devkit.support.text import choice, path_of
 
 
 class ResultsWriter:

@@ -22,9 +22,10 @@ from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.files import path_of, remove_in, replacing_folder, temporary_path
+from deepaccident_devkit.support.files import remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.support.json_text import Record, as_record, parsed_json
 from deepaccident_devkit.support.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
 SUMMARY_FILE: Final = "metrics_summary.json"

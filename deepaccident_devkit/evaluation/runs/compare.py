@@ -27,8 +27,7 @@ from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.evaluation.runs.verification import differing
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import FloatArray, ShortRepr, known
-from deepaccident_devkit.support.files import path_of
-from deepaccident_devkit.support.text import columns_text
+from deepaccident_devkit.support.text import columns_text, path_of
 
 Family = Literal["main", "headlines", "other"]
 """What a number is tested with: by itself, with all other headlines, or not at all."""

@@ -15,8 +15,9 @@ from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.parallel import Places, Store, run_batch, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
-from deepaccident_devkit.support.files import path_of, remove_in
+from deepaccident_devkit.support.files import remove_in
 from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.text import path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, get_args
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.motion import samples
-from deepaccident_devkit.motion.sample_lists import no_samples_text
+from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import choice, settle_choices, spelled
 from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS

@@ -29,7 +29,7 @@ from deepaccident_devkit.evaluation.runs.prevention import with_prevented
 from deepaccident_devkit.evaluation.runs.rows import sample_rows
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.text import path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

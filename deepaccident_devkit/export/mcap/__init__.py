@@ -19,7 +19,7 @@ from typing import Any
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
 from deepaccident_devkit.export.mcap.config import EPOCH, McapConfig, Predictions
-from deepaccident_devkit.support.files import path_of
+from deepaccident_devkit.support.text import path_of
 
 __all__ = ["EPOCH", "McapConfig", "Predictions", "export_mcap"]
 

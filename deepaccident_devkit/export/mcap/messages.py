@@ -41,7 +41,7 @@ from deepaccident_devkit.render.roles import recorders_of
 from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR
-from deepaccident_devkit.v2x.configurations import Agents, agents_of, cooperating_agents
+from deepaccident_devkit.v2x.agents import Agents, agents_of, cooperating_agents
 
 _FRAME_NANOSECONDS: Final = 100_000_000
 _SECOND_NANOSECONDS: Final = 1_000_000_000

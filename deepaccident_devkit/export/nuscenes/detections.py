@@ -29,9 +29,9 @@ from deepaccident_devkit.evaluation.results.header import ContentError, at, show
 from deepaccident_devkit.evaluation.results.records import FORMAT, BoxEntry
 from deepaccident_devkit.export.keyframes import KEY_STEP
 from deepaccident_devkit.export.nuscenes.scenes import token
-from deepaccident_devkit.support.files import path_of
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import agent_token, sample_data_token, sample_token
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, LIDAR, OWN_ACTOR_ID, STATIC_ACTOR_ID, UNTRACKED_ID
-from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.agents import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset

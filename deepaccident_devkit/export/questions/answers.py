@@ -15,9 +15,9 @@ from deepaccident_devkit.errors import ConfigError, ResultsError, shortened
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.support.arrays import FloatArray, ShortRepr, checked_number
-from deepaccident_devkit.support.files import path_of
 from deepaccident_devkit.support.json_text import Record, parsed_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.tables.tokens import sample_token
 
 _REMEDY: Final = "mend that line; README.md beside the questions says what an answer is"

@@ -33,8 +33,8 @@ from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.support.text import Word, choice, settle_choices, spelled
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS, AgentName
+from deepaccident_devkit.v2x.agents import AGENT_SETS, agents_of, cooperating_agents
 from deepaccident_devkit.v2x.collisions import collision, labelled_pair
-from deepaccident_devkit.v2x.configurations import AGENT_SETS, agents_of, cooperating_agents
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:

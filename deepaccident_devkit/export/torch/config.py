@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.dataset import Visible
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.export.images import ImageConfig
-from deepaccident_devkit.geometry import BevGrid, Boxes, LidarPointCloud, six_vectors
+from deepaccident_devkit.geometry import BevGrid, Boxes, LidarPointCloud, conventions
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
-from deepaccident_devkit.motion.warps.warping import WarpMode
+from deepaccident_devkit.motion.warping import WarpMode
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, as_floats, checked, checked_number, checked_whole
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import OnError
 from deepaccident_devkit.v2x import Agents, Link
-from deepaccident_devkit.v2x.link import checked_link
+from deepaccident_devkit.v2x.messages import checked_link
 
 BoxSource = Literal["sample", "cooperative"]
 AugmentationSource = Augmentation | Callable[[np.random.Generator], Augmentation]
@@ -216,7 +216,7 @@ def augmented_pose(pose: ArrayLike, augmentation: Augmentation) -> FloatArray:
 
 def augmented_six_vectors(six: ArrayLike, augmentation: Augmentation) -> FloatArray:
     """The same for 6-vectors (…, 6): translations are scaled; rotations stay rotations, even with a flip."""
-    return six_vectors.from_matrices(augmented_pose(six_vectors.to_matrices(six), augmentation))
+    return conventions.six_vectors_of(augmented_pose(conventions.matrices_of_six(six), augmentation))
 
 
 def transformed(matrix: FloatArray, points: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from torch import Tensor
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.geometry import SE3
-from deepaccident_devkit.geometry.footprints import intersection_areas
+from deepaccident_devkit.geometry.box_arrays import intersection_areas
 from deepaccident_devkit.model.detection.head import CODE_CHANNELS, ClassSlots, DetectionConfig, TaskMaps
 from deepaccident_devkit.model.detection.targets import gather_cells, precise
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, check_least

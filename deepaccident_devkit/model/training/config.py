@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final, get_args
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.motion.sample_lists import Purpose
+from deepaccident_devkit.motion.sample_labels import Purpose
 from deepaccident_devkit.support.arrays import checked_number, checked_whole
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.v2x import AgentConfig, Agents

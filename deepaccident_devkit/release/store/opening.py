@@ -30,8 +30,9 @@ from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, Store
 from deepaccident_devkit.release.store.sources import UrlSource, asked
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.release.store.zips import list_zip
-from deepaccident_devkit.support.files import is_writable_folder, path_text
+from deepaccident_devkit.support.files import is_writable_folder
 from deepaccident_devkit.support.reading import fault_text, open_file
+from deepaccident_devkit.support.text import path_text
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -14,8 +14,14 @@ import numpy as np
 from deepaccident_devkit.errors import MOST_TOLD, DatarootError, shortened
 from deepaccident_devkit.release.store.members import Listing, Member
 from deepaccident_devkit.release.store.names import is_release_file, release_folder
-from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, check_end
-from deepaccident_devkit.support.reading import LIMITS_VARIABLE, RefusedFileError, fault_text, limit_of
+from deepaccident_devkit.support.reading import (
+    DAMAGED_ARCHIVE,
+    LIMITS_VARIABLE,
+    RefusedFileError,
+    check_end,
+    fault_text,
+    limit_of,
+)
 
 HEAD_LENGTH: Final = 30
 """Bytes of a member's head before its name."""

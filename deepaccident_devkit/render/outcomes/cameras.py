@@ -36,7 +36,7 @@ from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, OWN_ACTOR_ID, POLE_HEIGHT
-from deepaccident_devkit.v2x.projection import camera_of
+from deepaccident_devkit.v2x.poses import camera_of
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

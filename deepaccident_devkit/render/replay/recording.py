@@ -19,8 +19,8 @@ from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, AgentName, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import default_scenario
-from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 

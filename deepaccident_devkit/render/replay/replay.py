@@ -41,8 +41,9 @@ from deepaccident_devkit.render.replay.sensors import (
     lidar_points,
 )
 from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
-from deepaccident_devkit.support.files import path_of, write_bytes
+from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.pages import document, part, source_hash
+from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
 from deepaccident_devkit.v2x import Agents
 

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from deepaccident_devkit.geometry import SE3, PinholeCamera, handedness, quaternions
+from deepaccident_devkit.geometry import SE3, PinholeCamera, conventions, quaternions
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.release import Calib
 from deepaccident_devkit.support.arrays import FloatArray
@@ -27,7 +27,7 @@ _SIDES = dict(zip(CAMERAS, ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1))
 _FIELD_OF_VIEW = {camera: float(np.deg2rad(110.0 if camera == "Camera_Back" else 70.0)) for camera in CAMERAS}
 _CLEAR_OF_HULL = 0.001
 """Metres from the face of the box to a camera, so that its rays do not begin inside the vehicle's body."""
-_OPTICAL_FROM_FORWARD = SE3(handedness.camera_from_lidar(np.eye(4)))
+_OPTICAL_FROM_FORWARD = SE3(conventions.camera_from_lidar(np.eye(4)))
 """A coordinate frame with x forward, y left, z up → the optical frame."""
 
 

@@ -9,8 +9,8 @@ from typing import Final, cast
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.support.files import path_of
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.synth.roads import ARMS, Arm
 from deepaccident_devkit.synth.spec.checks import LEADERS, check_scenario, meeting_roles, usual_lanes
 from deepaccident_devkit.synth.spec.model import (

@@ -16,7 +16,7 @@ from deepaccident_devkit.model.checkpoint import read_weights
 from deepaccident_devkit.model.presets import tiny
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperating_agents, visible_instances
-from deepaccident_devkit.v2x.seen import seen_actors
+from deepaccident_devkit.v2x.cooperation import seen_actors
 
 DOCS = Path(__file__).parents[3] / "docs"
 NAMES = ("model_study_numbers", "model_study_rows", "model_study_protocol", "model_study", "make_model_page")

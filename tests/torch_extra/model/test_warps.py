@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.geometry import BevGrid, six_vectors
+from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.model.warps import (
     agents_mask,
     agents_to_ego,
@@ -42,7 +42,7 @@ def centres() -> tuple[torch.Tensor, torch.Tensor]:
 @given(six)
 def test_matrices_equal_those_of_the_geometry_and_give_the_vectors_back(vector: torch.Tensor) -> None:
     matrix = matrices_from_six(vector)
-    np.testing.assert_allclose(matrix.numpy(), six_vectors.to_matrices(vector.numpy()), atol=1e-12)
+    np.testing.assert_allclose(matrix.numpy(), conventions.matrices_of_six(vector.numpy()), atol=1e-12)
     np.testing.assert_allclose(six_from_matrices(matrix).numpy(), vector.numpy(), atol=1e-7)
 
 

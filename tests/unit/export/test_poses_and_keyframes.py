@@ -8,7 +8,7 @@ from strategies import matrices
 
 from deepaccident_devkit.export.keyframes import KEY_STEP, keyframe_after, keyframes
 from deepaccident_devkit.export.opencood import carla_six
-from deepaccident_devkit.geometry.handedness import flip_pose
+from deepaccident_devkit.geometry.conventions import flip_pose
 
 DEGREES = st.floats(-179.9, 179.9)
 

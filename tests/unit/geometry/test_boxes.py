@@ -6,8 +6,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import SE3, Box, Boxes, footprints, points_in_boxes
-from deepaccident_devkit.geometry.box_columns import COLUMNS
+from deepaccident_devkit.geometry import SE3, Box, Boxes, box_arrays
+from deepaccident_devkit.geometry.box_arrays import COLUMNS
 from deepaccident_devkit.geometry.boxes import concatenate, trusted_boxes
 
 
@@ -258,9 +258,9 @@ def test_many_pairs_are_worked_off_in_pieces(monkeypatch: pytest.MonkeyPatch) ->
     some = Boxes.from_arrays(rng.normal(size=(40, 3)) * 5, rng.uniform(1, 5, (40, 3)), rng.uniform(-3, 3, 40))
     points = rng.normal(size=(300, 3)) * 5
     whole = some.iou_bev(some), some.distance_bev(some), some.contains(points)
-    monkeypatch.setattr(footprints, "_PAIRS_AT_ONCE", 7)
-    monkeypatch.setattr(points_in_boxes, "_PAIRS_AT_ONCE", 7)
-    monkeypatch.setattr(points_in_boxes, "_POINTS_AT_ONCE", 7)
+    monkeypatch.setattr(box_arrays, "_PAIRS_AT_ONCE", 7)
+    monkeypatch.setattr(box_arrays, "_PAIRS_AT_ONCE", 7)
+    monkeypatch.setattr(box_arrays, "_POINTS_AT_ONCE", 7)
     for have, want in zip((some.iou_bev(some), some.distance_bev(some), some.contains(points)), whole, strict=True):
         assert_array_equal(have, want)
 

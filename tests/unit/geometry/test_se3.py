@@ -6,7 +6,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
-from deepaccident_devkit.geometry.se3 import stored_transforms
+from deepaccident_devkit.geometry.conventions import stored_transforms
 
 QUARTER_LEFT = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 

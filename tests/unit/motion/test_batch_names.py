@@ -5,7 +5,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.handedness import flip_six_vector
+from deepaccident_devkit.geometry.conventions import flip_six_vector
 from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, MotionLabels, motion_labels_from_boxes
 from deepaccident_devkit.motion.batch_names import HEADS, MAPS, config_from_names
 

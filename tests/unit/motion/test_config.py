@@ -9,8 +9,7 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, Augmentation, MotionLabelConfig
-from deepaccident_devkit.motion.config import label_config
-from deepaccident_devkit.motion.protocols import slip_names
+from deepaccident_devkit.motion.config import label_config, slip_names
 from deepaccident_devkit.v2x import AgentConfig
 
 

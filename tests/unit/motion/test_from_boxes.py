@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid
+from deepaccident_devkit.geometry.bev_grid import axes_of, to_orientation
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
     OWN_BOX_ID,
@@ -15,8 +16,7 @@ from deepaccident_devkit.motion import (
     MotionLabelConfig,
     motion_labels_from_boxes,
 )
-from deepaccident_devkit.motion.drawing.box_polygons import box_polygons
-from deepaccident_devkit.motion.orientations import axes_of, to_orientation
+from deepaccident_devkit.motion.box_polygons import box_polygons
 
 STILL = np.zeros((7, 6))
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]

@@ -8,12 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
+from deepaccident_devkit.exact.contours import redrawn_cells
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.config import MotionLabelConfig
-from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.postprocessing.contours import redrawn_cells
-from deepaccident_devkit.motion.postprocessing.grouping import LABEL_LOGIT, MotionHeads
-from deepaccident_devkit.motion.postprocessing.predict import (
+from deepaccident_devkit.motion.grouping import LABEL_LOGIT, MotionHeads
+from deepaccident_devkit.motion.instances import (
     FOREGROUND_THRESHOLD,
     POST_PROCESSING,
     PostProcessing,
@@ -21,6 +20,7 @@ from deepaccident_devkit.motion.postprocessing.predict import (
     predict_instances,
     trajectories,
 )
+from deepaccident_devkit.motion.labels import MotionLabels
 
 SHAPE = (30, 40)
 

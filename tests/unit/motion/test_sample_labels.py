@@ -19,7 +19,7 @@ from deepaccident_devkit.motion import (
     MotionLabels,
     motion_labels_from_boxes,
 )
-from deepaccident_devkit.motion.warps.chains import egomotion
+from deepaccident_devkit.motion.warping import egomotion
 from deepaccident_devkit.taxonomy import AGENTS, LIDAR
 from deepaccident_devkit.v2x.cooperation import visible_actors
 

@@ -9,7 +9,7 @@ import tiny
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.motion import evaluation_samples, samples, training_samples
-from deepaccident_devkit.motion.sample_lists import no_samples_text
+from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.taxonomy import AGENTS
 
 

@@ -9,15 +9,21 @@ from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError
-from deepaccident_devkit.geometry import BevGrid, six_vectors
+from deepaccident_devkit.exact import single_precision
+from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.config import LABEL_PROTOCOLS, LabelProtocol, MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
-from deepaccident_devkit.motion.warps import single_precision
-from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
-from deepaccident_devkit.motion.warps.to_present import agents_to_ego, past_to_present
-from deepaccident_devkit.motion.warps.warping import nearest_indices, rounded_points, sampling_matrix, warp
+from deepaccident_devkit.motion.warping import (
+    agents_to_ego,
+    nearest_indices,
+    past_to_present,
+    present_from_frames,
+    present_from_past,
+    rounded_points,
+    sampling_matrix,
+    warp,
+)
 
 GRID = BevGrid((-4, 4, 1), (-4, 4, 1))
 RELEASED, CLEAN, FIERY = (LABEL_PROTOCOLS[name] for name in ("released", "clean", "fiery"))
@@ -122,7 +128,7 @@ def test_past_motions_are_multiplied_in_the_order_of_time_as_released_and_rightl
     exact = present_from_past([first, second], CLEAN)
     released = present_from_past([first, second], RELEASED)
     # left-handed: turning is the other way round
-    ahead, turn = six_vectors.to_matrices(first), six_vectors.to_matrices(np.negative(second))
+    ahead, turn = conventions.matrices_of_six(first), conventions.matrices_of_six(np.negative(second))
     np.testing.assert_allclose(exact, [turn @ ahead, turn], atol=1e-12)
     np.testing.assert_allclose(released, [ahead @ turn, turn], atol=1e-6)
     assert present_from_past(np.zeros((0, 6)), RELEASED).shape == (0, 4, 4)
@@ -146,7 +152,7 @@ def test_single_precision_inverses_are_inverses() -> None:
     six = np.random.default_rng(1).normal(0, (8, 8, 1, 0.1, 0.1, 1), (50, 6))
     matrices = single_precision.pose_matrices(six)
     assert matrices.dtype == np.float32
-    np.testing.assert_allclose(matrices, six_vectors.to_matrices(six), atol=1e-6)
+    np.testing.assert_allclose(matrices, conventions.matrices_of_six(six), atol=1e-6)
     for inverse in (single_precision.inverse, single_precision.rigid_inverse):
         np.testing.assert_allclose(
             single_precision.product(inverse(matrices), matrices), np.tile(np.eye(4), (50, 1, 1)), atol=1e-5

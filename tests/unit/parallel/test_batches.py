@@ -15,7 +15,7 @@ import workers
 
 from deepaccident_devkit.errors import ChoiceError, ReleaseError, SomeFailedError, WorkerError
 from deepaccident_devkit.parallel import Failure, Places, Tried, check_failures, in_order, run_batch, run_unordered
-from deepaccident_devkit.parallel.calls import Call, marked
+from deepaccident_devkit.parallel.batches import Call, marked
 
 
 class Delayed(Executor):
@@ -106,7 +106,7 @@ def test_a_worker_with_another_folder_of_the_same_name(tmp_path: Path) -> None:
 
 def test_a_worker_with_another_version(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     sent = pickle.dumps(Call(workers.following, 1, (str(tmp_path),)))  # not checked yet in this process
-    monkeypatch.setattr("deepaccident_devkit.parallel.calls.__version__", "9.9")
+    monkeypatch.setattr("deepaccident_devkit.parallel.batches.__version__", "9.9")
     with pytest.raises(WorkerError, match=r"^a worker on \S+ has deepaccident_devkit 9\.9, and this is .*; install"):
         pickle.loads(sent)()
 

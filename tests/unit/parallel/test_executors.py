@@ -54,7 +54,7 @@ def test_a_wrong_scheduler_file(tmp_path: Path, content: str | None, monkeypatch
     import distributed  # noqa: F401 - as above
     from dask import config
 
-    monkeypatch.setattr("deepaccident_devkit.parallel.scheduler_file._SECONDS", 0.2)
+    monkeypatch.setattr("deepaccident_devkit.parallel.executors._SECONDS", 0.2)
     path = tmp_path / "scheduler.json"
     if content is not None:
         path.write_text(content)
@@ -94,7 +94,7 @@ def test_errors_of_the_work_are_not_those_of_workers() -> None:
 def test_the_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refused = CliRunner().invoke(deepaccident, ["index", "release", "--scheduler", "tcp://x", "--workers", "2"])
     assert (refused.exit_code, "--workers changes nothing with a scheduler" in refused.output) == (2, True)
-    monkeypatch.setattr("deepaccident_devkit.parallel.scheduler_file._SECONDS", 0.2)
+    monkeypatch.setattr("deepaccident_devkit.parallel.executors._SECONDS", 0.2)
     path = tmp_path / "absent.json"
     with pytest.raises(WorkerError, match=f"^{path}: no dask scheduler answers"):
         CliRunner().invoke(deepaccident, ["index", "release", "--scheduler", str(path)], catch_exceptions=False)

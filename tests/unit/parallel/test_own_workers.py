@@ -14,7 +14,7 @@ from processes import is_running, wait_for
 
 from deepaccident_devkit.errors import WorkerError
 from deepaccident_devkit.parallel import run_batch, run_unordered
-from deepaccident_devkit.parallel.pool import signals_put_off
+from deepaccident_devkit.parallel.executors import signals_put_off
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render.best_view import best_view, crop_about
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
-from deepaccident_devkit.v2x.projection import camera_of
+from deepaccident_devkit.v2x.poses import camera_of
 
 
 def test_the_best_view_of_the_vehicle_ahead_is_the_front_camera(da: DeepAccident, behind: str) -> None:

@@ -14,7 +14,7 @@ from deepaccident_devkit.render import render_pointcloud_in_image, render_sample
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
-from deepaccident_devkit.v2x.projection import camera_of
+from deepaccident_devkit.v2x.poses import camera_of
 
 
 def test_the_box_of_a_collider_passes_within_two_pixels_of_its_corners(da: DeepAccident, behind: str) -> None:

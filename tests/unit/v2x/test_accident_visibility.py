@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.v2x import accident_visibility, accident_visible, accident_visible_mask, pair_in_view
-from deepaccident_devkit.v2x.accident_visibility import SHEER_CURTAINS
+from deepaccident_devkit.v2x.agents import SHEER_CURTAINS
 
 VIEWS = np.array(list(itertools.product([False, True], repeat=3)))
 SEEN = [False, True, False, True, False, True, True, True]

@@ -12,7 +12,7 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.clouds import moved_points
 from deepaccident_devkit.v2x.messages import messages
-from deepaccident_devkit.v2x.projection import _colors_at
+from deepaccident_devkit.v2x.poses import _colors_at
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 

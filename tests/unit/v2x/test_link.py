@@ -14,8 +14,7 @@ from deepaccident_devkit import DeepAccident, v2x
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link, PoseNoise
-from deepaccident_devkit.v2x.link import uniforms
-from deepaccident_devkit.v2x.messages import messages
+from deepaccident_devkit.v2x.messages import messages, uniforms
 
 FIRST_DRAW = (0.8390037267799063, 0.07483574513276203, 0.8888751418060693, 0.6098842047921865)
 

@@ -14,9 +14,8 @@ from deepaccident_devkit.evaluation.motion.overlaps import vpq_counts
 from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
 from deepaccident_devkit.evaluation.trajectories import instance_paths, match_trajectories, trajectory_errors
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, to_orientation
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
-from deepaccident_devkit.motion.orientations import to_orientation
 
 CONFIG = MotionLabelConfig()
 SCALES = ("iou", "pq", "sq", "rq")

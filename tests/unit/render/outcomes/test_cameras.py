@@ -36,7 +36,7 @@ from deepaccident_devkit.render.outcomes import (
 from deepaccident_devkit.render.outcomes.above import FORESEEN_COLOR
 from deepaccident_devkit.render.outcomes.evaluation import AccidentVerdict
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
-from deepaccident_devkit.v2x.projection import camera_of
+from deepaccident_devkit.v2x.poses import camera_of
 
 IN_ORDER = [f"Camera_{place}" for place in ("FrontLeft", "Front", "FrontRight", "BackLeft", "Back", "BackRight")]
 AHEAD = (10.0, 14.0, -1.0, 1.0)

@@ -1,7 +1,7 @@
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.motion.postprocessing.grouping import nearest_peaks
+from deepaccident_devkit.exact.peaks import nearest_peaks
 
 PEAKS = np.array([[0, 0], [0, 2]], dtype=np.float32)
 

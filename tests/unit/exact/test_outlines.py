@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import find_objects
 
-from deepaccident_devkit.evaluation.accident.outlines import NO_OUTLINE, TOLERANCE, first_outline, pair_gaps, simplified
+from deepaccident_devkit.exact.outlines import NO_OUTLINE, TOLERANCE, first_outline, pair_gaps, simplified
 
-ORACLE = Path(__file__).parents[3] / "data" / "outlines_skimage_0_20.npz"
+ORACLE = Path(__file__).parents[2] / "data" / "outlines_skimage_0_20.npz"
 """1,200 masks of 24 × 24 cells (boxes at all angles, whole or cut, noise, discs with holes, scraps; some at the border)
 with an id each, and what scikit-image 0.20.0 with numpy 1.23.5 said of each: outline = find_contours(mask * id, 0.1)[0]
 and kept, which of its points approximate_polygon(outline, 0.5) has."""

@@ -11,22 +11,23 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
+from deepaccident_devkit.exact.peaks import find_peaks
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
-from deepaccident_devkit.motion.orientations import cells_in, to_orientation
-from deepaccident_devkit.motion.postprocessing.contours import first_hulls, redrawn_cells
-from deepaccident_devkit.motion.postprocessing.grouping import (
-    LABEL_LOGIT,
-    FrameGroups,
-    MotionHeads,
-    find_peaks,
-    group_cells,
-    link_frames,
-    sums_by,
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, cells_in, to_orientation
+from deepaccident_devkit.motion.config import LabelProtocol, label_protocol
+from deepaccident_devkit.motion.grouping import LABEL_LOGIT, FrameGroups, MotionHeads, group_cells, link_frames, sums_by
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    ShortRepr,
+    checked_count,
+    checked_flag,
+    checked_setting,
+    readonly,
 )
-from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol
-from deepaccident_devkit.motion.settings import count, flag, number
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, readonly
 from deepaccident_devkit.support.text import choice
 
 Foreground = Literal["argmax", "sigmoid"]
@@ -69,12 +70,12 @@ class PostProcessing:
         """Check the values; raises ChoiceError or ConfigError."""
         values = {
             "foreground": choice("foreground", self.foreground, get_args(Foreground)),
-            "labels_bypass_sigmoid": flag("labels_bypass_sigmoid", self.labels_bypass_sigmoid),
-            "center_threshold": number("center_threshold", self.center_threshold, "a number from 0", 0.0),
-            "max_centers": count("max_centers", self.max_centers, "centres of a frame", _MOST_CENTERS),
+            "labels_bypass_sigmoid": checked_flag("labels_bypass_sigmoid", self.labels_bypass_sigmoid),
+            "center_threshold": checked_setting("center_threshold", self.center_threshold, "a number from 0", 0.0),
+            "max_centers": checked_count("max_centers", self.max_centers, "centres of a frame", _MOST_CENTERS),
             "scan": choice("scan", self.scan, ORIENTATIONS),
-            "link_distance": number("link_distance", self.link_distance, "a number of cells from 0", 0.0),
-            "redraw": flag("redraw", self.redraw),
+            "link_distance": checked_setting("link_distance", self.link_distance, "a number of cells from 0", 0.0),
+            "redraw": checked_flag("redraw", self.redraw),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy.ndimage import label
 
-from deepaccident_devkit.motion.postprocessing.contours import are_one_part, convex_hull, first_contour, min_area_rects
+from deepaccident_devkit.exact.contours import are_one_part, convex_hull, first_contour, min_area_rects
 
 ORACLE = Path(__file__).parents[2] / "data" / "min_area_rect_opencv_4_7.npz"
 """2,400 masks of 24 × 24 cells (boxes at all angles, lines, blobs, noise, rings with dots in them, scraps) and what

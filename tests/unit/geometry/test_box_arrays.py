@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepaccident_devkit.geometry.conflicts import time_to_collision
+from deepaccident_devkit.geometry.box_arrays import time_to_collision
 
 EAST = [10.0, 0.0]
 CAR = [0.0, 0.0, 4.0, 2.0, 0.0]

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
+from deepaccident_devkit.exact.polygon_fill import filled_cells
 
 ORACLE = Path(__file__).parents[2] / "data" / "fill_poly_opencv_4_7.npz"
 """Random quadrangles and what OpenCV 4.7.0's fillPoly drew of each: cars and trucks, tiny, crossing, degenerate and

@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
+from deepaccident_devkit.exact.polygon_fill import filled_cells
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 Point = tuple[int, int]

@@ -1,0 +1,142 @@
+"""What differs between CARLA, the released code and the devkit (docs/conventions.md): the one place where signs change.
+
+CARLA's frames have x forward, y **right**, z up, and yaw clockwise seen from above. The devkit's have x forward,
+y **left**, z up, yaw counter-clockwise. With S = diag(1, −1, 1) every conversion of a point, a pose or an angle is its
+own inverse, so each `flip_*` works in both directions. Cameras also change from CARLA's axes (x depth, y right, z up)
+to optical axes (x right, y down, z forward), which is not its own inverse: these two functions have a `*_to_raw` each.
+
+The released code's 6-vectors (tx, ty, tz, rx, ry, rz) stand for rigid transforms (docs/released_code.md, Poses) with
+R = Rx(rx) · Ry(ry) · Rz(rz): about z first, then y, then x, each about the target frame's own, fixed axes; radians, ry
+in [−π/2, π/2]. At ry = ±π/2 only rx ± rz is determined, and rounding errors decide how it is divided. A raw matrix
+gives the raw vector, a right-handed one the right-handed vector.
+
+All functions take arrays with any leading axes, return new float64 arrays and do not change their arguments.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, as_floats
+
+LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+_S = np.array([1.0, -1.0, 1.0])
+_S4 = np.array([1.0, -1.0, 1.0, 1.0])
+_SIX = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+_OPTICAL_FROM_FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""Q: a camera frame with x forward, y left, z up → the optical frame."""
+_OPTICAL_FROM_RAW = _OPTICAL_FROM_FORWARD * _S
+"""Q·S: CARLA's camera axes → the optical frame."""
+
+
+def checked_frame(name: str, frame: object) -> str:
+    """`frame` if it can be the name of a coordinate frame, known or not; raises GeometryError."""
+    if not isinstance(frame, str) or not frame:
+        raise GeometryError(f"{name}: expected the name of a frame, such as 'world', 'ego' or 'lidar', found {frame!r}")
+    return frame
+
+
+def flip_points(points: ArrayLike) -> FloatArray:
+    """Points or vectors (…, 3) in the other handedness: y changes its sign."""
+    return as_floats(as_floats(points) * _S)
+
+
+def flip_vectors2(vectors: ArrayLike) -> FloatArray:
+    """Horizontal vectors (…, 2), such as a label's velocity, in the other handedness."""
+    return as_floats(as_floats(vectors) * _S[:2])
+
+
+def flip_yaw(yaw: ArrayLike) -> FloatArray:
+    """Angles about z (…), radians, in the other handedness."""
+    return -as_floats(yaw)
+
+
+def flip_pose(pose: ArrayLike) -> FloatArray:
+    """Transforms (…, 4, 4) between two frames in the other handedness: S4·T·S4."""
+    return as_floats(as_floats(pose) * np.outer(_S4, _S4))
+
+
+def flip_six_vector(six: ArrayLike) -> FloatArray:
+    """Poses (…, 6) as (tx, ty, tz, rx, ry, rz), docs/released_code.md, Poses, in the other handedness."""
+    return as_floats(as_floats(six) * _SIX)
+
+
+def camera_from_lidar(lidar_to_cam: ArrayLike) -> FloatArray:
+    """CARLA's `lidar_to_<Camera>` (…, 4, 4) → right-handed LiDAR to optical camera: Q·S·T·S."""
+    flipped = as_floats(lidar_to_cam) * _S4
+    result = flipped.copy()
+    result[..., :3, :] = _OPTICAL_FROM_RAW @ flipped[..., :3, :]
+    return as_floats(result)
+
+
+def camera_from_lidar_to_raw(camera_from_lidar: ArrayLike) -> FloatArray:
+    """The inverse of `camera_from_lidar`: CARLA's `lidar_to_<Camera>` (…, 4, 4)."""
+    flipped = as_floats(camera_from_lidar) * _S4
+    result = flipped.copy()
+    result[..., :3, :] = _OPTICAL_FROM_RAW.T @ flipped[..., :3, :]
+    return as_floats(result)
+
+
+def intrinsic(raw_intrinsic: ArrayLike) -> FloatArray:
+    """CARLA's permuted intrinsic (…, 3, 3) → the usual K = [[f, 0, cx], [0, f, cy], [0, 0, 1]]."""
+    return as_floats(as_floats(raw_intrinsic) @ _OPTICAL_FROM_RAW.T)
+
+
+def intrinsic_to_raw(intrinsic: ArrayLike) -> FloatArray:
+    """The inverse of `intrinsic`: K (…, 3, 3) for CARLA's camera axes (x depth, y right, z up)."""
+    return as_floats(as_floats(intrinsic) @ _OPTICAL_FROM_RAW)
+
+
+def six_vectors_of(matrix: ArrayLike) -> FloatArray:
+    """Rigid matrices (…, 4, 4) → 6-vectors (…, 6), metres and radians in [−π, π]. Raises GeometryError."""
+    m = as_floats(matrix)
+    if m.shape[-2:] != (4, 4):
+        raise GeometryError(f"matrix: expected shape (…, 4, 4), found {m.shape}")
+    m12, m22 = m[..., 1, 2], m[..., 2, 2]
+    rx = np.arctan2(-m12, m22)
+    ry = np.arctan2(m[..., 0, 2], np.hypot(m12, m22))
+    rz = np.arctan2(-m[..., 0, 1], m[..., 0, 0])
+    return np.concatenate([m[..., :3, 3], np.stack([rx, ry, rz], axis=-1)], axis=-1)
+
+
+def matrices_of_six(six: ArrayLike) -> FloatArray:
+    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4); all angles are allowed. Raises GeometryError."""
+    vector = as_floats(six)
+    if vector.shape[-1:] != (6,):
+        raise GeometryError(f"six: expected shape (…, 6), found {vector.shape}")
+    cosines, sines = np.cos(vector[..., 3:]), np.sin(vector[..., 3:])
+    cx, cy, cz = (cosines[..., axis] for axis in range(3))
+    sx, sy, sz = (sines[..., axis] for axis in range(3))
+    result = np.zeros((*vector.shape[:-1], 4, 4))
+    rows = [
+        [cy * cz, -cy * sz, sy],
+        [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy],
+        [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
+    ]
+    result[..., :3, :3] = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    result[..., :3, 3] = vector[..., :3]
+    result[..., 3, 3] = 1
+    return result
+
+
+def stored_transforms(numbers: FloatArray) -> FloatArray:
+    """Transforms stored as 12 or 16 numbers, (…, 12 or 16), as a new array (…, 4, 4) whose last row is exact."""
+    transforms = np.empty((*numbers.shape[:-1], 4, 4))
+    transforms[..., :3, :] = numbers[..., :12].reshape(*numbers.shape[:-1], 3, 4)
+    transforms[..., 3, :] = LAST_ROW
+    return transforms
+
+
+def inverses(matrix: AnyArray) -> AnyArray:
+    """The inverses of transforms (…, 4, 4), right for slightly wrong rotations too; raises GeometryError.
+
+    To transpose a rotation with an error of 1e-3 would move a point 600 m away by 60 cm.
+    """
+    result = np.zeros_like(matrix)
+    try:
+        result[..., :3, :3] = turned_back = np.linalg.inv(matrix[..., :3, :3])
+    except np.linalg.LinAlgError:
+        raise GeometryError("a transform has no inverse: its rotation is no rotation") from None
+    result[..., :3, 3] = -(turned_back @ matrix[..., :3, 3, None])[..., 0]
+    result[..., 3, 3] = 1
+    return result
