@@ -19,11 +19,20 @@ import numpy as np
 
 from deepaccident_devkit.errors import LabelError, shortened
 from deepaccident_devkit.geometry import Boxes, handedness, quaternions
-from deepaccident_devkit.release._content import LARGEST, in_range, integer_of, number_of, read_content
-from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, readonly
+from deepaccident_devkit.release.store import ReleasePath, read_content
+from deepaccident_devkit.support.arrays import (
+    LARGEST,
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    ShortRepr,
+    in_range,
+    readonly,
+)
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import LIMITS_VARIABLE, limit_of
+from deepaccident_devkit.support.text import integer_of, number_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 

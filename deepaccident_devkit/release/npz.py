@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from deepaccident_devkit.errors import MOST_TOLD, SensorFileError, shortened
 from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.handedness import flip_points
-from deepaccident_devkit.release._content import REMEDY, in_range, read_content
-from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content
 from deepaccident_devkit.support.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_member
-from deepaccident_devkit.support.arrays import AnyArray, ByteArray, ShortRepr, checked, readonly
+from deepaccident_devkit.support.arrays import AnyArray, ByteArray, ShortRepr, checked, in_range, readonly
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import FileKind, fault_text
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE

@@ -22,6 +22,8 @@ AnyArray = NDArray[Any]
 _FLOAT64: Final = np.dtype(np.float64)
 _NUMBERS: Final = "biuf"
 """Kinds of element types."""
+LARGEST: Final = 1e9
+"""Metres, m/s, pixels, …: a larger number in a file is damage and counts as infinite; squares would overflow."""
 _LONGEST_FIELDS: Final = 160
 _LONGEST_VALUE: Final = 80
 _FEW: Final = 4
@@ -181,6 +183,12 @@ def as_floats(values: ArrayLike) -> FloatArray:
         return given.astype(_FLOAT64)
     except (TypeError, ValueError) as error:
         raise GeometryError(f"expected numbers, found {type(values).__name__} ({error})") from error
+
+
+def in_range(numbers: AnyArray | float) -> BoolArray:
+    """Which numbers are neither NaN nor infinite, nor as large as no sound file has them."""
+    small: BoolArray = np.abs(numbers) <= np.float64(LARGEST)  # half precision has no 1e9
+    return small
 
 
 def known(values: ArrayLike | None, digits: int | None = None) -> Any:

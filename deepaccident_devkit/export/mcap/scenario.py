@@ -48,7 +48,7 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion.config import label_config
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.images import read_jpeg
-from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.roles import role_colors

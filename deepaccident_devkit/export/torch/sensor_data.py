@@ -14,7 +14,7 @@ from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.torch.config import V2XConfig, augmented_points, augmented_pose
 from deepaccident_devkit.motion import Augmentation
-from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import LIDAR, AgentName
