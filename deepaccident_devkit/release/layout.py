@@ -142,7 +142,7 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
     return ReleaseLayout(
         root=root,
         version=version,
-        layout="+".join(sorted({"B" if folder else "A" for folder in folders})),
+        layout="+".join(["A"] * ("" in folders) + ["B"] * any(folders)),
         scenarios=tuple(sorted(scenarios, key=attrgetter("token", "folder"))),
         split_files=_split_files(root),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from numbers import Real
 from typing import Any, Final
@@ -71,6 +71,32 @@ class FrozenArrays(ShortRepr):
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies go without `__init__`, since what they hold was checked."""
         return _restored, (type(self), {name: getattr(self, name) for name in _field_names(type(self))})
+
+
+class BitView(Sequence[bool]):
+    """A bool column as Arrow packs it, eight rows a byte; rows are unpacked when asked for."""
+
+    def __init__(self, packed: ByteArray, length: int) -> None:
+        """View `length` bits, lowest first."""
+        self._packed, self._length = packed, length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __iter__(self) -> Iterator[bool]:
+        return iter(self[:].tolist())
+
+    def __getitem__(self, rows: Any) -> Any:
+        """One row as bool, or a slice with step 1 as a new bool array."""
+        if isinstance(rows, slice):
+            start, stop, _ = rows.indices(self._length)
+            return self._unpacked(start, max(start, stop))
+        return bool(self._packed.item(rows >> 3) >> (rows & 7) & 1)
+
+    def _unpacked(self, start: int, stop: int) -> BoolArray:
+        window = self._packed[start >> 3 : (stop + 7) >> 3]
+        first = start & 7
+        return np.unpackbits(window, bitorder="little")[first : first + stop - start].view(np.bool_)
 
 
 def checked(

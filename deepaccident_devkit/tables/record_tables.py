@@ -18,7 +18,7 @@ from deepaccident_devkit.tables.tokens import ACTOR
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.tables.opened import OpenTables
+    from deepaccident_devkit.tables.tables import OpenTables
 
 
 class RecordTables:

@@ -12,8 +12,8 @@ from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.store import Entry, ReleasePath, listed
 from deepaccident_devkit.support.reading import LIMITS_VARIABLE
 from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.tables.boxes import VelocityFit, total_fit
 from deepaccident_devkit.tables.scan import times_digest
-from deepaccident_devkit.tables.velocities import VelocityFit, total_fit
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
 from deepaccident_devkit.validation.completeness import FileCount
 

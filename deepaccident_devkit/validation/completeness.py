@@ -16,8 +16,8 @@ from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import columns_text, counted, size_text
+from deepaccident_devkit.tables.indexing import assign_splits
 from deepaccident_devkit.tables.scan import ENDINGS
-from deepaccident_devkit.tables.split_assignment import assign_splits
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,

@@ -21,7 +21,7 @@ from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.support.reading import FileKind, read_bytes
 from deepaccident_devkit.tables import Finding
-from deepaccident_devkit.tables.findings import finding_of
+from deepaccident_devkit.tables.scan import finding_of
 from deepaccident_devkit.taxonomy import (
     BEV_CAMERA,
     BEV_RESOLUTION,

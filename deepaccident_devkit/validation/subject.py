@@ -13,8 +13,8 @@ from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, 
 from deepaccident_devkit.tables import Finding, displacement_velocities
 from deepaccident_devkit.tables import boxes as box_rules
 from deepaccident_devkit.tables.boxes import ScenarioBoxes
-from deepaccident_devkit.tables.build import ScenarioFiles, scenario_boxes
-from deepaccident_devkit.tables.scan import frame_ranges
+from deepaccident_devkit.tables.build import scenario_boxes
+from deepaccident_devkit.tables.scan import ScenarioFiles, frame_ranges
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
 from deepaccident_devkit.validation.codes import CODES
 

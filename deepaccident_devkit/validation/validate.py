@@ -21,9 +21,8 @@ from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.tables import SEVERITIES, Finding
-from deepaccident_devkit.tables.build import read_scenario
-from deepaccident_devkit.tables.scan import scan_scenario
-from deepaccident_devkit.tables.velocities import VelocityFit, fit_velocities, total_fit
+from deepaccident_devkit.tables.boxes import VelocityFit, fit_velocities, total_fit
+from deepaccident_devkit.tables.scan import read_scenario, scan_scenario
 from deepaccident_devkit.taxonomy import VELOCITY_FRAMES
 from deepaccident_devkit.validation.agreement import check_agreement, check_story
 from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, check_key
