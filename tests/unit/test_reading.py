@@ -124,7 +124,7 @@ NOT_OF_STRANGERS = {
     "explore/pages/scenarios.py": "the split file that was written a line before",
     "explore/pages/answers.py": "the package's own styles and scripts",
     "explore/serving.py": "a browser",
-    "export/questions/format.py": "the parts that the export wrote",
+    "export/questions/questions.py": "the parts that the export wrote",
     "support/pages.py": "the package's own templates",
     "parallel/store.py": "locks, of which nothing is believed",
     "release/images.py": "the head of an image that the gate opened",

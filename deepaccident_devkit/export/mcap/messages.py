@@ -34,7 +34,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.export.mcap.config import EPOCH
+from deepaccident_devkit.export.mcap import EPOCH
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.render.boxes import EDGES
 from deepaccident_devkit.render.roles import recorders_of

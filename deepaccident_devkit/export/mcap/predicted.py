@@ -13,7 +13,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results import Prediction, Results
-from deepaccident_devkit.export.mcap.config import Predictions
+from deepaccident_devkit.export.mcap import Predictions
 from deepaccident_devkit.export.mcap.messages import (
     COLORED_POINT,
     Moment,

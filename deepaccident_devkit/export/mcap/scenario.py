@@ -20,7 +20,7 @@ from tqdm import tqdm
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.export.mcap.config import EXPORTED_CHANNELS, McapConfig, Predictions
+from deepaccident_devkit.export.mcap import EXPORTED_CHANNELS, McapConfig, Predictions
 from deepaccident_devkit.export.mcap.messages import (
     Moment,
     Recording,

@@ -27,7 +27,7 @@ from deepaccident_devkit.evaluation.results.entries import (
 )
 from deepaccident_devkit.evaluation.results.header import ContentError, at, shown
 from deepaccident_devkit.evaluation.results.records import FORMAT, BoxEntry
-from deepaccident_devkit.export.keyframes import KEY_STEP
+from deepaccident_devkit.export.frames import KEY_STEP
 from deepaccident_devkit.export.nuscenes.scenes import token
 from deepaccident_devkit.support.files import path_of
 from deepaccident_devkit.support.json_text import parsed_json

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.export.keyframes import keyframe_after, keyframes
-from deepaccident_devkit.export.sensor_files import sensor_files, stored_camera
+from deepaccident_devkit.export.frames import keyframe_after, keyframes, sensor_files, stored_camera
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.keyframes import KEY_STEP
+from deepaccident_devkit.export.frames import KEY_STEP
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.support.arrays import (

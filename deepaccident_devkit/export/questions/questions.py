@@ -15,6 +15,8 @@ import numpy as np
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation.accident import box_truth
 from deepaccident_devkit.export.bulk import Format, Output, Unit
+from deepaccident_devkit.export.frames import sensor_files
+from deepaccident_devkit.export.questions.answers import answer_schema, readme
 from deepaccident_devkit.export.questions.observed import (
     RATE,
     Observations,
@@ -25,8 +27,6 @@ from deepaccident_devkit.export.questions.observed import (
     names_of,
     question_facts,
 )
-from deepaccident_devkit.export.questions.texts import answer_schema, readme
-from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import read_bytes

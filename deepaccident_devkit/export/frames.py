@@ -1,6 +1,8 @@
-"""The sensor files of a recording that are there, with their sizes, by one look into their folder."""
+"""The frames of a recording that formats take: keyframes, two a second counted back from its end; and their files."""
 
 from __future__ import annotations
+
+from typing import Final
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import PinholeCamera
@@ -9,6 +11,19 @@ from deepaccident_devkit.release.layout import frame_sizes
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CHANNEL_FORMAT
+
+KEY_STEP: Final = 5
+"""Recorded frames from one keyframe to the next."""
+
+
+def keyframes(last: int) -> range:
+    """The numbers of a recording's keyframes; frames are counted from 1 to `last`."""
+    return range((last - 1) % KEY_STEP + 1, last + 1, KEY_STEP)
+
+
+def keyframe_after(number: int, last: int) -> int:
+    """The keyframe that a frame leads to: itself, or the next one."""
+    return number + (last - number) % KEY_STEP
 
 
 def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> dict[int, tuple[ReleasePath, int]]:
