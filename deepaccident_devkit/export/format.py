@@ -287,13 +287,7 @@ def flat_name(token: str) -> str:
 
 
 def shards(dataset: Dataset, sizes: Mapping[str, int], limit: int) -> dict[str, list[tuple[str, ...]]]:
-    """Name of a split → its shards: consecutive scenarios up to the limit, but at least one.
-
-    Args:
-        dataset: the release.
-        sizes: scenario, by token → its size.
-        limit: size of a shard.
-    """
+    """Name of a split → its shards: consecutive scenarios, sizes up to the limit, but at least one scenario."""
     found: dict[str, list[tuple[str, ...]]] = {name: [] for name in SPLIT_NAMES.values()}
     room = dict.fromkeys(found, 0)
     for scenario, size in sizes.items():

@@ -79,11 +79,7 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
 
 
 def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, ScenarioFolder]:
-    """Where some scenarios' files lie, by token in order; those that are not in the release are left out.
-
-    Raises:
-        DatarootError: the release's folder is gone, or one of its folders cannot be listed.
-    """
+    """Where some scenarios' files lie, by token in order, if they are in the release; raises DatarootError."""
     folders = {each.token: each for each in reversed(find_release(dataset.dataroot, dataset.version).scenarios)}
     return {token: folders[token] for token in sorted(set(scenarios)) if token in folders}
 
@@ -104,11 +100,7 @@ def folder_hashes(scenario: ScenarioFolder) -> ScenarioHashes:
 
 
 def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) -> str:
-    """A hash of the frames and sizes of a scenario's sensor files of some agents and channels; folders are only listed.
-
-    Raises:
-        DatarootError: one of its folders cannot be listed.
-    """
+    """A hash of frames and sizes of sensor files of a scenario's agents and channels; folders are only listed."""
     sizes = [
         (agent, channel, list(frame_sizes(scenario.kind_folder(agent, channel), CHANNEL_FORMAT[channel]).items()))
         for agent, channel in sensors

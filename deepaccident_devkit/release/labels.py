@@ -165,10 +165,7 @@ def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
 
 
 def read_lone_words(path: ReleasePath) -> list[tuple[int, str, bool]]:
-    """The lines of one label file that are skipped since they have one word, as its reference reader skips them.
-
-    Returns:
-        The number of each line, its word, and whether the file ends within it.
+    """The lines of a label that are skipped since they have one word: number, word, whether the file ends within it.
 
     Raises as `read_label` does, if the file cannot be read.
     """

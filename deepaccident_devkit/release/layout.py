@@ -161,10 +161,7 @@ def _version_remedy(version: object) -> str:
 def frame_numbers(folder: ReleasePath, ending: str) -> tuple[list[int], list[str]]:
     """The frame numbers of a folder's files, ascending, and the names with that ending but without a frame number.
 
-    A folder that is not there has none.
-
-    Raises:
-        DatarootError: it cannot be listed: a file in its place, no permission.
+    A folder that is not there has none; one that cannot be listed, or a file in its place, raises DatarootError.
     """
     frames, odd = [], []
     for number, entry in _frame_entries(folder, _entries(folder), ending):
@@ -176,12 +173,9 @@ def frame_numbers(folder: ReleasePath, ending: str) -> tuple[list[int], list[str
 
 
 def frame_sizes(folder: ReleasePath, ending: str) -> dict[int, int]:
-    """Frame number → bytes of a folder's files of frames, ascending, by one look into it.
+    """Frame number → bytes of a folder's files of frames, ascending, by one look into it; raises DatarootError.
 
     A folder that is not there, or with a file in its place, has none; a link to nothing is no file.
-
-    Raises:
-        DatarootError: it cannot be listed.
     """
     sizes = {}
     for number, entry in _frame_entries(folder, _entries(folder, files=True), ending):
@@ -226,9 +220,8 @@ def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[ReleasePath, st
 def left_aside(root: ReleasePath) -> Iterator[tuple[ReleasePath, str | None]]:
     """What lies in a release and is not read, though it looks as if it should be.
 
-    Returns:
-        Each folder with a name that only looks like one of the release (downloads are unpacked beside each other as
-        `… (1)`, `…-001`), and what it looks like; each link that leads nowhere or back, and None.
+    Each folder with a name that only looks like one of the release (downloads are unpacked beside each other as `…
+    (1)`, `…-001`), and what it looks like; each link that leads nowhere or back, and None.
     """
     splits = [root / name for name in _subfolders(root) if name in _ABOVE_TYPES]
     yield from _aside_in(root, (SCENARIO_TYPE.pattern, *_ABOVE_TYPES))

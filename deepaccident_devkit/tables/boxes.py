@@ -122,13 +122,10 @@ def instances(boxes: ScenarioBoxes) -> tuple[Mapping[str, AnyArray], AnyArray]:
 
 
 def tracks(boxes: ScenarioBoxes, instance_row: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Which box stands for each actor at each frame, ordered by frame and instance, and who annotated it.
+    """Which box (M,) stands for each actor at each frame, by frame and instance; (M,) bit masks of who annotated it.
 
     The box of the first agent in order that saw the actor from outside. An agent's own row counts only if nobody else
     annotated it, since it lies up to 0.3 m from where the others see it.
-
-    Returns:
-        (M,) rows of the chosen boxes; (M,) uint8 bit masks over `taxonomy.AGENTS`.
     """
     known = np.flatnonzero(instance_row != NULL_INTEGER)
     own = boxes.labels.actor_id[known] == OWN_ACTOR_ID
@@ -269,14 +266,10 @@ def velocities_that_fit(boxes: ScenarioBoxes, displacement: FloatArray) -> tuple
 
 
 def decoded_velocities(boxes: ScenarioBoxes, displacement: FloatArray, frame: str | None) -> FloatArray:
-    """(N, 3) m/s in world: the labels' own velocities where they have any, the displacements (N, 3) elsewhere.
+    """(N, 3) m/s in world: the labels' own, which are in `frame`, where they have any; else the displacements (N, 3).
 
-    A label has no vertical velocity: it is taken from the displacement, and is 0 without one.
-
-    Args:
-        boxes: the boxes.
-        displacement: of each, as of `displacement_velocities`.
-        frame: what the labels' velocities are in; None for the release's own way.
+    A label has no vertical velocity: it is taken from the displacement, and is 0 without one. None for the frame is the
+    release's own way.
     """
     over_ground = turned(boxes.labels.velocity, _angles(boxes)[frame or RELEASED_VELOCITY_FRAME])
     own = boxes.labels.actor_id == OWN_ACTOR_ID

@@ -244,13 +244,9 @@ def _time_of_day_code(meta: Meta | None) -> int:
 
 
 def accident_type(meta: Meta | None, *, signalized: bool) -> int | None:
-    """Which of the paper's designs 1 to 12 an accident realises (docs/format.md, Accident types).
+    """Which of the paper's designs an accident realises: 1 to 6 where there are lights, else 7 to 12 (docs/format.md).
 
     None for no accident, one with a pedestrian or a third vehicle, or of no design.
-
-    Args:
-        meta: the scenario's meta, None if it is missing.
-        signalized: whether the intersection has traffic lights: designs 1 to 6, else 7 to 12.
     """
     if meta is None or meta.collision is None or "pedestrian" in meta.collision.classes:
         return None
@@ -334,16 +330,7 @@ def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: in
 
 
 def _calibrated_sensor_rows(values: FloatArray, agents: int, frames: int) -> tuple[Columns, IntArray]:
-    """The distinct values of every agent's sensors, by agent, channel, first occurrence; and each file's row.
-
-    Args:
-        values: as of `_sensor_values`.
-        agents: how many.
-        frames: of each.
-
-    Returns:
-        The columns; (samples, channels) rows of them.
-    """
+    """The distinct values of each agent's sensors by first occurrence; (samples, channels) which of them each is."""
     row_of = np.zeros(values.shape[:2], dtype=np.int64)
     chosen: list[FloatArray] = []
     keys: list[tuple[int, int, int]] = []

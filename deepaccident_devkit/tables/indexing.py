@@ -137,13 +137,7 @@ class Outcome:
 
 
 def index_scenario(store: Store, scenario: ScenarioFolder, *, check_files: bool = False) -> Outcome:
-    """Keep the rows of one scenario, unless they are kept and its files are as they were.
-
-    Args:
-        store: where.
-        scenario: which.
-        check_files: compare the contents of its files; else their sizes and times alone.
-    """
+    """Keep the rows of one scenario, unless they are kept and its files have the same times, or contents."""
     key = f"{SCHEMA_VERSION}:{times_digest(scenario)}"  # before anything is read: a later edit is noticed
     token, scan = scenario.token, scan_scenario(scenario)
     if not scan.agents and not scan.problems:
@@ -190,16 +184,9 @@ def rows_to_keep(tables: Mapping[str, Columns], contents: str) -> bytes:
 
 
 def join_tables(folder: Path, scenarios: Sequence[Path], splits: Sequence[str | None]) -> None:
-    """Write every table to `folder`, which must exist: row keys count on, scenario after scenario.
+    """Write every table to a folder: row keys count on, scenario after scenario, whose kept rows and splits are given.
 
-    Args:
-        folder: where the tables go.
-        scenarios: the kept rows of each, in the order that they shall have.
-        splits: each scenario's split, None if unknown.
-
-    Raises:
-        OSError: something cannot be read or written.
-        IndexStoreError: a file holds no rows of a scenario.
+    Raises OSError, and IndexStoreError if a file holds no rows of a scenario.
     """
     specs = table_specs()
     with ExitStack() as stack:

@@ -223,12 +223,7 @@ def times_digest(scenario: ScenarioFolder) -> str:
 
 
 def contents_digest(scenario: ScenarioFolder, known: Mapping[str, bytes] | None = None) -> str:
-    """A digest of name and content of every label, calib and meta file of a scenario.
-
-    Args:
-        scenario: where they lie.
-        known: path → `content_words` of files that were read already; the others are read now.
-    """
+    """A digest of names and contents of a scenario's small files; of those read already, `content_words` are given."""
     found = known or {}
     return _digest(scenario, lambda path, kind: found.get(str(path)) or _words_of_file(path, kind))
 

@@ -169,12 +169,7 @@ def streams_metadata(content: bytes) -> dict[str, str]:
 
 
 def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]] | None:
-    """Of each table stored column → its values, as `streams` took them; None if they are not of these tables.
-
-    Args:
-        source: an Arrow file or bytes in an Arrow reader, at the first stream.
-        specs: the tables, in their order.
-    """
+    """Of each table stored column → values, as `streams` took them; None if they are not of these tables."""
     import pyarrow as pa
 
     tables = []

@@ -176,10 +176,9 @@ def subject_of(files: ScenarioFiles) -> Subject:
 
 
 def near_pairs(places: FloatArray, moments: AnyArray, radius: float) -> tuple[IntArray, BoolArray]:
-    """Which places (M, 3) of a moment (M,) are no further apart than `radius`.
+    """Pairs (P, 2) of places (M, 3) of a moment (M,) within `radius`; and (M,) which are in crowds, and in no pair.
 
-    Returns:
-        (P, 2) pairs of them; (M,) those in crowds, which are in no pair: pairs of many at one place would have no end.
+    Pairs of many at one place would have no end.
     """
     from scipy.spatial import cKDTree
 

@@ -158,12 +158,7 @@ def moment_of(scenario: str, index: int, agents: tuple[str, ...]) -> Moment:
 
 
 def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[str, ...]:
-    """The agents that an `agents=` argument means, in the order of `taxonomy.AGENTS`.
-
-    Raises:
-        ChoiceError: no such agent or configuration, or no agent is given.
-        NotAvailableError: an agent is not in this (partial) release of the scenario.
-    """
+    """The agents that an `agents=` argument means, in usual order; raises ChoiceError and NotAvailableError."""
     first = agents_of(dataset, scenario)[0]
     chosen = cooperating_agents(dataset, sample_token(scenario, first, 1), agents)
     return tuple(agent for agent in AGENTS if agent in chosen)

@@ -111,8 +111,7 @@ def _read(document: object, ours: Mapping[str, str]) -> NuScenesDetections:
 def _take_our_classes(results: dict[str, Any]) -> dict[str, dict[int, str]]:
     """Give boxes our classes, those of other classes any, and null for a velocity of NaN; what is wrong stays.
 
-    Returns:
-        Token → number of each box that is to be left out, and its class.
+    Returns, by token, the number of each box that is to be left out, and its class.
     """
     left_out: dict[str, dict[int, str]] = {}
     for theirs, given in results.items():

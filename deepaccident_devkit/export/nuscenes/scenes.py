@@ -82,12 +82,9 @@ def scene_name(scenario: str, agent: str) -> str:
 
 
 def timestamp(scenario_row: int, agent: str, number: int) -> int:
-    """Microseconds of a frame; the devkit of nuScenes sorts scenes by their first one, so no two are the same.
+    """Microseconds of a frame (from 1); no two scenes begin at the same, since the devkit of nuScenes sorts them by it.
 
-    Args:
-        scenario_row: of the scenario table, which gets an hour of its own.
-        agent: who recorded it; agents are a microsecond apart.
-        number: of the frame, from 1.
+    Each scenario, by its row, has an hour of its own, and agents are a microsecond apart.
     """
     return _EPOCH + (scenario_row + 1) * _HOUR + number * _PERIOD + AGENTS.index(agent)
 
@@ -306,9 +303,6 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
 
     Files that are missing in a partial release have rows too, as those of a partial nuScenes download: evaluations look
     up every keyframe's `LIDAR_TOP`, but open no cloud. A missing image has the size of the camera's first one.
-
-    Raises:
-        SensorFileError: a file cannot be read.
     """
     data: list[Row] = []
     calibrated: dict[str, Row] = {}

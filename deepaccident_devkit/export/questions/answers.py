@@ -80,14 +80,7 @@ _TWO: Final = msgspec.Meta(min_length=2, max_length=2)
 
 
 def readme(*, seconds: int, observe: float, seen: str, pictures: bool) -> bytes:
-    """The README.md for those who answer.
-
-    Args:
-        seconds: that are asked about.
-        observe: seconds of a window.
-        seen: what counts as seen.
-        pictures: whether there are pictures.
-    """
+    """The README.md for those who answer: seconds that are asked about, of a window, what counts as seen, pictures."""
     sure = 2 if seconds > 1 else 1
     example = {
         "id": "0123456789abcdef",

@@ -207,17 +207,10 @@ def source_of(base: str) -> Source:
 
 
 def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
-    """The files of a release that an archive holds; only its directory is read.
+    """The files of a release in an archive of `size` bytes, which errors show as `shown`; only its directory is read.
 
-    Args:
-        file: the archive.
-        archive: its path from the store's place: the folders on it and its name without `.zip` count as folders that
-            lead to the members.
-        shown: the archive in errors.
-        size: its bytes.
-
-    Raises:
-        DatarootError: it is no zip, truncated or damaged, or a member is encrypted or compressed by an unknown method.
+    `archive` is its path from the store's place: the folders on it and its name without `.zip` count as folders that
+    lead to the members. Raises DatarootError, also for a member that is encrypted or compressed by an unknown method.
     """
     try:
         check_end(file, limit_of("archive"))
@@ -251,11 +244,7 @@ def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
 
 
 def member_bytes(content: bytes, member: Member) -> bytes:
-    """The bytes of a member of an archive, from those that are stored; checksums are not compared.
-
-    Raises:
-        RefusedFileError: they do not decode to as many bytes as the archive says.
-    """
+    """The bytes of a member, from those that are stored; checksums are not compared. Raises RefusedFileError."""
     if member.deflated:
         decoder = zlib.decompressobj(-zlib.MAX_WBITS)
         try:

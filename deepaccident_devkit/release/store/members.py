@@ -191,12 +191,7 @@ class Members:
 
 
 def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, tuple[int, str]]) -> None:
-    """Write the list of the files of some archives, whose `Members.states` are these.
-
-    Raises:
-        DatarootError: a file is in two archives, or twice in one.
-        OSError: it cannot be written.
-    """
+    """Write the list of some archives' files; raises DatarootError for a file that is in it twice."""
     import pyarrow as pa
 
     folders = sorted({folder for listing in listings for folder in listing.folders})

@@ -171,12 +171,7 @@ Entry: TypeAlias = os.DirEntry[str] | StoreEntry
 
 
 def listed(folder: ReleasePath) -> list[Entry]:
-    """What lies in a folder, in no order.
-
-    Raises:
-        FileNotFoundError: there is no such folder.
-        OSError: it cannot be listed.
-    """
+    """What lies in a folder, in no order; raises OSError, FileNotFoundError and NotADirectoryError among them."""
     if isinstance(folder, Path):
         with os.scandir(folder) as entries:
             return list(entries)
@@ -226,11 +221,7 @@ def _fetched(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
 
 @contextmanager
 def fetched(paths: Iterable[ReleasePath]) -> Iterator[None]:
-    """Have small files read together if they are at a URL; in the block, in this thread, they are read from memory.
-
-    Raises:
-        DatarootError: the URL cannot be read.
-    """
+    """Have small files at a URL read together, and from memory in the block and thread; raises DatarootError."""
     remote = [path for path in paths if isinstance(path, StorePath) and path.store.is_remote]
     token = READ_BEFORE.set(_fetched(remote))
     try:

@@ -66,11 +66,7 @@ class FileCache:
         return cls(place.absolute(), most)
 
     def path_of(self, identity: str, name: str) -> Path:
-        """Where the copy of a file lies if it is there: `identity` tells it from all others, `name` is its own.
-
-        Raises:
-            OutputFolderError: it lies behind a link, which somebody put into the folder.
-        """
+        """Where the copy of a file would lie, of which `identity` is the only one; raises OutputFolderError."""
         digest = hashlib.blake2b(identity.encode(errors="surrogateescape"), digest_size=16).hexdigest()
         return place_in(self.folder, f"{digest[:2]}/{digest[2:]}/{name}", opened=True)
 
@@ -85,11 +81,7 @@ class FileCache:
         return True
 
     def put(self, path: Path, content: bytes) -> None:
-        """Keep a copy.
-
-        Raises:
-            OSError: there is no room, or it cannot be written to; the message names the folder and the remedy.
-        """
+        """Keep a copy; raises OSError if there is no room, which names the folder and the remedy."""
         try:
             self._make_room(len(content))
             write_bytes(path, content)
@@ -165,12 +157,9 @@ class Store:
         return (self.list_file,) if self.is_remote else (Path(self.place), self.list_file)
 
     def read(self, name: str, kind: FileKind) -> bytes:
-        """A file's bytes; of a URL, sensor files are kept in the user's cache (`cache.FileCache`).
+        """A file's bytes; of a URL, sensor files are kept in the user's cache (`FileCache`).
 
-        Raises:
-            FileNotFoundError: there is no such file.
-            RefusedFileError: it is too large for its kind, or damaged.
-            OSError: it cannot be read, or there is no room in the cache.
+        Raises FileNotFoundError, RefusedFileError if it is too large for its kind or damaged, or any other OSError.
         """
         if (known := READ_BEFORE.get()) is not None and name in known:
             return known[name]
@@ -184,10 +173,7 @@ class Store:
     def local_path(self, name: str) -> Path:
         """A real path of a file's bytes, in the user's cache; it may be gone when that is full of newer ones.
 
-        Raises:
-            MissingFileError: there is no such file.
-            SensorFileError: it cannot be read, or there is no room in the cache.
-            ConfigError: the environment names a wrong size of the cache.
+        Raises MissingFileError, SensorFileError, or ConfigError if the environment names a wrong size of the cache.
         """
         try:
             return self._kept(name, self._member(name))
@@ -197,12 +183,7 @@ class Store:
             raise SensorFileError(f"{self.place}/{name}: {fault_text(error)}") from error
 
     def fetch(self, names: Iterable[str]) -> dict[str, bytes]:
-        """Small files by name, read together; those that are not there, or are damaged, are left out.
-
-        Raises:
-            FileNotFoundError: an archive or a file is gone.
-            OSError: nothing can be read.
-        """
+        """Small files by name, read together, without those that are not there or damaged; raises OSError."""
         wanted = [(name, member) for name in names if (member := self.members.find(name)) is not None]
         if not wanted:
             return {}
