@@ -10,10 +10,10 @@ from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Calibs, Meta
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.tables import boxes as box_rules
+from deepaccident_devkit.tables.arrow_files import Columns
 from deepaccident_devkit.tables.boxes import ScenarioBoxes, decoded_velocities, displacement_velocities, fit_velocities
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.tables.scan import ScenarioFiles
-from deepaccident_devkit.tables.store import Columns
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,

@@ -17,6 +17,14 @@ from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta, read_split_file
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.reading import observed
+from deepaccident_devkit.tables.arrow_files import (
+    Columns,
+    TableWriter,
+    read_streams,
+    streams,
+    streams_metadata,
+    write_table,
+)
 from deepaccident_devkit.tables.build import scenario_rows, sensor_rows
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec
 from deepaccident_devkit.tables.records import table_specs
@@ -30,7 +38,6 @@ from deepaccident_devkit.tables.scan import (
     scan_scenario,
     times_digest,
 )
-from deepaccident_devkit.tables.store import Columns, TableWriter, read_streams, streams, streams_metadata, write_table
 from deepaccident_devkit.taxonomy import CATEGORIES, MINI_SPLITS, SPLITS
 
 SCHEMA_VERSION = 4

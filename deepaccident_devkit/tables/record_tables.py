@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.tables.arrow_files import damaged_value
 from deepaccident_devkit.tables.columns import Choice, Column, Key, Struct, Subset, Vector
 from deepaccident_devkit.tables.records import table_spec
-from deepaccident_devkit.tables.store import damaged_value
 from deepaccident_devkit.tables.tokens import ACTOR
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from deepaccident_devkit.tables.arrow_files import arrow_type
 from deepaccident_devkit.tables.columns import (
     Choice,
     Column,
@@ -18,7 +19,6 @@ from deepaccident_devkit.tables.columns import (
     Word,
 )
 from deepaccident_devkit.tables.records import record_columns, table_specs
-from deepaccident_devkit.tables.store import arrow_type
 from deepaccident_devkit.tables.tokens import FORMS
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -24,10 +24,10 @@ from deepaccident_devkit.release.store import ReleasePath, places_of
 from deepaccident_devkit.support.files import path_of
 from deepaccident_devkit.support.nuscenes_names import field_remedy
 from deepaccident_devkit.support.text import choice, meant_text, spelled
+from deepaccident_devkit.tables.arrow_files import REMEDY, StoredTable, damaged_value
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.index import Problem
 from deepaccident_devkit.tables.records import table_spec, table_specs
-from deepaccident_devkit.tables.store import REMEDY, StoredTable, damaged_value
 from deepaccident_devkit.tables.tokens import Resolver
 from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS, OnError
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.support.text import meant_text
-from deepaccident_devkit.tables.store import damaged_value
+from deepaccident_devkit.tables.arrow_files import damaged_value
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 
 ACTOR = "actor"
@@ -90,10 +90,10 @@ class Resolver:
         self._first_frame: list[int] = scenario["first_frame_row"].tolist()
         self._first_sample: list[int] = agent["first_sample_row"].tolist()
         self._agents: list[dict[str, int]] = [{} for _ in self.scenario_tokens]
-        self._agent_tokens: list[str] = []
-        for scenario_row, code in zip(agent["scenario_row"].tolist(), agent["name"].tolist(), strict=True):
-            self._agents[scenario_row][AGENTS[code]] = len(self._agent_tokens)
-            self._agent_tokens.append(f"{self.scenario_tokens[scenario_row]}/{AGENTS[code]}")
+        self._agent_scenario: list[int] = agent["scenario_row"].tolist()
+        self._agent_names = [AGENTS[code] for code in agent["name"].tolist()]
+        for row, (scenario_row, name) in enumerate(zip(self._agent_scenario, self._agent_names, strict=True)):
+            self._agents[scenario_row][name] = row
         self._row_finders: dict[str, Callable[..., int]] = {
             "scenario": self._scenario_row,
             "agent": self._agent_row,
@@ -110,7 +110,7 @@ class Resolver:
         }
         self.token_makers: dict[str, Callable[[int], str]] = {
             "scenario": self.scenario_tokens.__getitem__,
-            "agent": self._agent_tokens.__getitem__,
+            "agent": self._agent_token,
             "frame": self._frame_token,
             "sample": self._sample_token,
             "sample_data": self._sample_data_token,
@@ -154,13 +154,16 @@ class Resolver:
         path = f"{scenario_type}/{agent}/{channel}/{name}/{name}_{number}.{CHANNEL_FORMAT[channel]}"
         return f"{folder}/{path}" if folder else path
 
+    def _agent_token(self, row: int) -> str:
+        return f"{self.scenario_tokens[self._agent_scenario[row]]}/{self._agent_names[row]}"
+
     def _frame_token(self, row: int) -> str:
         scenario = self._views["frame"]["scenario_row"].item(row)
         return f"{self.scenario_tokens[scenario]}/{row - self._first_frame[scenario] + 1:03d}"
 
     def _sample_token(self, row: int) -> str:
         agent = self._views["sample"]["agent_row"].item(row)
-        return f"{self._agent_tokens[agent]}/{row - self._first_sample[agent] + 1:03d}"
+        return f"{self._agent_token(agent)}/{row - self._first_sample[agent] + 1:03d}"
 
     def _sample_data_token(self, row: int) -> str:
         sample, channel = divmod(row, len(CHANNELS))
@@ -169,7 +172,7 @@ class Resolver:
     def _calibrated_sensor_token(self, row: int) -> str:
         view = self._views["calibrated_sensor"]
         number = view["number"].item(row)
-        token = f"{self._agent_tokens[view['agent_row'].item(row)]}/{CHANNELS[view['sensor_row'].item(row)]}"
+        token = f"{self._agent_token(view['agent_row'].item(row))}/{CHANNELS[view['sensor_row'].item(row)]}"
         return token if number == 1 else f"{token}/{number}"
 
     def _instance_token(self, row: int) -> str:

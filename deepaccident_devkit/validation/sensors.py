@@ -22,15 +22,7 @@ from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, F
 from deepaccident_devkit.support.reading import FileKind, read_bytes
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.scan import finding_of
-from deepaccident_devkit.taxonomy import (
-    BEV_CAMERA,
-    BEV_RESOLUTION,
-    BEV_SHAPE,
-    CAMERAS,
-    CATEGORIES,
-    LIDAR,
-    OWN_ACTOR_ID,
-)
+from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE, CAMERAS, CATEGORIES, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.validation.inventory import Inventory
 from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_text
 

@@ -129,7 +129,7 @@ NOT_OF_STRANGERS = {
     "parallel/store.py": "locks, of which nothing is believed",
     "release/images.py": "the head of an image that the gate opened",
     "release/store/store.py": "the cache's own copies",
-    "release/store/archives.py": "fsspec, and the directory of an archive that the gate or fsspec opened",
+    "release/store/sources.py": "fsspec, and the directory of an archive that the gate or fsspec opened",
     "synth/spec/catalogue.py": "the package's own designs",
 }
 

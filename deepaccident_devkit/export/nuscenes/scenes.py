@@ -76,19 +76,6 @@ def token(kind: str, *parts: object) -> str:
     return hashlib.md5("/".join(map(str, (kind, *parts))).encode(), usedforsecurity=False).hexdigest()
 
 
-def scene_name(scenario: str, agent: str) -> str:
-    """A scene is what one agent recorded of a scenario, given by its token: `<type>-<scenario>-<agent>`."""
-    return f"{scenario.replace('/', '-')}-{agent}"
-
-
-def timestamp(scenario_row: int, agent: str, number: int) -> int:
-    """Microseconds of a frame (from 1); no two scenes begin at the same, since the devkit of nuScenes sorts them by it.
-
-    Each scenario, by its row, has an hour of its own, and agents are a microsecond apart.
-    """
-    return _EPOCH + (scenario_row + 1) * _HOUR + number * _PERIOD + AGENTS.index(agent)
-
-
 def sensor_path(scene: str, channel: str, stamp: int, *, key: bool) -> str:
     """The path of a sensor file below the folder; `channel` is ours."""
     name = CHANNEL_NAMES[channel]
@@ -113,8 +100,8 @@ class Scene:
 
     @property
     def name(self) -> str:
-        """As in the table `scene` and in `splits.json`."""
-        return scene_name(self.scenario, self.agent)
+        """As in the table `scene` and in `splits.json`: `<type>-<scenario>-<agent>`."""
+        return f"{self.scenario.replace('/', '-')}-{self.agent}"
 
     @cached_property
     def last(self) -> int:
@@ -152,8 +139,12 @@ class Scene:
         return sample_token(self.scenario, self.agent, number)
 
     def stamp(self, number: int) -> int:
-        """Microseconds of a frame."""
-        return timestamp(self.dataset.getind("scenario", self.scenario), self.agent, number)
+        """Microseconds of a frame: a scenario has an hour of its own, an agent starts a microsecond after the other.
+
+        The devkit of nuScenes sorts scenes by their first one, so no two are the same.
+        """
+        hours = self.dataset.getind("scenario", self.scenario) + 1
+        return _EPOCH + hours * _HOUR + number * _PERIOD + AGENTS.index(self.agent)
 
     def rows(self) -> Rows:
         """The rows of `scene`, `log`, `sample` and `ego_pose`."""

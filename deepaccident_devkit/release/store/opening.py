@@ -16,7 +16,6 @@ import numpy as np
 
 from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.release.store.archives import UrlSource, asked, list_zip
 from deepaccident_devkit.release.store.members import (
     FORM,
     MINI_FOLDER,
@@ -31,6 +30,7 @@ from deepaccident_devkit.release.store.members import (
     write_members,
 )
 from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, is_folder, listed
+from deepaccident_devkit.release.store.sources import UrlSource, asked, list_zip
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.support.files import is_writable_folder, path_text
 from deepaccident_devkit.support.reading import fault_text, open_file

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ConfigError, MissingFileError, SensorFileError
-from deepaccident_devkit.release.store.archives import (
+from deepaccident_devkit.release.store.members import Member, Members
+from deepaccident_devkit.release.store.sources import (
     HEAD_LENGTH,
     LONGEST_HEAD,
     Range,
@@ -27,7 +28,6 @@ from deepaccident_devkit.release.store.archives import (
     member_bytes,
     source_of,
 )
-from deepaccident_devkit.release.store.members import Member, Members
 from deepaccident_devkit.support.files import place_in, remove_in, temporary_of, write_bytes
 from deepaccident_devkit.support.reading import FileKind, RefusedFileError, bytes_of, check_size, fault_text
 

@@ -17,7 +17,7 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingFileError, NotAvailableError, SomeFailedError
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.store import open_dataroot
-from deepaccident_devkit.release.store.archives import LocalSource, UrlSource
+from deepaccident_devkit.release.store.sources import LocalSource, UrlSource
 from deepaccident_devkit.release.store.store import FileCache
 from deepaccident_devkit.support.reading import RefusedFileError
 from deepaccident_devkit.tables import clear_index
@@ -189,7 +189,7 @@ def test_where_nothing_can_be_written_lists_are_kept_in_the_cache(
 def test_as_many_archives_are_open_as_the_system_allows(
     opened: dict[str, DeepAccident], places: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deepaccident_devkit.release.store.archives._MOST_OPEN", 2)
+    monkeypatch.setattr("deepaccident_devkit.release.store.sources._MOST_OPEN", 2)
     source = LocalSource(Path(places["zips"]))
     for path in [*sorted(Path(places["zips"]).rglob("*.zip"))] * 2:
         assert source.read(path.relative_to(places["zips"]).as_posix(), 0, 4) == b"PK\x03\x04"
