@@ -19,10 +19,10 @@ from deepaccident_devkit.geometry.se3 import SE3
 from deepaccident_devkit.release import Calibs, Collision, Labels, Meta, ScenarioFolder, find_release, write_meta
 from deepaccident_devkit.release.store import INDEX_FOLDER
 from deepaccident_devkit.tables import Index
-from deepaccident_devkit.tables.build import ScenarioFiles, scenario_rows
+from deepaccident_devkit.tables.build import scenario_rows
 from deepaccident_devkit.tables.index import table_files
 from deepaccident_devkit.tables.indexing import join_tables, rows_to_keep
-from deepaccident_devkit.tables.scan import ScenarioScan, folder_digest
+from deepaccident_devkit.tables.scan import ScenarioFiles, ScenarioScan, folder_digest
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CAMERAS,

@@ -19,8 +19,8 @@ from deepaccident_devkit.support import nuscenes_names
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import choice, spelled
 from deepaccident_devkit.tables import OpenTables, RowArgument, displacement_velocities, visible_ids, visible_mask
-from deepaccident_devkit.tables.opened import token_of
-from deepaccident_devkit.tables.store import damaged_value
+from deepaccident_devkit.tables.arrow_files import damaged_value
+from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,

@@ -9,10 +9,9 @@ import numpy as np
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.tables.boxes import world_centers
-from deepaccident_devkit.tables.build import read_scenario, scenario_boxes
-from deepaccident_devkit.tables.scan import scan_scenario
-from deepaccident_devkit.tables.velocities import decoded_velocities, displacement_velocities
+from deepaccident_devkit.tables.boxes import decoded_velocities, displacement_velocities, world_centers
+from deepaccident_devkit.tables.build import scenario_boxes
+from deepaccident_devkit.tables.scan import read_scenario, scan_scenario
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, CHANNELS, VELOCITY_FRAMES
 
 HERE = Path(__file__).parent

@@ -53,7 +53,7 @@ from deepaccident_devkit.model.training.data import SCORE, validated, validation
 from deepaccident_devkit.model.training.state import read_log
 from deepaccident_devkit.model.training.train import train
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
-from deepaccident_devkit.release.split_files import write_split_file
+from deepaccident_devkit.release.layout import write_split_file
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.synth import SynthConfig, make_release
 

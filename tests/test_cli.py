@@ -157,7 +157,7 @@ def test_a_verb_does_not_wait_for_what_others_import() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["mcap", "mmdet3d", "nuscenes", "opencood", "parquet", "questions", "webdataset"])
 def test_an_export_imports_its_own_format_alone(name: str) -> None:
-    shared = {"bulk", "format", "keyframes", "sensor_files", "shards"}
+    shared = {"bulk", "format", "frames"}
     own = {name} | ({"nuscenes", "released_infos"} if name == "mmdet3d" else set())
     found = {each.split(".")[1] for each in imported("export", name, "--help") if each.startswith("export.")}
     assert found <= shared | own

@@ -180,7 +180,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 IN_A_LIBRARY = """
     import os, sys, time
-    from deepaccident_devkit.cli.interruption import run_interruptibly
+    from deepaccident_devkit.cli.process import run_interruptibly
 
     def verb():
         try:
@@ -229,7 +229,7 @@ def test_other_signals_end_nothing() -> None:
     """Such as that of a terminal whose size changes."""
     script = """
         import signal, time
-        from deepaccident_devkit.cli.interruption import run_interruptibly
+        from deepaccident_devkit.cli.process import run_interruptibly
 
         def verb():
             signal.signal(signal.SIGUSR1, lambda *_: None)
@@ -248,7 +248,7 @@ def test_a_signal_amid_the_end_of_python_changes_nothing(number: signal.Signals)
     """The verb has done its work: this runs last of what is to run at the end."""
     script = f"""
         import atexit, os
-        from deepaccident_devkit.cli.interruption import run_interruptibly
+        from deepaccident_devkit.cli.process import run_interruptibly
 
         atexit.register(lambda: (os.kill(os.getpid(), {int(number)}), print("went on")))
         run_interruptibly(lambda: print("whole"))
@@ -262,7 +262,7 @@ def test_a_signal_amid_what_python_calls_in_between(number: signal.Signals, stat
     """Python ignores what a `__del__` raises, and would say so."""
     script = f"""
         import os, time
-        from deepaccident_devkit.cli.interruption import run_interruptibly
+        from deepaccident_devkit.cli.process import run_interruptibly
 
         class Last:
             def __del__(self):

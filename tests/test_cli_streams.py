@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_results
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.cli.streams import _Stream
+from deepaccident_devkit.cli.process import _Stream
 
 HOSTILE = "town\x1b[31m\x07\x9b\u202e\udcff"
 SHOWN = r"town\u001b[31m\u0007\u009b\u202e\udcff"

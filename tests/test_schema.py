@@ -9,7 +9,7 @@ import jsonschema
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.tables.arrow import arrow_schema
+from deepaccident_devkit.tables.arrow_files import arrow_schema
 from deepaccident_devkit.tables.index import SCHEMA_VERSION
 from deepaccident_devkit.tables.records import table_specs
 

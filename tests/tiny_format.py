@@ -11,7 +11,7 @@ from typing import ClassVar
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.bulk import Format, Output, Unit, export_release
-from deepaccident_devkit.export.sensor_files import sensor_files
+from deepaccident_devkit.export.frames import sensor_files
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.tables.tokens import frame_token
 

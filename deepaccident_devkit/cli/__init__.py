@@ -15,8 +15,7 @@ from typing import Final
 import click
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.cli.interruption import run_interruptibly
-from deepaccident_devkit.cli.streams import lasting_streams
+from deepaccident_devkit.cli.process import lasting_streams, run_interruptibly
 from deepaccident_devkit.cli.verbs import LazyVerbs
 from deepaccident_devkit.errors import DeepAccidentError, SomeFailedError
 

@@ -20,21 +20,11 @@ _CAMERA = "Camera_Front"
 
 
 def rows_to_draw(dataset: Dataset, table: str, tokens: Sequence[str], frames: range | None) -> list[str]:
-    """The tokens of a table's rows that a verb renders.
+    """The tokens of a table's rows that a verb renders; raises DeepAccidentError, or click.UsageError for `frames`.
 
-    Args:
-        dataset: the release.
-        table: the table whose rows the verb renders.
-        tokens: of rows of this table or of scenarios. A scenario stands for its first agent at `frames`, and for the
-            actor that this agent collides with. No tokens stand for the first accident; if
-            there is none, for the first scenario, except where a whole scenario is rendered.
-        frames: frame numbers of the scenarios; None for one second before their end.
-
-    Raises:
-        TokenError: no such scenario.
-        ChoiceError: a scenario does not have such frames.
-        NotAvailableError: there is no accident, and a whole scenario is to be rendered; or the moment has no boxes.
-        click.UsageError: `frames` are given, but the table or a token has no frames to choose from.
+    `tokens` are of rows of this table or of scenarios. A scenario stands for its first agent at `frames` (None: one
+    second before its end), and for the actor that this agent collides with. No tokens stand for the first accident; if
+    there is none, for the first scenario, except where a whole scenario is rendered.
     """
     if frames is not None and table in ("scenario", "instance"):
         raise click.UsageError(f"--frame-range is for moments; a whole {table} is rendered, leave it out")
@@ -88,11 +78,7 @@ def _annotation(dataset: Dataset, sample: str) -> str:
 
 
 def picture_paths(out: Path, view: str, rows: Sequence[str]) -> list[Path]:
-    """Where the pictures of rows go: the file `out` for a single picture, or files in the folder `out`.
-
-    Raises:
-        click.UsageError: several pictures for one file.
-    """
+    """Where the pictures of rows go: a single one into the file `out`, several into the folder; or click.UsageError."""
     if out.suffix.lower() not in PICTURE_SUFFIXES:
         if out.suffix and not out.is_dir():
             kinds = ", ".join(PICTURE_SUFFIXES)

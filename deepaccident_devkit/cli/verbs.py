@@ -114,13 +114,7 @@ def field_option(
     """An option for a field of a dataclass, so that nothing is said twice.
 
     Its name, type and default are the field's, its help is the first sentence of what the class says of the field.
-
-    Args:
-        config: the dataclass.
-        field: name of the field, and of the verb's parameter.
-        names: of the option, if other ones; after a parameter's name, if that is another one too.
-        option: `click.option` or `advanced`.
-        changes: what is other than the field, as `click.option` takes it.
+    `names` are of the option if other ones, `changes` what is other than the field, as `click.option` takes it.
     """
     default = changes.get("default", config.__dataclass_fields__[field].default)
     hint = get_type_hints(config)[field]

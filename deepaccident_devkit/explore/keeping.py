@@ -12,7 +12,7 @@ from typing import Final, Generic, TypeVar
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.parallel import Store
-from deepaccident_devkit.release.store.cache import FileCache
+from deepaccident_devkit.release.store.store import FileCache
 from deepaccident_devkit.support.files import is_writable_folder, place_in
 
 Value = TypeVar("Value")

@@ -274,15 +274,10 @@ class _Export:
         return (self.parts(unit) / _DONE).exists()
 
     def estimate(self, units: Sequence[Unit], *, alone: bool) -> Tally:
-        """About how much units are, by the first scenario that has a sample and can be read.
+        """About how much units that are left are, by the first scenario that has a sample and can be read.
 
-        Args:
-            units: that are left.
-            alone: whether nothing else is in the folder yet.
-
-        Raises:
-            NotAvailableError: they are alone, and no scenario has a sample.
-            ExportError: the system's temporary folder cannot be written to.
+        Raises NotAvailableError if no scenario has a sample and nothing else is in the folder yet (`alone`);
+        ExportError.
         """
         scenarios, failed = [token for unit in units for token in unit.scenarios], False
         for token in scenarios:

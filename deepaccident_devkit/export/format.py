@@ -1,4 +1,4 @@
-"""What a format is: settings, units of scenarios, and what each of them writes into an export's folder, counted."""
+"""What a format is: settings, units of scenarios, what each of them writes into an export's folder; and shards."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import re
 import shutil
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
+from typing import Any, ClassVar, Final, Literal, get_args
 
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, SensorFileError
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.selection import parse_where
@@ -24,15 +26,33 @@ from deepaccident_devkit.support.reading import fault_text, open_file, read_byte
 from deepaccident_devkit.support.text import choice, settle_choices
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, MINI_SPLITS, SPLITS
 
-if TYPE_CHECKING:
-    from deepaccident_devkit.dataset import Dataset
-
 Link = Literal["hard", "symbolic", "copy"]
 _NO_LINKS: Final = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
 """What a file system answers that cannot make a link; a full disk is another matter."""
 _DIGEST: Final = re.compile(r"-[0-9a-f]{16}\Z")
 _MOST_CHARACTERS: Final = 150
 """Of a name made from a token; the devkit's and the formats' endings come to it, and systems allow 255."""
+README: Final = "README.md"
+SPLIT_NAMES: Final[Mapping[str | None, str]] = {"train": "train", "val": "validation", "test": "test", None: "unknown"}
+"""A scenario's split → what files are called by it; `datasets` expects these words."""
+_TEXT: Final = """\
+---
+{head}---
+
+# {title}
+
+Made by `deepaccident export {name}` of the DeepAccident devkit {devkit} from version {version} of DeepAccident
+(https://deepaccident.github.io/). {selection}
+
+Please cite the paper: Wang et al., DeepAccident: A Motion and Accident Prediction Benchmark for V2X Autonomous Driving,
+AAAI 2024, https://arxiv.org/abs/2304.01168. The data are those of its authors, and their terms hold. The licence of the
+devkit, Apache-2.0, is that of its code alone.
+
+Everything is right-handed: x forward, y left, z up, yaw counter-clockwise; metres, seconds, radians. Quaternions are
+w, x, y, z. Cameras have optical axes: x right, y down, z forward. Frames are numbered from 1 and 0.1 s apart. The
+impact of an accident is the last frame of its scenario.
+
+{body}"""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -264,3 +284,34 @@ def flat_name(token: str) -> str:
     if name == plain and not _DIGEST.search(name):
         return name
     return f"{name}-{hashlib.blake2b(token.encode(), digest_size=8).hexdigest()}"
+
+
+def shards(dataset: Dataset, sizes: Mapping[str, int], limit: int) -> dict[str, list[tuple[str, ...]]]:
+    """Name of a split → its shards: consecutive scenarios, sizes up to the limit, but at least one scenario."""
+    found: dict[str, list[tuple[str, ...]]] = {name: [] for name in SPLIT_NAMES.values()}
+    room = dict.fromkeys(found, 0)
+    for scenario, size in sizes.items():
+        split = SPLIT_NAMES[dataset.scenario.get(scenario)["split"]]
+        if not found[split] or size > room[split]:
+            found[split].append(())
+            room[split] = limit
+        found[split][-1] = (*found[split][-1], scenario)
+        room[split] -= size
+    return {split: groups for split, groups in found.items() if groups}
+
+
+def readme(form: Format, dataset: Dataset, title: str, head: Mapping[str, Any], body: str) -> bytes:
+    """A README.md with a head in YAML, what is in the export and where it is from, and a body."""
+    import yaml
+
+    selection = [f"split {form.split}"] if form.split is not None else []
+    selection += [f"scenarios where {text}" for text in form.where]
+    return _TEXT.format(
+        head=yaml.safe_dump({"pretty_name": title, **head}, sort_keys=False, allow_unicode=True),
+        title=title,
+        name=form.name,
+        devkit=__version__,
+        version=dataset.version,
+        selection=f"It holds {', '.join(selection) or 'all scenarios'}, as recorded by {', '.join(form.agents)}.",
+        body=body,
+    ).encode()

@@ -24,8 +24,8 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, ExportError, MissingFileError, SensorFileError
 from deepaccident_devkit.export.bulk import Format, Manifest, Output, Unit, flat_name
+from deepaccident_devkit.export.frames import sensor_files
 from deepaccident_devkit.export.images import ImageConfig
-from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image, encode_jpeg
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray, IntArray

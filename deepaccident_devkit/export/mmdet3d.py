@@ -25,10 +25,9 @@ import numpy as np
 
 from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.export.bulk import Manifest
-from deepaccident_devkit.export.keyframes import keyframes
+from deepaccident_devkit.export.frames import keyframes, stored_camera
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.scenes import CAMERA_CHANNELS, TURNS, VERSION, sensor_path, token
-from deepaccident_devkit.export.sensor_files import stored_camera
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.support.files import write_bytes

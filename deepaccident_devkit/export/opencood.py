@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.format import Format, Output, Unit, some_of
-from deepaccident_devkit.export.sensor_files import sensor_files, stored_camera
+from deepaccident_devkit.export.frames import sensor_files, stored_camera
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.conventions import camera_from_lidar_to_raw, flip_pose, inverses, stored_transforms
 from deepaccident_devkit.geometry.quaternions import to_matrix

@@ -12,7 +12,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.bulk import Format, Output, Unit
-from deepaccident_devkit.export.shards import README, SPLIT_NAMES, readme, shards
+from deepaccident_devkit.export.format import README, SPLIT_NAMES, readme, shards
 from deepaccident_devkit.support.arrays import IntArray
 from deepaccident_devkit.tables.columns import Key, Kind, Number, Vector
 from deepaccident_devkit.tables.record_tables import RecordTables

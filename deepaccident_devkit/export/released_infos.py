@@ -23,7 +23,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.export.bulk import Format, Output, Unit
-from deepaccident_devkit.export.keyframes import keyframes
+from deepaccident_devkit.export.frames import keyframes
 from deepaccident_devkit.release import Labels, ScenarioFolder, read_calib, read_label
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.support.files import write_bytes

@@ -17,9 +17,8 @@ import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.bulk import Format, Output, Unit
-from deepaccident_devkit.export.keyframes import keyframes
-from deepaccident_devkit.export.sensor_files import sensor_files
-from deepaccident_devkit.export.shards import README, readme, shards
+from deepaccident_devkit.export.format import README, readme, shards
+from deepaccident_devkit.export.frames import keyframes, sensor_files
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import image_size, read_image_bytes
 from deepaccident_devkit.release.store import ReleasePath

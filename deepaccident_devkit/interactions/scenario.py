@@ -21,8 +21,8 @@ from deepaccident_devkit.interactions.config import InteractionConfig
 from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names, interaction_specs
 from deepaccident_devkit.parallel import Places, Store, in_order, run_unordered
 from deepaccident_devkit.support.files import place_in
+from deepaccident_devkit.tables.arrow_files import read_streams, streams
 from deepaccident_devkit.tables.columns import NULL_INTEGER
-from deepaccident_devkit.tables.store import read_streams, streams
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:

@@ -13,10 +13,15 @@ from deepaccident_devkit.release.labels import (
     world_from_label_velocity,
     write_label,
 )
-from deepaccident_devkit.release.layout import ReleaseLayout, ScenarioFolder, find_release
+from deepaccident_devkit.release.layout import (
+    ReleaseLayout,
+    ScenarioFolder,
+    find_release,
+    read_split_file,
+    write_split_file,
+)
 from deepaccident_devkit.release.meta import Collision, Meta, read_meta, write_meta
 from deepaccident_devkit.release.npz import BevImage, read_bev, read_lidar, write_bev, write_lidar
-from deepaccident_devkit.release.split_files import read_split_file, write_split_file
 
 __all__ = [
     "BevImage",

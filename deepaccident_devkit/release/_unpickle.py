@@ -41,19 +41,11 @@ class Machine:
         start: int = 0,
         refer: Callable[[Any], object] | None = None,
     ) -> None:
-        """Read it.
+        """Read it; raises pickle.UnpicklingError, and what wrong values raise, such as TypeError.
 
-        Args:
-            content: the bytes in which it is.
-            names: module and name, with a blank between them → what stands for it. What its call returns gets the
-                pickle's state by `__setstate__`, if it has that.
-            most: opcodes that it may have.
-            start: its first byte.
-            refer: what makes a value from a persistent id; None allows none.
-
-        Raises:
-            pickle.UnpicklingError: what is not allowed, and at which byte.
-            AttributeError, LookupError, OverflowError, TypeError, ValueError: a value is not what it should be.
+        `names`: module and name, with a blank between them → what stands for it; what its call returns gets the
+        pickle's state by `__setstate__`, if it has that. `most`: opcodes that it may have. `refer` makes a value from a
+        persistent id; None allows none.
         """
         self.value: Any = None
         self.end = self._opcode_at = start

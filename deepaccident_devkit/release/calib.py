@@ -11,10 +11,9 @@ import numpy as np
 from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.geometry import SE3, conventions
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
-from deepaccident_devkit.release._content import LARGEST, REMEDY, in_range, read_content
 from deepaccident_devkit.release.pickles import load_arrays, pickled
-from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, ShortRepr, readonly
+from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content
+from deepaccident_devkit.support.arrays import LARGEST, AnyArray, BoolArray, FloatArray, ShortRepr, in_range, readonly
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import CAMERAS
 

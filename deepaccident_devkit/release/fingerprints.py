@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers, frame_sizes
-from deepaccident_devkit.release.store import ReleasePath, places_of
+from deepaccident_devkit.release.store import ReleasePath, places_of, read_content
 from deepaccident_devkit.support.reading import FileKind
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT
 
@@ -80,35 +79,28 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
 
 
 def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, ScenarioFolder]:
-    """Where some scenarios' files lie, by token in order; those that are not in the release are left out.
-
-    Raises:
-        DatarootError: the release's folder is gone, or one of its folders cannot be listed.
-    """
+    """Where some scenarios' files lie, by token in order, if they are in the release; raises DatarootError."""
     folders = {each.token: each for each in reversed(find_release(dataset.dataroot, dataset.version).scenarios)}
     return {token: folders[token] for token in sorted(set(scenarios)) if token in folders}
 
 
 def folder_hashes(scenario: ScenarioFolder) -> ScenarioHashes:
-    """The hashes of a scenario's files.
-
-    Raises:
-        DatarootError: one of its folders cannot be listed.
-        ReleaseError: a file cannot be read.
-    """
+    """The hashes of a scenario's files; raises DatarootError and ReleaseError as `scenario_hashes` does."""
+    base = scenario.root / scenario.folder / scenario.scenario_type
     meta = [scenario.meta_path] if scenario.meta_path.is_file() else []
-    return ScenarioHashes(
-        meta=_digest(meta, "meta", scenario.meta_path.parent),
-        **{kind: _digest(_files(scenario, kind), kind, _base(scenario)) for kind in _ENDINGS},
-    )
+    hashes = {"meta": _digest(meta, "meta", scenario.meta_path.parent)}
+    for kind, ending in _ENDINGS.items():
+        paths = [
+            scenario.file(agent, kind, frame, ending)
+            for agent in AGENTS
+            for frame in frame_numbers(scenario.kind_folder(agent, kind), ending)[0]
+        ]
+        hashes[kind] = _digest(paths, kind, base)
+    return ScenarioHashes(**hashes)
 
 
 def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) -> str:
-    """A hash of the frames and sizes of a scenario's sensor files of some agents and channels; folders are only listed.
-
-    Raises:
-        DatarootError: one of its folders cannot be listed.
-    """
+    """A hash of frames and sizes of sensor files of a scenario's agents and channels; folders are only listed."""
     sizes = [
         (agent, channel, list(frame_sizes(scenario.kind_folder(agent, channel), CHANNEL_FORMAT[channel]).items()))
         for agent, channel in sensors
@@ -127,29 +119,13 @@ def digest_of(value: Any) -> str:
     return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
 
 
-def _files(scenario: ScenarioFolder, kind: FileKind) -> list[ReleasePath]:
-    ending = _ENDINGS[kind]
-    return [
-        scenario.file(agent, kind, frame, ending)
-        for agent in AGENTS
-        for frame in frame_numbers(scenario.kind_folder(agent, kind), ending)[0]
-    ]
-
-
-def _base(scenario: ScenarioFolder) -> ReleasePath:
-    return scenario.root / scenario.folder / scenario.scenario_type
-
-
 def _digest(paths: Collection[ReleasePath], kind: FileKind, base: ReleasePath) -> str | None:
     if not paths:
         return None
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for path in paths:
         content = read_content(path, kind, ReleaseError)
-        digest.update(f"{_below(path, base)} {len(content)}\n".encode())
+        name = str(path).removeprefix(str(base)).replace(os.sep, "/").lstrip("/")
+        digest.update(f"{name} {len(content)}\n".encode())
         digest.update(content)
     return digest.hexdigest()
-
-
-def _below(path: ReleasePath, base: ReleasePath) -> str:
-    return str(path).removeprefix(str(base)).replace(os.sep, "/").lstrip("/")

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit.errors import MOST_TOLD, SensorFileError, shortened
-from deepaccident_devkit.release._content import REMEDY, read_content
-from deepaccident_devkit.release.store import ReleasePath, real_path
+from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content, real_path
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import check_size, fault_text, open_file

@@ -19,11 +19,20 @@ import numpy as np
 
 from deepaccident_devkit.errors import LabelError, shortened
 from deepaccident_devkit.geometry import Boxes, conventions, quaternions
-from deepaccident_devkit.release._content import LARGEST, in_range, integer_of, number_of, read_content
-from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, readonly
+from deepaccident_devkit.release.store import ReleasePath, read_content
+from deepaccident_devkit.support.arrays import (
+    LARGEST,
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    ShortRepr,
+    in_range,
+    readonly,
+)
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import LIMITS_VARIABLE, limit_of
+from deepaccident_devkit.support.text import integer_of, number_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 
@@ -32,7 +41,7 @@ def label_from_world_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArr
 
     Args:
         velocity: (N, 2) m/s in world.
-        yaw: (N,) radians, each box's in the LiDAR frame of the label, of the same handedness.
+        yaw: (N,) radians, each box's in the LiDAR frame of the label, of the same conventions.
     """
     return turned(velocity, yaw)
 
@@ -150,16 +159,19 @@ def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
             belongs, an unknown class, NaN, infinity or more than 1e9 in a position, size or yaw; the message names file
             and line.
     """
-    parts = _parse_batches([paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)])
-    parts = parts or [_columns_of(_parse_body(b""), _parse_header(b""), np.zeros(0, dtype=np.int64))]
-    return _labels({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, raw=raw)
+    batches = [paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)]
+    parts = _parse_batches(batches or [[]])
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if not raw:
+        columns["agent_velocity"] = conventions.flip_vectors2(columns["agent_velocity"])
+        columns["center"] = conventions.flip_points(columns["center"])
+        columns["velocity"] = conventions.flip_vectors2(columns["velocity"])
+        columns["yaw"] = conventions.flip_yaw(columns["yaw"])
+    return Labels(raw=raw, **columns)
 
 
 def read_lone_words(path: ReleasePath) -> list[tuple[int, str, bool]]:
-    """The lines of one label file that are skipped since they have one word, as its reference reader skips them.
-
-    Returns:
-        The number of each line, its word, and whether the file ends within it.
+    """The lines of a label that are skipped since they have one word: number, word, whether the file ends within it.
 
     Raises as `read_label` does, if the file cannot be read.
     """
@@ -195,16 +207,6 @@ def write_label(path: Path, labels: Labels) -> None:
     )
     lines += [f"{CATEGORIES[code]} {_words(row)} {actor} {points} {seen}" for code, row, actor, points, seen in rows]
     write_bytes(path, "\n".join(lines).encode("ascii"))
-
-
-def _labels(columns: dict[str, AnyArray], *, raw: bool) -> Labels:
-    """The columns as the files say them, or right-handed."""
-    if not raw:
-        columns["agent_velocity"] = conventions.flip_vectors2(columns["agent_velocity"])
-        columns["center"] = conventions.flip_points(columns["center"])
-        columns["velocity"] = conventions.flip_vectors2(columns["velocity"])
-        columns["yaw"] = conventions.flip_yaw(columns["yaw"])
-    return Labels(raw=raw, **columns)
 
 
 def _words(numbers: Iterable[float]) -> str:
@@ -243,7 +245,7 @@ def _content(path: ReleasePath, *, ended: bool = True) -> bytes:
 
 def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     """Parse files that end in a line end; None where they need tidying or hold a fault."""
-    from pyarrow import ArrowInvalid
+    import pyarrow as pa
 
     body_starts = [content.index(b"\n") + 1 for content in contents]
     num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
@@ -256,8 +258,17 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     if header.startswith(codecs.BOM_UTF8) or body.startswith(codecs.BOM_UTF8):
         return None
     try:
-        header_table, body_table = _parse_header(header), _parse_body(body)
-    except ArrowInvalid:
+        header_table = _parse_csv(header, dict.fromkeys(_HEADER, pa.float64()))
+        body_table = _parse_csv(
+            body,
+            {
+                "class": pa.dictionary(pa.int32(), pa.string()),
+                **dict.fromkeys(_FLOAT_FIELDS, pa.float64()),
+                **dict.fromkeys(_INTEGER_FIELDS, pa.int64()),
+                "camera_visible": pa.bool_(),
+            },
+        )
+    except pa.ArrowInvalid:
         return None
     # blank lines vanish silently, so counts are compared
     if header_table.num_rows != len(contents) or body_table.num_rows != num_boxes.sum():
@@ -265,34 +276,17 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     return _columns_of(body_table, header_table, num_boxes)
 
 
-def _parse_header(header: bytes) -> Any:
-    import pyarrow as pa
-
-    return _parse_csv(header, _HEADER, dict.fromkeys(_HEADER, pa.float64()))
-
-
-def _parse_body(body: bytes) -> Any:
-    import pyarrow as pa
-
-    types = {
-        "class": pa.dictionary(pa.int32(), pa.string()),
-        **dict.fromkeys(_FLOAT_FIELDS, pa.float64()),
-        **dict.fromkeys(_INTEGER_FIELDS, pa.int64()),
-        "camera_visible": pa.bool_(),
-    }
-    return _parse_csv(body, FIELDS, types)
-
-
-def _parse_csv(content: bytes, names: Sequence[str], types: dict[str, Any]) -> Any:
+def _parse_csv(content: bytes, types: dict[str, Any]) -> Any:
+    """A table of words between blanks, by name and type of its columns."""
     import pyarrow as pa
     from pyarrow import csv
 
     if not content or content.isspace():
-        return pa.table({name: pa.array([], type=types[name]) for name in names})
+        return pa.table({name: pa.array([], type=kind) for name, kind in types.items()})
     return csv.read_csv(
         pa.BufferReader(content),
         # workers share the cores, so each parses on one
-        read_options=csv.ReadOptions(column_names=list(names), use_threads=False, block_size=len(content) + 1),
+        read_options=csv.ReadOptions(column_names=list(types), use_threads=False, block_size=len(content) + 1),
         parse_options=csv.ParseOptions(delimiter=" ", quote_char=False, double_quote=False),
         convert_options=csv.ConvertOptions(
             column_types=types, null_values=[], true_values=["True"], false_values=["False"]

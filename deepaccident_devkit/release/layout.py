@@ -1,16 +1,22 @@
-"""Where the files of a release lie, in either layout (docs/format.md, Tree)."""
+"""Where the files of a release lie (docs/format.md, Tree): folders of either layout, split files, missing files."""
 
+from __future__ import annotations
+
+import logging
 import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
+from operator import attrgetter
 from pathlib import Path
+from typing import get_args
 
-from deepaccident_devkit.errors import DatarootError, VersionError
-from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed
-from deepaccident_devkit.release.store.names import (
+from deepaccident_devkit.errors import DatarootError, MissingFileError, SplitFileError, VersionError, shortened
+from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed, read_lines
+from deepaccident_devkit.release.store.members import (
     MINI_FOLDER,
     SCENARIO_TYPE,
     SPLIT_FILE_FOLDER,
@@ -18,13 +24,9 @@ from deepaccident_devkit.release.store.names import (
     SPLIT_FOLDERS,
 )
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.text import spelled
-from deepaccident_devkit.taxonomy import (
-    AGENTS,
-    CHANNEL_FORMAT,
-    VERSIONS,
-    AgentName,
-)
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.text import choice, spelled
+from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT, VERSIONS, AgentName, OnError
 
 _UNLISTABLE_REMEDY = "unpack its archive again, or make it readable"
 _ABOVE_TYPES = (*SPLIT_FOLDERS, MINI_FOLDER)
@@ -35,6 +37,7 @@ _COPY = r"(?:Copy of )?({})(?:\W.*|_*\d.*|_+(?i:copy|part|old|new|backup)\w*)?"
 _MOST_ASIDE = 3
 """Folders that the error of a release without scenarios names at most."""
 _FRAME_FILE = re.compile(r"_(\d{3,})\.\w+")
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +118,10 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
     version = spelled(version, VERSIONS)
     if version not in VERSIONS:
         raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}{_version_remedy(version)}")
-    if not _is_unicode(str(root)):
-        raise DatarootError(f"{str(root)!r}: is not UTF-8, which Arrow needs a path to be; rename the folder")
+    try:
+        str(root).encode()
+    except UnicodeEncodeError:
+        raise DatarootError(f"{str(root)!r}: is not UTF-8, which Arrow needs a path to be; rename the folder") from None
     if not root.is_dir():
         missing = "is a link that leads nowhere" if os.path.islink(str(root)) else "does not exist"  # noqa: PTH114
         state = "is a file" if root.is_file() else missing
@@ -137,8 +142,8 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
     return ReleaseLayout(
         root=root,
         version=version,
-        layout="+".join(sorted({"B" if folder else "A" for folder in folders})),
-        scenarios=tuple(sorted(scenarios, key=lambda scenario: (scenario.token, scenario.folder))),
+        layout="+".join(["A"] * ("" in folders) + ["B"] * any(folders)),
+        scenarios=tuple(sorted(scenarios, key=attrgetter("token", "folder"))),
         split_files=_split_files(root),
     )
 
@@ -153,21 +158,10 @@ def _version_remedy(version: object) -> str:
     return ""
 
 
-def _is_unicode(path: str) -> bool:
-    try:
-        path.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def frame_numbers(folder: ReleasePath, ending: str) -> tuple[list[int], list[str]]:
     """The frame numbers of a folder's files, ascending, and the names with that ending but without a frame number.
 
-    A folder that is not there has none.
-
-    Raises:
-        DatarootError: it cannot be listed: a file in its place, no permission.
+    A folder that is not there has none; one that cannot be listed, or a file in its place, raises DatarootError.
     """
     frames, odd = [], []
     for number, entry in _frame_entries(folder, _entries(folder), ending):
@@ -179,15 +173,12 @@ def frame_numbers(folder: ReleasePath, ending: str) -> tuple[list[int], list[str
 
 
 def frame_sizes(folder: ReleasePath, ending: str) -> dict[int, int]:
-    """Frame number → bytes of a folder's files of frames, ascending, by one look into it.
+    """Frame number → bytes of a folder's files of frames, ascending, by one look into it; raises DatarootError.
 
     A folder that is not there, or with a file in its place, has none; a link to nothing is no file.
-
-    Raises:
-        DatarootError: it cannot be listed.
     """
     sizes = {}
-    for number, entry in _frame_entries(folder, _entries_of_folder(folder), ending):
+    for number, entry in _frame_entries(folder, _entries(folder, files=True), ending):
         with suppress(OSError):
             if number is not None:
                 sizes[number] = entry.stat().st_size
@@ -229,9 +220,8 @@ def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[ReleasePath, st
 def left_aside(root: ReleasePath) -> Iterator[tuple[ReleasePath, str | None]]:
     """What lies in a release and is not read, though it looks as if it should be.
 
-    Returns:
-        Each folder with a name that only looks like one of the release (downloads are unpacked beside each other as
-        `… (1)`, `…-001`), and what it looks like; each link that leads nowhere or back, and None.
+    Each folder with a name that only looks like one of the release (downloads are unpacked beside each other as `…
+    (1)`, `…-001`), and what it looks like; each link that leads nowhere or back, and None.
     """
     splits = [root / name for name in _subfolders(root) if name in _ABOVE_TYPES]
     yield from _aside_in(root, (SCENARIO_TYPE.pattern, *_ABOVE_TYPES))
@@ -249,7 +239,7 @@ def _aside_in(folder: ReleasePath, known: Sequence[str]) -> Iterator[tuple[Relea
     """What `left_aside` tells of one folder, in which these names (patterns) are read; of others only links."""
     entries: list[Entry] = []
     with suppress(DatarootError):  # told where its scenarios are read
-        entries = _entries_of_folder(folder)
+        entries = _entries(folder, files=True)
     for entry in sorted(entries, key=lambda entry: entry.name):
         path, found = folder / entry.name, re.fullmatch(_COPY.format("|".join(known)), entry.name)
         if leads_back(entry):
@@ -283,7 +273,7 @@ def _folders_of(root: ReleasePath, version: str) -> list[str]:
 
 
 def _scenario_types(folder: ReleasePath) -> list[str]:
-    return sorted(name for name in _subfolders(folder) if SCENARIO_TYPE.fullmatch(name))
+    return sorted(filter(SCENARIO_TYPE.fullmatch, _subfolders(folder)))
 
 
 def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
@@ -309,28 +299,88 @@ def _subfolders(folder: ReleasePath, *, loops: bool = False) -> list[str]:
 
     With `loops`, so are links to themselves, which `frame_numbers` reports, too.
     """
-    entries = _entries_of_folder(folder)
+    entries = _entries(folder, files=True)
     return [entry.name for entry in entries if not entry.name.startswith(".") and is_folder(entry, loops=loops)]
 
 
-def _entries_of_folder(folder: ReleasePath) -> list[Entry]:
-    """What lies in a folder; nothing if there is no such folder, or a file in its place."""
-    try:
-        return _entries(folder)
-    except DatarootError as error:
-        if isinstance(error.__cause__, NotADirectoryError):
-            return []
-        raise
-
-
-def _entries(folder: ReleasePath) -> list[Entry]:
-    """What lies in a folder; nothing if there is no such folder."""
+def _entries(folder: ReleasePath, *, files: bool = False) -> list[Entry]:
+    """What lies in a folder; nothing if there is no such folder, nor, with `files`, if a file is in its place."""
     try:
         return listed(folder)
-    except FileNotFoundError:
-        return []
     except OSError as error:
+        if isinstance(error, FileNotFoundError) or (files and isinstance(error, NotADirectoryError)):
+            return []
         raise DatarootError(f"{folder}: cannot be listed ({error.strerror}); {_UNLISTABLE_REMEDY}") from error
+
+
+def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = False) -> list[str]:
+    """The scenarios of a split file, in its order, each once, as tokens `<scenario_type>/<scenario>`.
+
+    Blank lines, blanks at line ends and CRLF are read.
+
+    Args:
+        path: the file.
+        raw: keep scenarios that stand in several lines as often.
+        unique: a scenario in two lines is an error; if not set, it counts once.
+
+    Raises:
+        MissingFileError: there is no such file.
+        SplitFileError: a line has not two words, the file is no text, or a scenario stands twice and `unique` is set.
+    """
+    lines = read_lines(path, "split", SplitFileError, "restore it from the release")
+    words = [(number, tuple(line.split(maxsplit=2))) for number, line in enumerate(lines, start=1) if line.strip()]
+    for number, line_words in words:
+        if len(line_words) != 2:
+            raise SplitFileError(
+                f"{path}:{number}: expected '<scenario_type> <scenario>', found {shortened(' '.join(line_words))!r}; "
+                "mend or remove the line"
+            )
+    first_line: dict[tuple[str, ...], int] = {}
+    for number, line_words in words if unique else ():
+        if line_words in first_line:
+            raise SplitFileError(
+                f"{path}:{number}: {shortened(' '.join(line_words))!r} stands in line {first_line[line_words]} "
+                "already; remove one of the two lines"
+            )
+        first_line[line_words] = number
+    tokens = ["/".join(line_words) for _, line_words in words]
+    return tokens if raw else list(dict.fromkeys(tokens))
+
+
+def write_split_file(path: Path, scenario_tokens: Sequence[str]) -> None:
+    """Write scenario tokens, one line each."""
+    lines = [f"{scenario_type} {name}\n" for scenario_type, name in (token.split("/") for token in scenario_tokens)]
+    write_bytes(path, "".join(lines).encode())
+
+
+class MissingFiles:
+    """Asks for sensor files, and counts by channel those that are not there (`on_missing='skip'`)."""
+
+    def __init__(self, root: ReleasePath, on_missing: OnError = "raise") -> None:
+        """Files below a release's folder; raises ChoiceError."""
+        self._root = root
+        self._skips = choice("on_missing", on_missing, get_args(OnError)) == "skip"
+        self._asked: Counter[str] = Counter()
+        self._missing: Counter[str] = Counter()
+
+    def has(self, path: ReleasePath, channel: str) -> bool:
+        """Whether a file is there, to be read; raises MissingFileError if it is not and nothing may be left out."""
+        self._asked[channel] += 1
+        if path.exists():
+            return True
+        if not self._skips:
+            raise MissingFileError(
+                f"{path}: no such file; unpack the archive that holds it, or leave out what is missing with "
+                "on_missing='skip'"
+            )
+        self._missing[channel] += 1
+        return False
+
+    def tell(self) -> None:
+        """Log one warning with the number of files that were left out, if any."""
+        if self._missing:
+            counts = ", ".join(f"{self._missing[name]} of {self._asked[name]} of {name}" for name in self._missing)
+            _logger.warning("left out files that are not in %s: %s", self._root, counts)
 
 
 def _split_files(root: ReleasePath) -> dict[str, ReleasePath]:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deepaccident_devkit.errors import MetaError, shortened
-from deepaccident_devkit.release._content import LARGEST, REMEDY, in_range, integer_of, number_of, read_lines
-from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_lines
+from deepaccident_devkit.support.arrays import LARGEST, ShortRepr, in_range
 from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.text import integer_of, number_of
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
 
 _FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"

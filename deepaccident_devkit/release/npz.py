@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from deepaccident_devkit.errors import MOST_TOLD, SensorFileError, shortened
 from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.conventions import flip_points
-from deepaccident_devkit.release._content import REMEDY, in_range, read_content
-from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.support.arrays import AnyArray, ByteArray, ShortRepr, checked, readonly
+from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content
+from deepaccident_devkit.support.arrays import AnyArray, ByteArray, ShortRepr, checked, in_range, readonly
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, FileKind, array_of, fault_text, open_zip, read_member
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
@@ -33,13 +32,7 @@ TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 
 
 
 def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
-    """The array under `data`, or the only one in the file, of numbers.
-
-    Raises:
-        MissingFileError: there is no such file.
-        SensorFileError: it is no file, empty, truncated, too large for its kind, disagrees with its sizes or checksum,
-            holds several arrays and none of them `data`, or objects.
-    """
+    """The array of numbers under `data`, or the only one in the file; raises MissingFileError and SensorFileError."""
     content = read_content(path, kind, SensorFileError)
     try:
         with open_zip(content) as archive:
@@ -157,6 +150,6 @@ def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
 
 
 def write_bev(path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = _FAST) -> None:
-    """Write tags and object ids, both (1200, 1200), forward up; `level` is that of `npz.write_npz`."""
+    """Write tags and object ids, both (1200, 1200), forward up; `level` is that of `write_npz`."""
     high, low = instance >> 8, instance & 255
     write_npz(path, np.stack([high, low, semantic], axis=-1).astype(np.uint8), level=level)

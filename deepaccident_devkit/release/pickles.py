@@ -54,11 +54,8 @@ def load_arrays(content: bytes) -> Any:
     """The value of a pickle: a dict of numeric numpy arrays, beside which other plain values stay what they are.
 
     It may name only what numpy's own pickles of arrays name (numpy 1 and 2, protocols 0 to 5). What stands for those
-    names notes what an array is made of; the arrays are made from the notes.
-
-    Raises:
-        pickle.UnpicklingError: the bytes are no pickle, or one that names, nests or repeats what such a dict does not
-            need; nothing of it has run.
+    names notes what an array is made of; the arrays are made from the notes. Anything else raises
+    pickle.UnpicklingError, and nothing of it has run.
     """
     try:
         layout = next((each for each in _layouts if each.fits(content)), None)

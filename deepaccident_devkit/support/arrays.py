@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from numbers import Real
 from typing import Any, Final
@@ -23,6 +23,8 @@ AnyArray = NDArray[Any]
 _FLOAT64: Final = np.dtype(np.float64)
 _NUMBERS: Final = "biuf"
 """Kinds of element types."""
+LARGEST: Final = 1e9
+"""Metres, m/s, pixels, …: a larger number in a file is damage and counts as infinite; squares would overflow."""
 _LONGEST_FIELDS: Final = 160
 _LONGEST_VALUE: Final = 80
 _FEW: Final = 4
@@ -70,6 +72,32 @@ class FrozenArrays(ShortRepr):
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies go without `__init__`, since what they hold was checked."""
         return _restored, (type(self), {name: getattr(self, name) for name in _field_names(type(self))})
+
+
+class BitView(Sequence[bool]):
+    """A bool column as Arrow packs it, eight rows a byte; rows are unpacked when asked for."""
+
+    def __init__(self, packed: ByteArray, length: int) -> None:
+        """View `length` bits, lowest first."""
+        self._packed, self._length = packed, length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __iter__(self) -> Iterator[bool]:
+        return iter(self[:].tolist())
+
+    def __getitem__(self, rows: Any) -> Any:
+        """One row as bool, or a slice with step 1 as a new bool array."""
+        if isinstance(rows, slice):
+            start, stop, _ = rows.indices(self._length)
+            return self._unpacked(start, max(start, stop))
+        return bool(self._packed.item(rows >> 3) >> (rows & 7) & 1)
+
+    def _unpacked(self, start: int, stop: int) -> BoolArray:
+        window = self._packed[start >> 3 : (stop + 7) >> 3]
+        first = start & 7
+        return np.unpackbits(window, bitorder="little")[first : first + stop - start].view(np.bool_)
 
 
 def checked(
@@ -206,6 +234,12 @@ def as_floats(values: ArrayLike) -> FloatArray:
         return given.astype(_FLOAT64)
     except (TypeError, ValueError) as error:
         raise GeometryError(f"expected numbers, found {type(values).__name__} ({error})") from error
+
+
+def in_range(numbers: AnyArray | float) -> BoolArray:
+    """Which numbers are neither NaN nor infinite, nor as large as no sound file has them."""
+    small: BoolArray = np.abs(numbers) <= np.float64(LARGEST)  # half precision has no 1e9
+    return small
 
 
 def known(values: ArrayLike | None, digits: int | None = None) -> Any:

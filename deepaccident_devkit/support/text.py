@@ -3,18 +3,21 @@
 import base64
 import math
 import os
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from html import escape
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, shortened
 
 Word = TypeVar("Word", bound=str | None)
 _LISTED = 20
 """Words that a message lists at most."""
+_NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+_INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
 
 
 def columns_text(rows: Sequence[Sequence[str]], *, left: int = 1) -> str:
@@ -51,6 +54,18 @@ class Pictured:
             content = base64.b64encode(Pictured.png_of(self)).decode("ascii")
             html = f'<img src="data:image/png;base64,{content}" alt="seen from above">{html}'
         return html
+
+
+def number_of(word: str) -> float | None:
+    """The number that a word of any length says, NaN and infinity included; None if it says none."""
+    return float(word) if _NUMBER.fullmatch(word) else None
+
+
+def integer_of(word: str) -> int | None:
+    """The integer of 64 bits that a word says; None if it says none. Python itself reads no more than 4,300 digits."""
+    found = _INTEGER.fullmatch(word)
+    value = int(found[1] + found[2]) if found else 2**63
+    return value if -(2**63) <= value < 2**63 else None
 
 
 def fixed_text(value: float, digits: int) -> str:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.parallel import Places, Progress, Store
-from deepaccident_devkit.release.store.names import SPLIT_FILE_FOLDER
+from deepaccident_devkit.release.store.members import SPLIT_FILE_FOLDER
 from deepaccident_devkit.support.files import is_writable_folder, place_in, remove_in, temporary_of, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes

@@ -1,17 +1,9 @@
 """The release as relational tables: their columns, the index they are made into, and the opened store."""
 
-from deepaccident_devkit.tables.boxes import visible_ids, visible_mask
-from deepaccident_devkit.tables.findings import SEVERITIES, Finding, Severity
-from deepaccident_devkit.tables.index import (
-    Index,
-    Problem,
-    clear_index,
-    open_index,
-    place_outside,
-)
-from deepaccident_devkit.tables.opened import OpenTables, RowArgument
-from deepaccident_devkit.tables.tables import Table, Tables, table_names
-from deepaccident_devkit.tables.velocities import displacement_velocities
+from deepaccident_devkit.tables.boxes import displacement_velocities, visible_ids, visible_mask
+from deepaccident_devkit.tables.index import Index, Problem, clear_index, open_index, place_outside
+from deepaccident_devkit.tables.scan import SEVERITIES, Finding, Severity
+from deepaccident_devkit.tables.tables import OpenTables, RowArgument, Table, Tables, table_names
 
 __all__ = [
     "SEVERITIES",

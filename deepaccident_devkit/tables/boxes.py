@@ -6,20 +6,40 @@ Arrays are over the N boxes of one scenario, in the order agent, frame, row. Who
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Labels
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats
+from deepaccident_devkit.release.labels import turned
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, as_floats
 from deepaccident_devkit.tables.columns import NULL_INTEGER
-from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, SMALL_CATEGORIES, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import (
+    CATEGORIES,
+    FRAME_PERIOD,
+    OWN_ACTOR_ID,
+    RELEASED_VELOCITY_FRAME,
+    SMALL_CATEGORIES,
+    STATIC_ACTOR_ID,
+    UNTRACKED_ID,
+    VELOCITY_FRAMES,
+)
 
 NEAR_VEHICLE = 10.0
 NEAR_INFRASTRUCTURE = 15.0
 """Metres from the LiDAR below which (strictly) a box is near."""
 _SMALL = np.array([name in SMALL_CATEGORIES for name in CATEGORIES])
+LEAST_BOXES: Final = 20
+"""With fewer moving boxes it is not known how a scenario's velocities are written."""
+_LEAST_SPEED = 1.0
+"""m/s; slower actors are not used."""
+_FITS = (0.5, 0.15)
+"""m/s, and as a share of the speed, within which a velocity fits."""
+_LEAST_SHARE = 0.5
+_AS_GOOD = 0.95
+"""Share of the best frame's boxes from which the release's own frame is taken instead."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,13 +122,10 @@ def instances(boxes: ScenarioBoxes) -> tuple[Mapping[str, AnyArray], AnyArray]:
 
 
 def tracks(boxes: ScenarioBoxes, instance_row: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Which box stands for each actor at each frame, ordered by frame and instance, and who annotated it.
+    """Which box (M,) stands for each actor at each frame, by frame and instance; (M,) bit masks of who annotated it.
 
     The box of the first agent in order that saw the actor from outside. An agent's own row counts only if nobody else
     annotated it, since it lies up to 0.3 m from where the others see it.
-
-    Returns:
-        (M,) rows of the chosen boxes; (M,) uint8 bit masks over `taxonomy.AGENTS`.
     """
     known = np.flatnonzero(instance_row != NULL_INTEGER)
     own = boxes.labels.actor_id[known] == OWN_ACTOR_ID
@@ -166,3 +183,111 @@ def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> I
     seen = [np.asarray(ids)[np.asarray(mask, dtype=bool)] for mask, ids in zip(masks, actor_ids, strict=True)]
     union = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *seen]).astype(np.int64))
     return np.setdiff1d(union, (OWN_ACTOR_ID, UNTRACKED_ID))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityFit(ShortRepr):
+    """How many boxes' velocities fit their displacement in each of `VELOCITY_FRAMES`; adds up over scenarios.
+
+    Attributes:
+        boxes: moving, tracked boxes of others that have both velocities.
+        fits: frame → boxes that fit.
+    """
+
+    boxes: int
+    fits: Mapping[str, int]
+
+    @property
+    def best(self) -> str | None:
+        """The frame that fits most boxes; None if there are too few, or none fits half of them.
+
+        The release's own counts where it fits nearly as many: on a straight road along x all frames are alike.
+        """
+        name = max(self.fits, key=lambda frame: self.fits[frame])
+        if self.fits[RELEASED_VELOCITY_FRAME] >= _AS_GOOD * self.fits[name]:
+            name = RELEASED_VELOCITY_FRAME
+        return name if self.boxes >= LEAST_BOXES and self.fits[name] >= _LEAST_SHARE * self.boxes else None
+
+
+def total_fit(fits: list[VelocityFit]) -> VelocityFit:
+    """The sum over scenarios."""
+    return VelocityFit(
+        boxes=sum(fit.boxes for fit in fits),
+        fits={name: sum(fit.fits[name] for fit in fits) for name in VELOCITY_FRAMES},
+    )
+
+
+def displacement_velocities(centers: FloatArray, agent: IntArray, label_id: IntArray, frame: IntArray) -> FloatArray:
+    """(N, 3) m/s in world from displacements at 10 Hz, NaN where unknown.
+
+    A track is one agent's rows of one label id (−100 is its own track): central differences where the frames before
+    and after are there, one-sided where one is, NaN where none is and for untracked rows.
+
+    Args:
+        centers: (N, 3) box centres in world, metres.
+        agent: (N,) which agent's.
+        label_id: (N,) ids as the labels say.
+        frame: (N,) frame numbers.
+    """
+    keys = np.column_stack([agent, label_id, frame])
+    steps, first, step_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    position = centers[first]
+    follows = (steps[1:, :2] == steps[:-1, :2]).all(axis=1) & (steps[1:, 2] == steps[:-1, 2] + 1)
+    before = np.concatenate([[False], follows])[: len(steps)]
+    after = np.concatenate([follows, [False]])[: len(steps)]
+    index = np.arange(len(steps))
+    span = (before.astype(np.float64) + after) * FRAME_PERIOD
+    known = (before | after) & (steps[:, 1] != UNTRACKED_ID)
+    velocity = np.full((len(steps), 3), np.nan)
+    with np.errstate(over="ignore"):  # labels may hold the largest numbers
+        moved = position[index + after] - position[index - before]
+        velocity[known] = moved[known] / span[known, None]
+    return velocity[step_of.reshape(-1)]
+
+
+def fit_velocities(boxes: ScenarioBoxes, displacement: FloatArray) -> VelocityFit:
+    """Which of `VELOCITY_FRAMES` the labels' velocities are in, by the displacements (N, 3) of the same boxes."""
+    rows, fits = velocities_that_fit(boxes, displacement)
+    return VelocityFit(boxes=len(rows), fits={name: int(fit.sum()) for name, fit in fits.items()})
+
+
+def velocities_that_fit(boxes: ScenarioBoxes, displacement: FloatArray) -> tuple[IntArray, dict[str, BoolArray]]:
+    """The rows (M,) of boxes that are used, and which of them fit each frame."""
+    label_id, said = boxes.labels.actor_id, boxes.labels.velocity
+    speed = np.linalg.norm(displacement[:, :2], axis=1)
+    telling = (label_id != OWN_ACTOR_ID) & (label_id != UNTRACKED_ID) & (label_id < STATIC_ACTOR_ID)
+    rows = np.flatnonzero(telling & (speed > _LEAST_SPEED) & np.isfinite(said).all(axis=1))
+    angles = _angles(boxes)
+    fits = {}
+    for name in VELOCITY_FRAMES:
+        off = np.linalg.norm(turned(said[rows], angles[name][rows]) - displacement[rows, :2], axis=1)
+        fits[name] = off < _FITS[0] + _FITS[1] * speed[rows]
+    return rows, fits
+
+
+def decoded_velocities(boxes: ScenarioBoxes, displacement: FloatArray, frame: str | None) -> FloatArray:
+    """(N, 3) m/s in world: the labels' own, which are in `frame`, where they have any; else the displacements (N, 3).
+
+    A label has no vertical velocity: it is taken from the displacement, and is 0 without one. None for the frame is the
+    release's own way.
+    """
+    over_ground = turned(boxes.labels.velocity, _angles(boxes)[frame or RELEASED_VELOCITY_FRAME])
+    own = boxes.labels.actor_id == OWN_ACTOR_ID
+    over_ground[own] = boxes.labels.velocity[own]  # in world, whatever the others' are in
+    velocity = np.column_stack([over_ground, np.nan_to_num(displacement[:, 2])])
+    unknown = np.flatnonzero(np.isnan(over_ground[:, 0] + over_ground[:, 1]))
+    velocity[unknown] = displacement[unknown]
+    return velocity
+
+
+def _angles(boxes: ScenarioBoxes) -> dict[str, FloatArray]:
+    """Frame → the angles (N,) that turn the labels' velocities into world."""
+    pose = boxes.world_from_lidar[boxes.sample]
+    heading = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
+    return {
+        "released": -boxes.labels.yaw,
+        "lidar": heading,
+        "world": np.zeros(len(boxes)),
+        "turned-wrong": -heading,
+        "box": quaternions.yaw_of(world_rotations(boxes)),
+    }

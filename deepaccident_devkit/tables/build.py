@@ -1,98 +1,48 @@
 """One scenario's files → the rows of every table, with row keys that count within the scenario."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict
+from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.release import Calibs, Labels, Meta, ScenarioFolder, read_calibs, read_labels, read_meta
-from deepaccident_devkit.release.store import ReleasePath, fetched
+from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.release import Calibs, Meta
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.tables import boxes as box_rules
-from deepaccident_devkit.tables.boxes import ScenarioBoxes
+from deepaccident_devkit.tables.arrow_files import Columns
+from deepaccident_devkit.tables.boxes import ScenarioBoxes, decoded_velocities, displacement_velocities, fit_velocities
 from deepaccident_devkit.tables.columns import NULL_INTEGER
-from deepaccident_devkit.tables.findings import Finding, finding_of
-from deepaccident_devkit.tables.scan import ScenarioScan
-from deepaccident_devkit.tables.sensor_rows import Rows, neighbour_rows, sensor_tables, timestamps
-from deepaccident_devkit.tables.velocities import decoded_velocities, displacement_velocities, fit_velocities
+from deepaccident_devkit.tables.scan import ScenarioFiles
 from deepaccident_devkit.taxonomy import (
     AGENTS,
+    BEV_CAMERA,
+    BEV_SHAPE,
+    CAMERAS,
+    CHANNEL_FORMAT,
+    CHANNEL_MODALITY,
+    CHANNELS,
+    FILE_FORMATS,
     INFRASTRUCTURE,
+    LIDAR,
+    MODALITIES,
     OWN_ACTOR_ID,
     TIMES_OF_DAY,
     UNTRACKED_ID,
     VEHICLE_AGENTS,
     VELOCITY_FRAMES,
+    frame_timestamp,
 )
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ScenarioFiles:
-    """The small files of a scenario, read.
-
-    Attributes:
-        scenario: where they lie.
-        scan: which there are.
-        meta: None if the scenario has none.
-        calibs: of every sample, agent by agent.
-        labels: of every labelled sample, agent by agent.
-    """
-
-    scenario: ScenarioFolder
-    scan: ScenarioScan
-    meta: Meta | None
-    calibs: Calibs
-    labels: Labels
-
-    @property
-    def num_samples(self) -> int:
-        """Agents times frames."""
-        return len(self.scan.agents) * self.scan.num_frames
+TRANSLATION_TOLERANCE: Final = 1e-3
+"""Metres by which a sensor's place on its agent jitters, since the release computes it in single precision; measured:
+2e-4 a few hundred metres from the world's origin."""
+ROTATION_TOLERANCE: Final = 1e-5
+"""The same for the entries of its rotation; measured: 4e-7."""
+_INTRINSIC_TOLERANCE = 1e-6
 
 
-def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles | None, list[Finding]]:
-    """Read a scenario's meta, calib and label files, and say everything that is wrong with them.
-
-    Returns:
-        The files, None if there is a fault; the faults, the first of every file.
-    """
-    faults: list[Finding] = []
-
-    def attempt(read: Any, code: str, paths: list[ReleasePath]) -> Any:
-        try:
-            return read(paths)
-        except ReleaseError as error:
-            if len(paths) == 1:
-                faults.append(finding_of(error, code, scenario.token))
-            else:
-                known = len(faults)
-                for path in paths:  # each by itself: the reader stops at the first
-                    attempt(read, code, [path])
-                if len(faults) == known:  # good alone, and not together
-                    faults.append(finding_of(error, code, scenario.token))
-            return None
-
-    frames = range(1, scan.num_frames + 1)
-    meta_paths = [scenario.meta_path] if scan.has_meta else []
-    calib_paths = [scenario.calib_path(agent, n) for agent in scan.agents for n in frames]
-    label_paths = [scenario.label_path(agent, n) for agent in scan.labelled for n in frames]
-    with fetched([*meta_paths, *calib_paths, *label_paths]):
-        metas = attempt(_read_metas, "meta-unreadable", meta_paths)
-        calibs = attempt(read_calibs, "calib-unreadable", calib_paths)
-        labels = attempt(read_labels, "label-unreadable", label_paths)
-    if faults:
-        return None, faults
-    meta = metas[0] if metas else None
-    return ScenarioFiles(scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels), []
-
-
-def _read_metas(paths: Sequence[ReleasePath]) -> list[Meta]:
-    return [read_meta(path) for path in paths]
-
-
-def scenario_rows(files: ScenarioFiles) -> dict[str, Rows]:
+def scenario_rows(files: ScenarioFiles) -> dict[str, Columns]:
     """The rows of every table but `sensor` and `category`, which are the same for all scenarios."""
     boxes = scenario_boxes(files)
     instance_rows, instance_of_box = box_rules.instances(boxes)
@@ -131,7 +81,7 @@ def scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
     )
 
 
-def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> Rows:
+def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> Columns:
     scenario, meta = files.scenario, files.meta
     signalized = "_subtype1_" in f"{scenario.scenario_type}_"
     collision = asdict(meta.collision) if meta and meta.collision else None
@@ -162,7 +112,7 @@ def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> Rows:
     }
 
 
-def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> Rows:
+def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> Columns:
     count = len(files.scan.agents)
     category = np.full(count, NULL_INTEGER)
     size = np.full((count, 3), np.nan)
@@ -180,7 +130,7 @@ def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> Rows:
     }
 
 
-def _frame_rows(files: ScenarioFiles) -> Rows:
+def _frame_rows(files: ScenarioFiles) -> Columns:
     count = files.scan.num_frames
     previous, following = neighbour_rows(count, 1)
     return {
@@ -193,7 +143,7 @@ def _frame_rows(files: ScenarioFiles) -> Rows:
     }
 
 
-def _sample_rows(files: ScenarioFiles) -> Rows:
+def _sample_rows(files: ScenarioFiles) -> Columns:
     agents, frames = len(files.scan.agents), files.scan.num_frames
     labelled = _sample_labelled(files)
     velocity = np.full((files.num_samples, 2), np.nan)
@@ -221,7 +171,7 @@ def _sample_rows(files: ScenarioFiles) -> Rows:
 
 def _annotation_rows(
     files: ScenarioFiles, boxes: ScenarioBoxes, instance_of_box: AnyArray, world_velocities: FloatArray
-) -> Rows:
+) -> Columns:
     labels = files.labels
     previous, following = box_rules.chains(boxes)
     return {
@@ -244,7 +194,7 @@ def _annotation_rows(
     }
 
 
-def _track_rows(boxes: ScenarioBoxes, annotations: Rows, centers: FloatArray, velocities: FloatArray) -> Rows:
+def _track_rows(boxes: ScenarioBoxes, annotations: Columns, centers: FloatArray, velocities: FloatArray) -> Columns:
     instance_of_box = annotations["instance_row"]
     chosen, agents = box_rules.tracks(boxes, instance_of_box)
     return {
@@ -294,13 +244,9 @@ def _time_of_day_code(meta: Meta | None) -> int:
 
 
 def accident_type(meta: Meta | None, *, signalized: bool) -> int | None:
-    """Which of the paper's designs 1 to 12 an accident realises (docs/format.md, Accident types).
+    """Which of the paper's designs an accident realises: 1 to 6 where there are lights, else 7 to 12 (docs/format.md).
 
     None for no accident, one with a pedestrian or a third vehicle, or of no design.
-
-    Args:
-        meta: the scenario's meta, None if it is missing.
-        signalized: whether the intersection has traffic lights: designs 1 to 6, else 7 to 12.
     """
     if meta is None or meta.collision is None or "pedestrian" in meta.collision.classes:
         return None
@@ -325,3 +271,124 @@ def _signalized_design(meta: Meta) -> int | None:
         designs = {frozenset({"straight", "left"}): 3, frozenset({"left", "right"}): 4}
         return designs.get(directions)
     return None
+
+
+def sensor_tables(calibs: Calibs, *, agents: int, frames: int) -> dict[str, Columns]:
+    """The rows of one scenario's sensor tables; `calibs` holds its samples agent by agent."""
+    values = _sensor_values(calibs)
+    calibrated_sensors, calibrated_sensor_of = _calibrated_sensor_rows(values, agents, frames)
+    return {
+        "sample_data": {
+            **_sample_data_rows(calibs, calibrated_sensor_of, agents, frames),
+            "matrix": values[..., :12].reshape(-1, 12),
+        },
+        "calibrated_sensor": calibrated_sensors,
+        "ego_pose": _ego_pose_rows(calibs, agents, frames),
+    }
+
+
+def sensor_rows() -> Columns:
+    """The rows of table `sensor`, the same for all scenarios."""
+    return {"channel": np.arange(len(CHANNELS)), "modality": _channel_modalities()}
+
+
+def neighbour_rows(frames: int, agents: int) -> tuple[IntArray, IntArray]:
+    """Columns before and after each of `agents` runs of `frames` rows; −1 at a run's ends."""
+    row = np.arange(agents * frames)
+    previous = np.where(row % frames == 0, NULL_INTEGER, row - 1)
+    return previous, np.where(row % frames == frames - 1, NULL_INTEGER, row + 1)
+
+
+def timestamps(frames: int) -> FloatArray:
+    """(F,) seconds since the first of `frames` frames."""
+    return np.array([frame_timestamp(index) for index in range(1, frames + 1)])
+
+
+def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: int, frames: int) -> Columns:
+    """Columns in the order sample, channel."""
+    samples, channels = len(calibs), len(CHANNELS)
+    previous, following = (
+        np.where(neighbour[:, None] < 0, NULL_INTEGER, neighbour[:, None] * channels + np.arange(channels))
+        for neighbour in neighbour_rows(frames, agents)
+    )
+    size = np.full((samples, channels, 2), NULL_INTEGER, dtype=np.int64)
+    size[:, : len(CAMERAS)] = np.rint(2 * calibs.intrinsic[..., :2, 2])
+    size[:, CHANNELS.index(BEV_CAMERA)] = BEV_SHAPE[::-1]
+    return {
+        "sample_row": np.repeat(np.arange(samples), channels),
+        "sensor_row": np.tile(np.arange(channels), samples),
+        "calibrated_sensor_row": calibrated_sensor_of.reshape(-1),
+        "ego_pose_row": np.repeat(np.arange(samples), channels),
+        "channel": np.tile(np.arange(channels), samples),
+        "modality": np.tile(_channel_modalities(), samples),
+        "fileformat": np.tile([FILE_FORMATS.index(CHANNEL_FORMAT[channel]) for channel in CHANNELS], samples),
+        "width": size[..., 0].reshape(-1),
+        "height": size[..., 1].reshape(-1),
+        "prev_row": previous.reshape(-1),
+        "next_row": following.reshape(-1),
+    }
+
+
+def _calibrated_sensor_rows(values: FloatArray, agents: int, frames: int) -> tuple[Columns, IntArray]:
+    """The distinct values of each agent's sensors by first occurrence; (samples, channels) which of them each is."""
+    row_of = np.zeros(values.shape[:2], dtype=np.int64)
+    chosen: list[FloatArray] = []
+    keys: list[tuple[int, int, int]] = []
+    for agent in range(agents):
+        samples = slice(agent * frames, (agent + 1) * frames)
+        for channel in range(len(CHANNELS)):
+            distinct, which = _distinct(values[samples, channel])
+            row_of[samples, channel] = len(keys) + which
+            chosen.append(distinct)
+            keys += [(agent, channel, number + 1) for number in range(len(distinct))]
+    table, key_table = np.concatenate(chosen), np.array(keys)
+    poses = table[:, :16].reshape(-1, 4, 4)
+    return {
+        "sensor_row": key_table[:, 1],
+        "agent_row": key_table[:, 0],
+        "number": key_table[:, 2],
+        "translation": poses[:, :3, 3],
+        "rotation": quaternions.from_matrix(poses[:, :3, :3]),
+        "camera_intrinsic": table[:, 16:],
+        "matrix": table[:, :16],
+    }, row_of
+
+
+def _sensor_values(calibs: Calibs) -> FloatArray:
+    """(samples, channels, 25): `ego_from_sensor` and K (NaN where there is none) of every file."""
+    samples, channels = len(calibs), len(CHANNELS)
+    matrix = np.tile(np.eye(4), (samples, channels, 1, 1))
+    matrix[:, : len(CAMERAS)] = calibs.ego_from_lidar[:, None] @ np.linalg.inv(calibs.camera_from_lidar)
+    matrix[:, CHANNELS.index(LIDAR)] = calibs.ego_from_lidar
+    intrinsic = np.full((samples, channels, 3, 3), np.nan)
+    intrinsic[:, : len(CAMERAS)] = calibs.intrinsic
+    return np.concatenate([matrix.reshape(samples, channels, 16), intrinsic.reshape(samples, channels, 9)], axis=-1)
+
+
+def _ego_pose_rows(calibs: Calibs, agents: int, frames: int) -> Columns:
+    pose = calibs.world_from_ego
+    return {
+        "translation": pose[:, :3, 3],
+        "rotation": quaternions.from_matrix(pose[:, :3, :3]),
+        "timestamp": np.tile(timestamps(frames), agents),
+        "matrix": pose.reshape(-1, 16),
+    }
+
+
+def _distinct(rows: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The rows (F, 25) that differ by more than rounding, in order of occurrence, and which of them each row is."""
+    tolerance = np.full(25, _INTRINSIC_TOLERANCE)
+    tolerance[:16] = ROTATION_TOLERANCE
+    tolerance[[3, 7, 11]] = TRANSLATION_TOLERANCE
+    which = np.full(len(rows), NULL_INTEGER)
+    first: list[int] = []
+    while (left := np.flatnonzero(which < 0)).size:
+        change = np.abs(rows[left] - rows[left[0]])
+        alike = (~(change > tolerance)).all(axis=1)  # NaN, where there is no K, is alike
+        which[left[alike]] = len(first)
+        first.append(int(left[0]))
+    return rows[first], which
+
+
+def _channel_modalities() -> AnyArray:
+    return np.array([MODALITIES.index(CHANNEL_MODALITY[channel]) for channel in CHANNELS])

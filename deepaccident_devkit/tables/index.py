@@ -39,11 +39,17 @@ from deepaccident_devkit.support.files import (
 )
 from deepaccident_devkit.support.reading import RefusedFileError, fault_text, file_checksum, limit_of, read_bytes
 from deepaccident_devkit.support.text import choice
-from deepaccident_devkit.tables.indexing import SCHEMA_VERSION, Outcome, index_scenario, join_tables
+from deepaccident_devkit.tables.arrow_files import table_path
+from deepaccident_devkit.tables.indexing import (
+    SCHEMA_VERSION,
+    Outcome,
+    SplitAssignment,
+    assign_splits,
+    index_scenario,
+    join_tables,
+)
 from deepaccident_devkit.tables.records import table_specs
 from deepaccident_devkit.tables.scan import contents_digest, folder_digest
-from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
-from deepaccident_devkit.tables.store import table_path
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
 
 if TYPE_CHECKING:

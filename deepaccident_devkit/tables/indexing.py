@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,31 @@ import numpy as np
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.parallel import Store
-from deepaccident_devkit.release import ScenarioFolder, read_meta
+from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta, read_split_file
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.reading import observed
-from deepaccident_devkit.tables.arrow import Columns
-from deepaccident_devkit.tables.build import ScenarioFiles, read_scenario, scenario_rows
+from deepaccident_devkit.tables.arrow_files import (
+    Columns,
+    TableWriter,
+    read_streams,
+    streams,
+    streams_metadata,
+    write_table,
+)
+from deepaccident_devkit.tables.build import scenario_rows, sensor_rows
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec
-from deepaccident_devkit.tables.findings import Finding
 from deepaccident_devkit.tables.records import table_specs
-from deepaccident_devkit.tables.scan import ScenarioScan, content_words, contents_digest, scan_scenario, times_digest
-from deepaccident_devkit.tables.sensor_rows import sensor_rows
-from deepaccident_devkit.tables.store import TableWriter, read_streams, streams, streams_metadata, write_table
-from deepaccident_devkit.taxonomy import CATEGORIES, SPLITS
+from deepaccident_devkit.tables.scan import (
+    Finding,
+    ScenarioFiles,
+    ScenarioScan,
+    content_words,
+    contents_digest,
+    read_scenario,
+    scan_scenario,
+    times_digest,
+)
+from deepaccident_devkit.taxonomy import CATEGORIES, MINI_SPLITS, SPLITS
 
 SCHEMA_VERSION = 4
 """Counts up whenever the stored columns, their meaning or the form of the index change."""
@@ -35,6 +49,76 @@ _FROM_OTHERS: Mapping[str, Mapping[str, Callable[[Columns], AnyArray]]] = {
 }
 """Table → column that is not kept, since it follows from others: a twentieth of the index."""
 _CONTENTS = "contents"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitAssignment:
+    """The splits of a release's scenarios.
+
+    Attributes:
+        split_of: scenario token → split; absent where it is unknown.
+        problems: scenario token → why it has no single place, a sentence each.
+        unlisted: scenarios that no split file lists, though there is one of every split.
+        contradictions: scenario token → how files and folders contradict each other; the files win.
+        notices: what is odd but harmless, a sentence each.
+    """
+
+    split_of: Mapping[str, str]
+    problems: Mapping[str, tuple[str, ...]]
+    unlisted: tuple[str, ...]
+    contradictions: Mapping[str, tuple[str, ...]]
+    notices: tuple[str, ...]
+
+
+def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
+    """Read the split files and compare them with the folders; raises SplitFileError for any other file."""
+    listed = {split: set(read_split_file(path)) for split, path in layout.split_files.items()}
+    tokens = {scenario.token for scenario in layout.scenarios}
+    problems: dict[str, list[str]] = {}
+    for group in (SPLITS, MINI_SPLITS):
+        for first, second in combinations([split for split in group if split in listed], 2):
+            for token in sorted(listed[first] & listed[second] & tokens):
+                files = f"{layout.split_files[first]} and {layout.split_files[second]}"
+                problems.setdefault(token, []).append(f"stands in two splits: {files}; remove it from one")
+    for token, folders in _folders_of(layout).items():
+        if len(folders) > 1:
+            places = " and ".join(str(layout.root / folder) for folder in folders)
+            problems.setdefault(token, []).append(f"stands in two folders: {places}; remove one")
+    in_folder = {scenario.token: scenario.folder for scenario in layout.scenarios if scenario.folder in SPLITS}
+    in_files = {token: split for split in SPLITS for token in listed.get(split, ())}
+    missing = {split: len(set(listed.get(split, ())) - tokens) for split in SPLITS}
+    return SplitAssignment(
+        split_of={token: split for token, split in {**in_folder, **in_files}.items() if token in tokens},
+        problems={token: tuple(messages) for token, messages in problems.items()},
+        unlisted=tuple(sorted(tokens - set(in_files))) if set(SPLITS) <= set(listed) else (),
+        contradictions=_contradictions(listed, in_folder),
+        notices=tuple(
+            f"{layout.split_files[split]}: lists {count} scenarios that are not in this release"
+            for split, count in missing.items()
+            if count
+        ),
+    )
+
+
+def _contradictions(listed: Mapping[str, set[str]], in_folder: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    messages: dict[str, list[str]] = {}
+    for token, folder in in_folder.items():
+        for split in SPLITS:
+            if split != folder and token in listed.get(split, ()):
+                messages.setdefault(token, []).append(f"lies in {folder}/, {split}.txt lists it")
+    for mini in MINI_SPLITS:
+        split = mini.removesuffix("_mini")
+        if split in listed:
+            for token in sorted(listed.get(mini, set()) - listed[split]):
+                messages.setdefault(token, []).append(f"{mini}.txt lists it, {split}.txt does not")
+    return {token: tuple(found) for token, found in messages.items()}
+
+
+def _folders_of(layout: ReleaseLayout) -> dict[str, list[str]]:
+    folders: dict[str, list[str]] = {}
+    for scenario in layout.scenarios:
+        folders.setdefault(scenario.token, []).append(scenario.folder)
+    return folders
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,13 +144,7 @@ class Outcome:
 
 
 def index_scenario(store: Store, scenario: ScenarioFolder, *, check_files: bool = False) -> Outcome:
-    """Keep the rows of one scenario, unless they are kept and its files are as they were.
-
-    Args:
-        store: where.
-        scenario: which.
-        check_files: compare the contents of its files; else their sizes and times alone.
-    """
+    """Keep the rows of one scenario, unless they are kept and its files have the same times, or contents."""
     key = f"{SCHEMA_VERSION}:{times_digest(scenario)}"  # before anything is read: a later edit is noticed
     token, scan = scenario.token, scan_scenario(scenario)
     if not scan.agents and not scan.problems:
@@ -113,16 +191,9 @@ def rows_to_keep(tables: Mapping[str, Columns], contents: str) -> bytes:
 
 
 def join_tables(folder: Path, scenarios: Sequence[Path], splits: Sequence[str | None]) -> None:
-    """Write every table to `folder`, which must exist: row keys count on, scenario after scenario.
+    """Write every table to a folder: row keys count on, scenario after scenario, whose kept rows and splits are given.
 
-    Args:
-        folder: where the tables go.
-        scenarios: the kept rows of each, in the order that they shall have.
-        splits: each scenario's split, None if unknown.
-
-    Raises:
-        OSError: something cannot be read or written.
-        IndexStoreError: a file holds no rows of a scenario.
+    Raises OSError, and IndexStoreError if a file holds no rows of a scenario.
     """
     specs = table_specs()
     with ExitStack() as stack:

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.tables.arrow_files import damaged_value
 from deepaccident_devkit.tables.columns import Choice, Column, Key, Struct, Subset, Vector
 from deepaccident_devkit.tables.records import table_spec
-from deepaccident_devkit.tables.store import damaged_value
 from deepaccident_devkit.tables.tokens import ACTOR
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.tables.opened import OpenTables
+    from deepaccident_devkit.tables.tables import OpenTables
 
 
 class RecordTables:
@@ -49,12 +49,9 @@ class RecordTables:
         }
 
     def rows(self, scenarios: Sequence[str], agents: Sequence[str] = AGENTS) -> dict[str, IntArray]:
-        """Table → its rows of some scenarios, given by token, in order; without `sensor` and `category`.
+        """Table → its rows of some scenarios (tokens), in order; without `sensor` and `category`; raises TokenError.
 
         Rows of what an agent recorded are only those of `agents`; tracks and instances are merged from all agents'.
-
-        Raises:
-            TokenError: no such scenario.
         """
         chosen = np.array([self._tables.getind("scenario", token) for token in scenarios], dtype=np.int64)
         agent, sample = self._tables.columns("agent"), self._tables.columns("sample")
@@ -78,13 +75,9 @@ class RecordTables:
         }
 
     def table(self, name: str, rows: IntArray) -> Any:
-        """Rows (N,) of a table as a `pyarrow.Table`, a column a field of its records.
+        """Rows (N,) of a table as a `pyarrow.Table`, a column a field; raises TableError and IndexStoreError.
 
         Choices are strings, matrices lists of lists. Lists have a fixed size where they are never null.
-
-        Raises:
-            TableError: no such table.
-            IndexStoreError: the index is damaged.
         """
         import pyarrow as pa
 

@@ -1,4 +1,4 @@
-"""What file names say of a scenario: its frames, missing files, and digests that change with any file."""
+"""A scenario's small files: which there are, what is in them and what is wrong with them; digests that tell changes."""
 
 import hashlib
 import os
@@ -6,21 +6,58 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.release import ScenarioFolder
+from deepaccident_devkit.release import Calibs, Labels, Meta, ScenarioFolder, read_calibs, read_labels, read_meta
 from deepaccident_devkit.release.layout import frame_numbers
-from deepaccident_devkit.release.store import ReleasePath, StorePath, listed
+from deepaccident_devkit.release.store import ReleasePath, StorePath, fetched, listed
+from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.reading import FileKind, fault_text, read_bytes
-from deepaccident_devkit.tables.findings import Finding, finding_of
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+"""Worst first: `error` cannot be indexed or cannot be true, `warning` is probably wrong, `note` is worth knowing."""
 ENDINGS = {"calib": "pkl", "label": "txt"}
 """Kind of small file → ending of its files."""
 _FRAMES_NAMED = 6
 _AnyPath: TypeAlias = ReleasePath | str
 _REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding(ShortRepr):
+    """One thing that is wrong, odd or missing.
+
+    Attributes:
+        code: its kind, such as `label-unreadable`; docs/validation.md lists them.
+        severity: how bad it is.
+        scenario: token of the scenario; None where the release as a whole is meant.
+        where: the file (with the line), the folder, or the agents and actors.
+        what: what is wrong there.
+        remedy: what to do.
+        known: whether the real release has it too; then it is no fault of this copy.
+    """
+
+    code: str
+    severity: Severity
+    scenario: str | None
+    where: str
+    what: str
+    remedy: str
+    known: bool = False
+
+    def __str__(self) -> str:
+        """One sentence: where, what, and the remedy."""
+        return f"{self.where}: {self.what}; {self.remedy}"
+
+
+def finding_of(error: ReleaseError, code: str, scenario: str | None) -> Finding:
+    """The finding that a reader's error tells of; its text is the error's."""
+    where, _, rest = str(error).partition(": ")
+    what, _, remedy = rest.rpartition("; ")
+    return Finding(code=code, severity="error", scenario=scenario, where=where, what=what, remedy=remedy)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +135,66 @@ def _broken(scenario: ScenarioFolder, code: str, where: ReleasePath, what: str, 
     return Finding(code=code, severity="error", scenario=scenario.token, where=str(where), what=what, remedy=remedy)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScenarioFiles:
+    """The small files of a scenario, read.
+
+    Attributes:
+        scenario: where they lie.
+        scan: which there are.
+        meta: None if the scenario has none.
+        calibs: of every sample, agent by agent.
+        labels: of every labelled sample, agent by agent.
+    """
+
+    scenario: ScenarioFolder
+    scan: ScenarioScan
+    meta: Meta | None
+    calibs: Calibs
+    labels: Labels
+
+    @property
+    def num_samples(self) -> int:
+        """Agents times frames."""
+        return len(self.scan.agents) * self.scan.num_frames
+
+
+def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles | None, list[Finding]]:
+    """A scenario's meta, calib and label files, None if there is a fault; and the faults, the first of every file."""
+    faults: list[Finding] = []
+
+    def attempt(read: Any, code: str, paths: list[ReleasePath]) -> Any:
+        try:
+            return read(paths)
+        except ReleaseError as error:
+            if len(paths) == 1:
+                faults.append(finding_of(error, code, scenario.token))
+            else:
+                known = len(faults)
+                for path in paths:  # each by itself: the reader stops at the first
+                    attempt(read, code, [path])
+                if len(faults) == known:  # good alone, and not together
+                    faults.append(finding_of(error, code, scenario.token))
+            return None
+
+    frames = range(1, scan.num_frames + 1)
+    meta_paths = [scenario.meta_path] if scan.has_meta else []
+    calib_paths = [scenario.calib_path(agent, n) for agent in scan.agents for n in frames]
+    label_paths = [scenario.label_path(agent, n) for agent in scan.labelled for n in frames]
+    with fetched([*meta_paths, *calib_paths, *label_paths]):
+        metas = attempt(_read_metas, "meta-unreadable", meta_paths)
+        calibs = attempt(read_calibs, "calib-unreadable", calib_paths)
+        labels = attempt(read_labels, "label-unreadable", label_paths)
+    if faults:
+        return None, faults
+    meta = metas[0] if metas else None
+    return ScenarioFiles(scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels), []
+
+
+def _read_metas(paths: Sequence[ReleasePath]) -> list[Meta]:
+    return [read_meta(path) for path in paths]
+
+
 def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[ReleasePath]) -> str:
     """A digest of the times of the scenarios' calib and label folders and of some files; opens none of them.
 
@@ -126,12 +223,7 @@ def times_digest(scenario: ScenarioFolder) -> str:
 
 
 def contents_digest(scenario: ScenarioFolder, known: Mapping[str, bytes] | None = None) -> str:
-    """A digest of name and content of every label, calib and meta file of a scenario.
-
-    Args:
-        scenario: where they lie.
-        known: path → `content_words` of files that were read already; the others are read now.
-    """
+    """A digest of names and contents of a scenario's small files; of those read already, `content_words` are given."""
     found = known or {}
     return _digest(scenario, lambda path, kind: found.get(str(path)) or _words_of_file(path, kind))
 

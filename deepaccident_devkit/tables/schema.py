@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from deepaccident_devkit.tables.arrow import arrow_type
+from deepaccident_devkit.tables.arrow_files import arrow_type
 from deepaccident_devkit.tables.columns import (
     Choice,
     Column,

@@ -10,7 +10,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud, quaternions
 from deepaccident_devkit.geometry.pointcloud import concatenate
-from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.support.arrays import FloatArray, checked_whole
 from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OnError
 from deepaccident_devkit.v2x.agents import Agents

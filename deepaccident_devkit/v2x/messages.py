@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import SE3
-from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.support.arrays import FloatArray, checked_number, checked_whole
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName, OnError

@@ -1,11 +1,10 @@
 """What is wrong, odd or missing in a release, checked across agents and files."""
 
 from deepaccident_devkit.tables import Finding
-from deepaccident_devkit.tables.velocities import VelocityFit
-from deepaccident_devkit.validation.checks import ScenarioCheck
+from deepaccident_devkit.tables.boxes import VelocityFit
 from deepaccident_devkit.validation.codes import CODES
 from deepaccident_devkit.validation.completeness import Completeness, FileCount, SplitFiles, release_completeness
-from deepaccident_devkit.validation.validate import ValidationReport, findings, validate_release
+from deepaccident_devkit.validation.validate import ScenarioCheck, ValidationReport, findings, validate_release
 
 __all__ = [
     "CODES",

@@ -16,8 +16,8 @@ from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import columns_text, counted, size_text
+from deepaccident_devkit.tables.indexing import assign_splits
 from deepaccident_devkit.tables.scan import ENDINGS
-from deepaccident_devkit.tables.split_assignment import assign_splits
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -197,14 +197,7 @@ def files_of(scenario: ScenarioFolder) -> tuple[FileCount, ...]:
 def completeness(
     layout: ReleaseLayout, found: Iterable[tuple[str, Sequence[FileCount]]], dataroot: str, *, selected: bool
 ) -> Completeness:
-    """Sum the files of scenarios.
-
-    Args:
-        layout: the release, with the split files to read.
-        found: token of each scenario, and what `files_of` gives of it.
-        dataroot: its name.
-        selected: whether these are not all scenarios.
-    """
+    """The sum of the files of scenarios, of which `files_of` told; `selected` if these are not all of the release."""
     split_of = assign_splits(layout).split_of
     by_split: dict[str, dict[str, list[FileCount]]] = {}
     for token, counts in found:

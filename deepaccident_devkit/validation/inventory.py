@@ -12,9 +12,8 @@ from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.safety import torn_twins
 from deepaccident_devkit.support.reading import fault_text, irregular_text
 from deepaccident_devkit.tables import Finding
-from deepaccident_devkit.tables.findings import finding_of
-from deepaccident_devkit.tables.scan import ScenarioScan, frame_ranges
-from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
+from deepaccident_devkit.tables.indexing import SplitAssignment, assign_splits
+from deepaccident_devkit.tables.scan import ScenarioScan, finding_of, frame_ranges
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT, CHANNELS
 from deepaccident_devkit.validation.subject import frames_text, make_finding
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import Finding
-from deepaccident_devkit.tables.sensor_rows import ROTATION_TOLERANCE, TRANSLATION_TOLERANCE
-from deepaccident_devkit.tables.velocities import LEAST_BOXES, VelocityFit, velocities_that_fit
+from deepaccident_devkit.tables.boxes import LEAST_BOXES, VelocityFit, velocities_that_fit
+from deepaccident_devkit.tables.build import ROTATION_TOLERANCE, TRANSLATION_TOLERANCE
 from deepaccident_devkit.taxonomy import (
     CAMERAS,
     CATEGORIES,

@@ -21,16 +21,8 @@ from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.support.reading import FileKind, read_bytes
 from deepaccident_devkit.tables import Finding
-from deepaccident_devkit.tables.findings import finding_of
-from deepaccident_devkit.taxonomy import (
-    BEV_CAMERA,
-    BEV_RESOLUTION,
-    BEV_SHAPE,
-    CAMERAS,
-    CATEGORIES,
-    LIDAR,
-    OWN_ACTOR_ID,
-)
+from deepaccident_devkit.tables.scan import finding_of
+from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE, CAMERAS, CATEGORIES, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.validation.inventory import Inventory
 from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_text
 
@@ -86,14 +78,11 @@ ORIENTATIONS: dict[str, str] = {
 
 
 def zero_stretch(content: bytes) -> tuple[int, int] | None:
-    """The place and length of a stretch of zero bytes in a JPEG's picture data that no encoder writes.
+    """Place and length of a stretch of zero bytes in a JPEG's picture data that no encoder writes; None without any.
 
-    With the usual codes, zero bits are coefficients that are negative one after the other up to a block's last.
-    `ZEROS` bytes hold several such blocks, which no picture has. In codes made for one picture they can be an even
-    surface, and nothing is said.
-
-    Returns:
-        Offset and length in bytes; None if there is none, or the file is no JPEG with the usual codes.
+    With the usual codes, zero bits are coefficients that are negative one after the other up to a block's last. `ZEROS`
+    bytes hold several such blocks, which no picture has. In codes made for one picture they can be an even surface, and
+    nothing is said.
     """
     start, stop = _last_scan(content)
     if content.find(_USUAL_CODES, 0, start) < 0 or (zeros := content.find(bytes(ZEROS), start, stop)) < 0:

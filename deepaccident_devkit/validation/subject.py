@@ -13,8 +13,8 @@ from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, 
 from deepaccident_devkit.tables import Finding, displacement_velocities
 from deepaccident_devkit.tables import boxes as box_rules
 from deepaccident_devkit.tables.boxes import ScenarioBoxes
-from deepaccident_devkit.tables.build import ScenarioFiles, scenario_boxes
-from deepaccident_devkit.tables.scan import frame_ranges
+from deepaccident_devkit.tables.build import scenario_boxes
+from deepaccident_devkit.tables.scan import ScenarioFiles, frame_ranges
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
 from deepaccident_devkit.validation.codes import CODES
 
@@ -176,10 +176,9 @@ def subject_of(files: ScenarioFiles) -> Subject:
 
 
 def near_pairs(places: FloatArray, moments: AnyArray, radius: float) -> tuple[IntArray, BoolArray]:
-    """Which places (M, 3) of a moment (M,) are no further apart than `radius`.
+    """Pairs (P, 2) of places (M, 3) of a moment (M,) within `radius`; and (M,) which are in crowds, and in no pair.
 
-    Returns:
-        (P, 2) pairs of them; (M,) those in crowds, which are in no pair: pairs of many at one place would have no end.
+    Pairs of many at one place would have no end.
     """
     from scipy.spatial import cKDTree
 

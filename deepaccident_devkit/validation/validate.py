@@ -2,32 +2,49 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.parallel import Places, Store, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import left_aside, names_without_calib
-from deepaccident_devkit.release.store import Dataroot, checksums_compared, open_dataroot, places_of
+from deepaccident_devkit.release.store import (
+    Dataroot,
+    Entry,
+    ReleasePath,
+    checksums_compared,
+    listed,
+    open_dataroot,
+    places_of,
+)
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.files import writable_folder
+from deepaccident_devkit.support.reading import LIMITS_VARIABLE
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.tables import SEVERITIES, Finding
-from deepaccident_devkit.tables.build import read_scenario
-from deepaccident_devkit.tables.scan import scan_scenario
-from deepaccident_devkit.tables.velocities import VelocityFit, fit_velocities, total_fit
-from deepaccident_devkit.taxonomy import VELOCITY_FRAMES
+from deepaccident_devkit.tables.boxes import VelocityFit, fit_velocities, total_fit
+from deepaccident_devkit.tables.scan import read_scenario, scan_scenario, times_digest
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, VELOCITY_FRAMES
 from deepaccident_devkit.validation.agreement import check_agreement, check_story
-from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, check_key
-from deepaccident_devkit.validation.completeness import Completeness, chosen_scenarios, completeness, files_of
+from deepaccident_devkit.validation.completeness import (
+    Completeness,
+    FileCount,
+    chosen_scenarios,
+    completeness,
+    files_of,
+)
 from deepaccident_devkit.validation.inventory import absences, check_splits, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses, check_untracked, check_velocities
@@ -39,8 +56,71 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.parallel import Engine
 
+NO_FIT = total_fit([])
 _LINES_A_SCENARIO = 8
 _ALL_LISTED = "(--all lists all)"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioCheck:
+    """What was found in one scenario.
+
+    Attributes:
+        token: the scenario's.
+        findings: in the order of the checks.
+        samples: agents times frames.
+        files: how many are here and missing.
+        velocity: what the labels' velocities fit.
+    """
+
+    token: str
+    findings: tuple[Finding, ...]
+    samples: int
+    files: tuple[FileCount, ...]
+    velocity: VelocityFit = NO_FIT
+
+    def to_json(self) -> str:
+        """One JSON object, from which `of_json` makes an equal one."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def of_json(cls, text: bytes) -> ScenarioCheck:
+        """The check that `to_json` wrote."""
+        stored = json.loads(text)  # names of files may have half characters
+        return cls(
+            token=stored["token"],
+            findings=tuple(Finding(**each) for each in stored["findings"]),
+            samples=stored["samples"],
+            files=tuple(FileCount(**each) for each in stored["files"]),
+            velocity=VelocityFit(**stored["velocity"]),
+        )
+
+
+def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
+    """A digest of all that decides a scenario's check: the devkit, settings, names, sizes and times of its files."""
+    settings = (__version__, deep, str(scenario.root), scenario.folder, os.environ.get(LIMITS_VARIABLE))
+    digest = hashlib.blake2b(f"{settings} {times_digest(scenario)}".encode(), digest_size=8)
+    for agent in AGENTS:
+        for channel in CHANNELS:
+            for words in (f"{agent}/{channel}", *_entries(scenario.kind_folder(agent, channel))):
+                digest.update(os.fsencode(f"{words}\n"))
+    return digest.hexdigest()
+
+
+def _entries(folder: ReleasePath) -> list[str]:
+    """Name, size and time of everything in a folder; nothing if it cannot be listed."""
+    try:
+        return sorted(f"{entry.name} {_times(entry)}" for entry in listed(folder))
+    except OSError:
+        return []
+
+
+def _times(entry: Entry) -> str:
+    try:
+        status = entry.stat()
+    except OSError:  # a link that leads nowhere
+        return "none"
+    return f"{status.st_size} {status.st_mtime_ns}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.keyframes import keyframes
+from deepaccident_devkit.export.frames import keyframes
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.geometry import SE3

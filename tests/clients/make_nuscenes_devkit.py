@@ -13,7 +13,7 @@ import numpy as np
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.keyframes import keyframes
+from deepaccident_devkit.export.frames import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.scenes import CHANNEL_NAMES
 from deepaccident_devkit.synth import SynthConfig, make_release

@@ -15,8 +15,8 @@ import numpy as np
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.format import SPLIT_NAMES
 from deepaccident_devkit.export.parquet import Parquet
-from deepaccident_devkit.export.shards import SPLIT_NAMES
 from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.synth import SynthConfig, make_release
 

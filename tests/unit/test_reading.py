@@ -116,21 +116,19 @@ OTHER_WAYS_TO_READ = re.compile(
 )
 NOT_OF_STRANGERS = {
     "support/reading.py": "the gate",
-    "support/archives.py": "its archives, of which the end was checked",
     "support/files.py": "the system's processes",
-    "cli/streams.py": "nothing: the null device",
+    "cli/process.py": "nothing: the null device",
     "cli/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
     "explore/pages/scenarios.py": "the split file that was written a line before",
     "explore/pages/answers.py": "the package's own styles and scripts",
     "explore/serving.py": "a browser",
-    "export/questions/format.py": "the parts that the export wrote",
+    "export/questions/questions.py": "the parts that the export wrote",
     "support/pages.py": "the package's own templates",
     "parallel/store.py": "locks, of which nothing is believed",
     "release/images.py": "the head of an image that the gate opened",
-    "release/store/sources.py": "fsspec, and the gate's files",
     "release/store/store.py": "the cache's own copies",
-    "release/store/zips.py": "the directory of an archive that the gate or fsspec opened",
+    "release/store/sources.py": "fsspec, and the directory of an archive that the gate or fsspec opened",
     "synth/spec/catalogue.py": "the package's own designs",
 }
 

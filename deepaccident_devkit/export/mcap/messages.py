@@ -34,7 +34,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.export.mcap.config import EPOCH
+from deepaccident_devkit.export.mcap import EPOCH
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.render.boxes import EDGES
 from deepaccident_devkit.render.roles import recorders_of
@@ -158,12 +158,7 @@ def moment_of(scenario: str, index: int, agents: tuple[str, ...]) -> Moment:
 
 
 def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[str, ...]:
-    """The agents that an `agents=` argument means, in the order of `taxonomy.AGENTS`.
-
-    Raises:
-        ChoiceError: no such agent or configuration, or no agent is given.
-        NotAvailableError: an agent is not in this (partial) release of the scenario.
-    """
+    """The agents that an `agents=` argument means, in usual order; raises ChoiceError and NotAvailableError."""
     first = agents_of(dataset, scenario)[0]
     chosen = cooperating_agents(dataset, sample_token(scenario, first, 1), agents)
     return tuple(agent for agent in AGENTS if agent in chosen)

@@ -13,7 +13,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results import Prediction, Results
-from deepaccident_devkit.export.mcap.config import Predictions
+from deepaccident_devkit.export.mcap import Predictions
 from deepaccident_devkit.export.mcap.messages import (
     COLORED_POINT,
     Moment,
@@ -87,13 +87,10 @@ class MotionMaps:
 def cell_points(
     instance: AnyArray, grid: BevGrid, valid: BoolArray | None = None, colors: Mapping[int, str] | None = None
 ) -> AnyArray:
-    """The cells of instance maps as points (N,) of `CELL_POINT`, by frame; later frames are paler and higher.
+    """The cells of instance maps (T, H, W) as points (N,) of `CELL_POINT`, by frame; later frames are paler and higher.
 
-    Args:
-        instance: (T, H, W) ids from 1, 0 elsewhere, all frames in the present ego frame.
-        grid: the cells of the maps.
-        valid: (T,) which frames count; None for all.
-        colors: id → colour; the other ids have the colours of a palette.
+    All frames are in the present ego frame; `valid` (T,) are those that count. Ids without a colour have those of a
+    palette.
     """
     count = len(instance)
     shown = instance > 0

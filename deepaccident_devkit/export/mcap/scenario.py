@@ -20,7 +20,7 @@ from tqdm import tqdm
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.export.mcap.config import EXPORTED_CHANNELS, McapConfig, Predictions
+from deepaccident_devkit.export.mcap import EXPORTED_CHANNELS, McapConfig, Predictions
 from deepaccident_devkit.export.mcap.messages import (
     Moment,
     Recording,
@@ -48,7 +48,7 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion.config import label_config
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.images import read_jpeg
-from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.roles import role_colors

@@ -27,7 +27,7 @@ from deepaccident_devkit.evaluation.results.entries import (
 )
 from deepaccident_devkit.evaluation.results.header import ContentError, at, shown
 from deepaccident_devkit.evaluation.results.records import FORMAT, BoxEntry
-from deepaccident_devkit.export.keyframes import KEY_STEP
+from deepaccident_devkit.export.frames import KEY_STEP
 from deepaccident_devkit.export.nuscenes.scenes import token
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
@@ -111,8 +111,7 @@ def _read(document: object, ours: Mapping[str, str]) -> NuScenesDetections:
 def _take_our_classes(results: dict[str, Any]) -> dict[str, dict[int, str]]:
     """Give boxes our classes, those of other classes any, and null for a velocity of NaN; what is wrong stays.
 
-    Returns:
-        Token → number of each box that is to be left out, and its class.
+    Returns, by token, the number of each box that is to be left out, and its class.
     """
     left_out: dict[str, dict[int, str]] = {}
     for theirs, given in results.items():

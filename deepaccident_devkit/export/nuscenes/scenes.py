@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.export.keyframes import keyframe_after, keyframes
-from deepaccident_devkit.export.sensor_files import sensor_files, stored_camera
+from deepaccident_devkit.export.frames import keyframe_after, keyframes, sensor_files, stored_camera
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath
@@ -77,22 +76,6 @@ def token(kind: str, *parts: object) -> str:
     return hashlib.md5("/".join(map(str, (kind, *parts))).encode(), usedforsecurity=False).hexdigest()
 
 
-def scene_name(scenario: str, agent: str) -> str:
-    """A scene is what one agent recorded of a scenario, given by its token: `<type>-<scenario>-<agent>`."""
-    return f"{scenario.replace('/', '-')}-{agent}"
-
-
-def timestamp(scenario_row: int, agent: str, number: int) -> int:
-    """Microseconds of a frame; the devkit of nuScenes sorts scenes by their first one, so no two are the same.
-
-    Args:
-        scenario_row: of the scenario table, which gets an hour of its own.
-        agent: who recorded it; agents are a microsecond apart.
-        number: of the frame, from 1.
-    """
-    return _EPOCH + (scenario_row + 1) * _HOUR + number * _PERIOD + AGENTS.index(agent)
-
-
 def sensor_path(scene: str, channel: str, stamp: int, *, key: bool) -> str:
     """The path of a sensor file below the folder; `channel` is ours."""
     name = CHANNEL_NAMES[channel]
@@ -117,8 +100,8 @@ class Scene:
 
     @property
     def name(self) -> str:
-        """As in the table `scene` and in `splits.json`."""
-        return scene_name(self.scenario, self.agent)
+        """As in the table `scene` and in `splits.json`: `<type>-<scenario>-<agent>`."""
+        return f"{self.scenario.replace('/', '-')}-{self.agent}"
 
     @cached_property
     def last(self) -> int:
@@ -156,8 +139,12 @@ class Scene:
         return sample_token(self.scenario, self.agent, number)
 
     def stamp(self, number: int) -> int:
-        """Microseconds of a frame."""
-        return timestamp(self.dataset.getind("scenario", self.scenario), self.agent, number)
+        """Microseconds of a frame: a scenario has an hour of its own, an agent starts a microsecond after the other.
+
+        The devkit of nuScenes sorts scenes by their first one, so no two are the same.
+        """
+        hours = self.dataset.getind("scenario", self.scenario) + 1
+        return _EPOCH + hours * _HOUR + number * _PERIOD + AGENTS.index(self.agent)
 
     def rows(self) -> Rows:
         """The rows of `scene`, `log`, `sample` and `ego_pose`."""
@@ -307,9 +294,6 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
 
     Files that are missing in a partial release have rows too, as those of a partial nuScenes download: evaluations look
     up every keyframe's `LIDAR_TOP`, but open no cloud. A missing image has the size of the camera's first one.
-
-    Raises:
-        SensorFileError: a file cannot be read.
     """
     data: list[Row] = []
     calibrated: dict[str, Row] = {}

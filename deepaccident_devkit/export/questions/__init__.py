@@ -12,7 +12,7 @@ docs/exports.md says what a question shows, and what not.
 """
 
 from deepaccident_devkit.export.questions.answers import Answers, read_answers, results_of_answers
-from deepaccident_devkit.export.questions.format import Questions
 from deepaccident_devkit.export.questions.observed import WindowRules
+from deepaccident_devkit.export.questions.questions import Questions
 
 __all__ = ["Answers", "Questions", "WindowRules", "read_answers", "results_of_answers"]

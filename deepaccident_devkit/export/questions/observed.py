@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.keyframes import KEY_STEP
+from deepaccident_devkit.export.frames import KEY_STEP
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.support.arrays import (
@@ -289,15 +289,7 @@ def names_of(
 def question_facts(
     seen: SeenRows, paths: Sequence[AgentPath], names: Names, window: Window, scenario: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What a question says, but its id, what it asks, and pictures.
-
-    Args:
-        seen: the actors.
-        paths: of the agents.
-        names: of all of them.
-        window: the moments.
-        scenario: its record, of which only `CONDITIONS` are taken.
-    """
+    """What a question says, but its id, what it asks, and pictures; of a scenario only `CONDITIONS` are taken."""
     of_agent = {path.agent: path for path in paths}
     of_name = {agent: name for name, agent in names.observers.items()}
     sets = {bits: [of_name[agent] for agent in _agents_in(bits, of_name)] for bits in np.unique(seen.seen_by).tolist()}

@@ -26,11 +26,9 @@ except ModuleNotFoundError as error:
     ) from error
 
 from deepaccident_devkit.export.images import ImageConfig
-from deepaccident_devkit.export.torch.all_egos import AllEgosDataset
-from deepaccident_devkit.export.torch.collate import collate, collate_all_egos, collate_fusion
+from deepaccident_devkit.export.torch.collate import collate, collate_all_egos, collate_fusion, merged_evaluator
 from deepaccident_devkit.export.torch.config import RandomAugmentation, V2XConfig
-from deepaccident_devkit.export.torch.dataset import V2XDataset
-from deepaccident_devkit.export.torch.distributed import merged_evaluator
+from deepaccident_devkit.export.torch.dataset import AllEgosDataset, V2XDataset
 
 __all__ = [
     "AllEgosDataset",

@@ -14,7 +14,7 @@ from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.torch.config import V2XConfig, augmented_points, augmented_pose
 from deepaccident_devkit.motion import Augmentation
-from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import LIDAR, AgentName
@@ -37,11 +37,8 @@ def participants(dataset: Dataset, sample: str, agents: Agents) -> tuple[AgentNa
 def received(dataset: Dataset, sample: str, names: tuple[AgentName, ...], config: V2XConfig) -> Received:
     """The messages that arrive at a sample and at the `config.past` − 1 moments before it, each through the link.
 
-    A moment before the recording has no messages. If latency asks for data from before the recording, the moment has
-    no messages of partners; at the sample itself that is an error.
-
-    Raises:
-        ConfigError: the link's latency is longer than the scenario's past at the present.
+    A moment before the recording has no messages. If latency asks for data from before the recording, the moment has no
+    messages of partners; at the sample itself that raises ConfigError.
     """
     scenario, ego, number = sample.rsplit("/", 2)
     result: list[dict[AgentName, Message]] = []
@@ -72,11 +69,7 @@ def with_files(
 ) -> tuple[Received, IntArray]:
     """The messages whose sensor files are all there, and how many files each agent and frame (A, P) lacks.
 
-    With a cache, images are there if it has them.
-
-    Raises:
-        MissingFileError: a file is not there, and `on_missing` is `raise`, or it is the sample's own of the present,
-            which it needs.
+    With a cache, images are there if it has them. Raises MissingFileError, by `on_missing`, or if a sample `needs_own`.
     """
     channels = (*[LIDAR] * config.points, *(() if config.images is None else config.images.cameras))
     files = MissingFiles(dataset.dataroot, config.on_missing)
@@ -141,12 +134,7 @@ def own_motions(
 def point_clouds(
     dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
 ) -> list[list[AnyArray]]:
-    """For each agent and moment (N, 4) float32: x y z in the sender's own augmented ego frame, intensity.
-
-    Raises:
-        MissingFileError: a point cloud was not downloaded.
-        SensorFileError: one cannot be read.
-    """
+    """For each agent and moment (N, 4) float32: x y z in the sender's own augmented ego frame, intensity."""
 
     def cloud(message: Message) -> AnyArray:
         return augmented_points(dataset.load_point_cloud(message.sample, "ego"), augmentation)
@@ -164,15 +152,9 @@ def camera_arrays(
 ) -> dict[str, AnyArray]:
     """All agents' C cameras; without a message, images are 0 and matrices are the identity.
 
-    Returns:
-        `images` (A, P, C, 3, h, w) as the configuration says, and, all float32, `intrinsics` (A, P, C, 3, 3),
-        `ego_from_camera` (A, P, C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), with the senders' own augmented ego
-        frames.
-
-    Raises:
-        MissingFileError: an image was not downloaded.
-        SensorFileError: one cannot be read.
-        ConfigError: images have different sizes, or the crop reaches beyond them.
+    `images` (A, P, C, 3, h, w) as the configuration says, and, all float32, `intrinsics` (A, P, C, 3, 3),
+    `ego_from_camera` (A, P, C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), with the senders' own augmented ego frames.
+    Raises ConfigError if images have different sizes, or the crop reaches beyond them.
     """
     load = config.load if cache is None else partial(cache.load, config)
     shape = (len(names), len(arrived), len(config.cameras))

@@ -1,13 +1,8 @@
 """Where a release's files are read: real folders, zip archives, or URLs. Nothing above `release` knows which."""
 
-from deepaccident_devkit.release.store.opening import (
-    INDEX_FOLDER,
-    index_places,
-    list_files_in,
-    open_dataroot,
-    places_of,
-)
+from deepaccident_devkit.release.store.opening import INDEX_FOLDER, index_places, list_files_in, open_dataroot
 from deepaccident_devkit.release.store.paths import (
+    REMEDY,
     Dataroot,
     Entry,
     ReleasePath,
@@ -17,11 +12,15 @@ from deepaccident_devkit.release.store.paths import (
     is_folder,
     leads_back,
     listed,
+    places_of,
+    read_content,
+    read_lines,
     real_path,
 )
 
 __all__ = [
     "INDEX_FOLDER",
+    "REMEDY",
     "Dataroot",
     "Entry",
     "ReleasePath",
@@ -35,5 +34,7 @@ __all__ = [
     "listed",
     "open_dataroot",
     "places_of",
+    "read_content",
+    "read_lines",
     "real_path",
 ]

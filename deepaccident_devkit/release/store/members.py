@@ -1,12 +1,14 @@
-"""The list of a store's files: where each lies in which archive; a memory-mapped Arrow file beside the index.
+"""Which files are of a release, by the folders that lead to them, and the list of a store's files.
 
-Opening it takes milliseconds for millions of files: only folders are looked at, and a file is found among those of its
-folder, which are sorted, when it is asked for.
+The list says where each lies in which archive; it is a memory-mapped Arrow file beside the index. Opening it takes
+milliseconds for millions of files: only folders are looked at, and a file is found among those of its folder, which are
+sorted, when it is asked for.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +21,15 @@ from deepaccident_devkit.errors import DatarootError, IndexStoreError, shortened
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.support.reading import irregular_text
+from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
+MINI_FOLDER: Final = "DeepAccident_mini"
+SPLIT_FOLDERS: Final = SPLITS
+SPLIT_FILE_FOLDER: Final = "split_txt_files"
+SCENARIO_TYPE: Final = re.compile(r"type\d+_subtype\d+_(?:accident|normal)")
+SPLIT_FILES: Final = tuple(f"{split}.txt" for split in (*SPLITS, *MINI_SPLITS))
+_FROM_MACOS: Final = "__MACOSX"
+"""The folder that macOS adds to its archives."""
 FORM: Final = 2
 """Counts up whenever the file's form or its meaning changes."""
 _HEAD: Final = b"deepaccident_members"
@@ -37,6 +47,27 @@ _NUMBERS: Final = np.dtype(
 _FRAME: Final = slice(-7, -4)
 """Where the name of a frame's file has its number."""
 _REMEDY: Final = "remove it with: deepaccident index DATAROOT --clear"
+
+
+def release_folder(parts: Sequence[str]) -> str | None:
+    """The folder of a release that a folder stands for: from its scenario type on, below its split folder if any.
+
+    `DeepAccident/train/type1_subtype1_accident/meta` stands for `train/type1_subtype1_accident/meta`. What leads there
+    does not matter, so that an archive may hold any part of a release, below any folders. Empty for the release's own
+    folder; None for one that holds files of no release.
+    """
+    if any(name.startswith(".") or name == _FROM_MACOS for name in parts):  # hidden, or leading out of an archive
+        return None
+    types = [place for place, name in enumerate(parts) if SCENARIO_TYPE.fullmatch(name)]
+    if not types:
+        return ""
+    above = [name for name in parts[: types[-1]] if name in (*SPLIT_FOLDERS, MINI_FOLDER)]
+    return "/".join([*above[-1:], *parts[types[-1] :]])
+
+
+def is_release_file(folder: str, name: str) -> bool:
+    """Whether a file is of a release: below a scenario type, or a split file in the release's own folder."""
+    return bool(folder) or name in SPLIT_FILES
 
 
 class Member(NamedTuple):
@@ -160,12 +191,7 @@ class Members:
 
 
 def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, tuple[int, str]]) -> None:
-    """Write the list of the files of some archives, whose `Members.states` are these.
-
-    Raises:
-        DatarootError: a file is in two archives, or twice in one.
-        OSError: it cannot be written.
-    """
+    """Write the list of some archives' files; raises DatarootError for a file that is in it twice."""
     import pyarrow as pa
 
     folders = sorted({folder for listing in listings for folder in listing.folders})

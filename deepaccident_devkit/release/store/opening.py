@@ -16,20 +16,22 @@ import numpy as np
 
 from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError
 from deepaccident_devkit.parallel import Places, run_batch
-from deepaccident_devkit.release.store.members import FORM, Listing, Members, write_members
-from deepaccident_devkit.release.store.names import (
+from deepaccident_devkit.release.store.members import (
+    FORM,
     MINI_FOLDER,
     SCENARIO_TYPE,
     SPLIT_FILE_FOLDER,
     SPLIT_FILES,
     SPLIT_FOLDERS,
+    Listing,
+    Members,
     is_release_file,
     release_folder,
+    write_members,
 )
 from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, is_folder, listed
-from deepaccident_devkit.release.store.sources import UrlSource, asked
+from deepaccident_devkit.release.store.sources import UrlSource, asked, list_zip
 from deepaccident_devkit.release.store.store import opened_store
-from deepaccident_devkit.release.store.zips import list_zip
 from deepaccident_devkit.support.files import is_writable_folder
 from deepaccident_devkit.support.reading import fault_text, open_file
 from deepaccident_devkit.support.text import path_text
@@ -111,11 +113,6 @@ def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[
 def list_files_in(place: Path) -> list[Path]:
     """The lists of stores' files in a folder of indexes, with what they were made from."""
     return sorted(place.glob(f"{_LIST}*"))
-
-
-def places_of(root: ReleasePath) -> tuple[Path, ...]:
-    """What workers must see to read a release."""
-    return (root,) if isinstance(root, Path) else root.store.places
 
 
 def _located(dataroot: str | os.PathLike[str]) -> Path | str:

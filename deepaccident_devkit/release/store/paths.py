@@ -9,11 +9,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import total_ordering
 from pathlib import Path, PurePath, PurePosixPath
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
-from deepaccident_devkit.errors import DatarootError, NotAvailableError
+from deepaccident_devkit.errors import DatarootError, MissingFileError, NotAvailableError, ReleaseError
 from deepaccident_devkit.release.store.store import COMPARES, READ_BEFORE, Store
-from deepaccident_devkit.support.reading import FileKind, fault_text
+from deepaccident_devkit.support.reading import FileKind, fault_text, read_bytes
+
+REMEDY: Final = "restore the file from its archive"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +115,29 @@ ReleasePath: TypeAlias = Path | StorePath
 """Where something of a release lies: a real path, or one in a store."""
 
 
+def places_of(root: ReleasePath) -> tuple[Path, ...]:
+    """What workers must see to read a release."""
+    return (root,) if isinstance(root, Path) else root.store.places
+
+
+def read_content(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY) -> bytes:
+    """A file's bytes; raises MissingFileError, and `fault` if it cannot be read or is too large for its kind."""
+    try:
+        return read_bytes(path, kind)
+    except FileNotFoundError:
+        raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
+    except OSError as error:
+        raise fault(f"{path}: {fault_text(error)}; {remedy}") from error
+
+
+def read_lines(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY) -> list[str]:
+    """The lines of a UTF-8 file, without line ends; raises as `read_content` does, and `fault` if it is no text."""
+    try:
+        return read_content(path, kind, fault, remedy).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise fault(f"{path}: not a text file ({error.reason}); {remedy}") from error
+
+
 def real_path(path: ReleasePath) -> Path:
     """A path that other programs can write to; raises NotAvailableError if this has no path of the system."""
     if isinstance(path, Path):
@@ -146,12 +171,7 @@ Entry: TypeAlias = os.DirEntry[str] | StoreEntry
 
 
 def listed(folder: ReleasePath) -> list[Entry]:
-    """What lies in a folder, in no order.
-
-    Raises:
-        FileNotFoundError: there is no such folder.
-        OSError: it cannot be listed.
-    """
+    """What lies in a folder, in no order; raises OSError, FileNotFoundError and NotADirectoryError among them."""
     if isinstance(folder, Path):
         with os.scandir(folder) as entries:
             return list(entries)
@@ -201,11 +221,7 @@ def _fetched(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
 
 @contextmanager
 def fetched(paths: Iterable[ReleasePath]) -> Iterator[None]:
-    """Have small files read together if they are at a URL; in the block, in this thread, they are read from memory.
-
-    Raises:
-        DatarootError: the URL cannot be read.
-    """
+    """Have small files at a URL read together, and from memory in the block and thread; raises DatarootError."""
     remote = [path for path in paths if isinstance(path, StorePath) and path.store.is_remote]
     token = READ_BEFORE.set(_fetched(remote))
     try:

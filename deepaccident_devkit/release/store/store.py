@@ -1,7 +1,13 @@
-"""`Store`: the files of a release in archives or at a URL, read by their path in the release."""
+"""`Store`: the files of a release in archives or at a URL, read by their path in it; `FileCache`: copies of such files.
+
+The cache is a folder of bounded size; who was not used the longest goes first. Several processes use it at once: each
+file appears whole, and one that is removed while it is read stays readable.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
 import zlib
 from collections.abc import Iterable
 from contextlib import suppress
@@ -10,18 +16,108 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-from deepaccident_devkit.errors import MissingFileError, SensorFileError
-from deepaccident_devkit.release.store.cache import FileCache
+from deepaccident_devkit.errors import ConfigError, MissingFileError, SensorFileError
 from deepaccident_devkit.release.store.members import Member, Members
-from deepaccident_devkit.release.store.sources import Range, Source, source_of
-from deepaccident_devkit.release.store.zips import HEAD_LENGTH, LONGEST_HEAD, damaged, head_length, member_bytes
-from deepaccident_devkit.support.reading import FileKind, RefusedFileError, check_size, fault_text
+from deepaccident_devkit.release.store.sources import (
+    HEAD_LENGTH,
+    LONGEST_HEAD,
+    Range,
+    Source,
+    damaged,
+    head_length,
+    member_bytes,
+    source_of,
+)
+from deepaccident_devkit.support.files import place_in, remove_in, temporary_of, write_bytes
+from deepaccident_devkit.support.reading import FileKind, RefusedFileError, bytes_of, check_size, fault_text
 
+FOLDER_VARIABLE: Final = "DEEPACCIDENT_CACHE"
+SIZE_VARIABLE: Final = "DEEPACCIDENT_CACHE_SIZE"
+_DEFAULT_SIZE: Final = "20G"
+_LOOKED_AFTER: Final = 0.05
+"""Part of the size that a process may add before it looks at the whole folder again."""
+_KEPT: Final = 0.9
+"""Part of the size that is left when something had to go."""
 _SENSOR_KINDS: Final[tuple[FileKind, ...]] = ("image", "lidar", "bev")
 COMPARES: ContextVar[bool] = ContextVar("compares", default=False)
 """Whether the bytes of archives' members are compared with their checksums; `paths.checksums_compared` sets it."""
 READ_BEFORE: ContextVar[dict[str, bytes] | None] = ContextVar("fetched", default=None)
 """Files by name that were read together; `paths.fetched` sets it."""
+
+
+class FileCache:
+    """A folder of copies."""
+
+    def __init__(self, folder: Path, most: int) -> None:
+        """Keep at most so many bytes in a folder, or a little more while several processes write."""
+        self.folder, self.most = folder, most
+        self._added = most  # so that the first one looks
+
+    @classmethod
+    def of_user(cls) -> FileCache:
+        """The one that the environment names, else in the user's cache folder; raises ConfigError for a wrong size."""
+        from platformdirs import user_cache_path
+
+        most = bytes_of(os.environ.get(SIZE_VARIABLE) or _DEFAULT_SIZE)
+        if most is None:
+            raise ConfigError(f"{SIZE_VARIABLE}: expected bytes with K, M, G or T, such as {_DEFAULT_SIZE}")
+        folder = os.environ.get(FOLDER_VARIABLE)
+        place = Path(folder).expanduser() if folder else user_cache_path("deepaccident_devkit") / "files"
+        return cls(place.absolute(), most)
+
+    def path_of(self, identity: str, name: str) -> Path:
+        """Where the copy of a file would lie, of which `identity` is the only one; raises OutputFolderError."""
+        digest = hashlib.blake2b(identity.encode(errors="surrogateescape"), digest_size=16).hexdigest()
+        return place_in(self.folder, f"{digest[:2]}/{digest[2:]}/{name}", opened=True)
+
+    def found(self, path: Path, size: int) -> bool:
+        """Whether a copy is there, whole; it counts as used now."""
+        try:
+            if path.stat().st_size != size:
+                return False
+            os.utime(path)
+        except OSError:
+            return False
+        return True
+
+    def put(self, path: Path, content: bytes) -> None:
+        """Keep a copy; raises OSError if there is no room, which names the folder and the remedy."""
+        try:
+            self._make_room(len(content))
+            write_bytes(path, content)
+        except OSError as error:
+            raise OSError(
+                error.errno,
+                f"cannot be kept in {self.folder}: {fault_text(error)}; make room there, or name another folder by "
+                f"{FOLDER_VARIABLE} or fewer bytes by {SIZE_VARIABLE}",
+            ) from error
+
+    def _make_room(self, size: int) -> None:
+        self._added += size
+        if self._added <= _LOOKED_AFTER * self.most:
+            return
+        self._added = size
+        there = self._there()
+        total = sum(bytes_ for _, bytes_, _ in there) + size
+        if total <= self.most:
+            return
+        for _, bytes_, path in sorted(there):
+            if total <= _KEPT * self.most:
+                break
+            with suppress(OSError):  # another process removes it too
+                remove_in(self.folder, path.relative_to(self.folder))
+                path.parent.rmdir()
+            total -= bytes_
+
+    def _there(self) -> list[tuple[int, int, Path]]:
+        """When each copy was used, its bytes, and where it is; none that is being written."""
+        found = []
+        for path in self.folder.glob("??/*/*"):
+            with suppress(OSError):
+                if temporary_of(path.name) is None:
+                    status = path.stat()
+                    found.append((status.st_mtime_ns, status.st_size, path))
+        return found
 
 
 class Store:
@@ -61,12 +157,9 @@ class Store:
         return (self.list_file,) if self.is_remote else (Path(self.place), self.list_file)
 
     def read(self, name: str, kind: FileKind) -> bytes:
-        """A file's bytes; of a URL, sensor files are kept in the user's cache (`cache.FileCache`).
+        """A file's bytes; of a URL, sensor files are kept in the user's cache (`FileCache`).
 
-        Raises:
-            FileNotFoundError: there is no such file.
-            RefusedFileError: it is too large for its kind, or damaged.
-            OSError: it cannot be read, or there is no room in the cache.
+        Raises FileNotFoundError, RefusedFileError if it is too large for its kind or damaged, or any other OSError.
         """
         if (known := READ_BEFORE.get()) is not None and name in known:
             return known[name]
@@ -80,10 +173,7 @@ class Store:
     def local_path(self, name: str) -> Path:
         """A real path of a file's bytes, in the user's cache; it may be gone when that is full of newer ones.
 
-        Raises:
-            MissingFileError: there is no such file.
-            SensorFileError: it cannot be read, or there is no room in the cache.
-            ConfigError: the environment names a wrong size of the cache.
+        Raises MissingFileError, SensorFileError, or ConfigError if the environment names a wrong size of the cache.
         """
         try:
             return self._kept(name, self._member(name))
@@ -93,12 +183,7 @@ class Store:
             raise SensorFileError(f"{self.place}/{name}: {fault_text(error)}") from error
 
     def fetch(self, names: Iterable[str]) -> dict[str, bytes]:
-        """Small files by name, read together; those that are not there, or are damaged, are left out.
-
-        Raises:
-            FileNotFoundError: an archive or a file is gone.
-            OSError: nothing can be read.
-        """
+        """Small files by name, read together, without those that are not there or damaged; raises OSError."""
         wanted = [(name, member) for name in names if (member := self.members.find(name)) is not None]
         if not wanted:
             return {}

@@ -12,8 +12,7 @@ from typing import BinaryIO, Final
 import numpy as np
 
 from deepaccident_devkit.errors import MOST_TOLD, DatarootError, shortened
-from deepaccident_devkit.release.store.members import Listing, Member
-from deepaccident_devkit.release.store.names import is_release_file, release_folder
+from deepaccident_devkit.release.store.members import Listing, Member, is_release_file, release_folder
 from deepaccident_devkit.support.reading import (
     DAMAGED_ARCHIVE,
     LIMITS_VARIABLE,

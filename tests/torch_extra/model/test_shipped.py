@@ -16,7 +16,7 @@ from deepaccident_devkit.model import PredictConfig, load_model, read_weights
 from deepaccident_devkit.model.checkpoint import SHIPPED, write_weights
 from deepaccident_devkit.model.training.data import validated
 from deepaccident_devkit.motion import samples
-from deepaccident_devkit.release.split_files import write_split_file
+from deepaccident_devkit.release.layout import write_split_file
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 demo: Any = importlib.import_module("deepaccident_devkit.cli.demo")

@@ -10,7 +10,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.explore import keeping
 from deepaccident_devkit.explore.keeping import Kept, KeptFiles
 from deepaccident_devkit.parallel import Store
-from deepaccident_devkit.release.store import cache
+from deepaccident_devkit.release.store import store
 
 
 def test_several_threads_make_it_once() -> None:
@@ -73,7 +73,7 @@ def test_where_the_index_cannot_be_written_the_users_cache_is_taken(
     da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(keeping, "is_writable_folder", lambda _: False)
-    monkeypatch.setenv(cache.FOLDER_VARIABLE, str(tmp_path / "cache" / "files"))
+    monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path / "cache" / "files"))
     files = KeptFiles(da_b)
     assert files.get("a", "thumbnail.jpg", lambda: b"1") == b"1"
     assert files.folder == tmp_path / "cache" / "thumbnails"

@@ -15,8 +15,8 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export import parquet
 from deepaccident_devkit.export.bulk import Exported, export_release
+from deepaccident_devkit.export.format import SPLIT_NAMES
 from deepaccident_devkit.export.parquet import Parquet
-from deepaccident_devkit.export.shards import SPLIT_NAMES
 from deepaccident_devkit.tables.tables import table_names
 
 RECORDED = ("agent", "sample", "sample_data", "calibrated_sensor", "ego_pose", "annotation")

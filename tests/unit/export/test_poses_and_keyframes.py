@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from strategies import matrices
 
-from deepaccident_devkit.export.keyframes import KEY_STEP, keyframe_after, keyframes
+from deepaccident_devkit.export.frames import KEY_STEP, keyframe_after, keyframes
 from deepaccident_devkit.export.opencood import carla_six
 from deepaccident_devkit.geometry.conventions import flip_pose
 

@@ -18,7 +18,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.bulk import Exported, export_release
-from deepaccident_devkit.export.shards import SPLIT_NAMES
+from deepaccident_devkit.export.format import SPLIT_NAMES
 from deepaccident_devkit.export.webdataset import JSON_FIELDS, WebDataset
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.taxonomy import CAMERAS

@@ -23,9 +23,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import BrokenReleaseError, DeepAccidentError, IndexStoreError, OutputFolderError
 from deepaccident_devkit.tables import OpenTables, Table, indexing
+from deepaccident_devkit.tables.arrow_files import StoredTable, write_table
 from deepaccident_devkit.tables.index import MANIFEST_FILE
 from deepaccident_devkit.tables.records import table_spec
-from deepaccident_devkit.tables.store import StoredTable, write_table
 
 MUTATIONS = 120
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from deepaccident_devkit.release import label_from_world_velocity, world_from_label_velocity
-from deepaccident_devkit.tables.velocities import VelocityFit, displacement_velocities, total_fit
+from deepaccident_devkit.tables.boxes import VelocityFit, displacement_velocities, total_fit
 from deepaccident_devkit.taxonomy import VELOCITY_FRAMES
 
 NUMBERS = st.floats(-50, 50)

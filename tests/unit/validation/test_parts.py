@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.validation import ScenarioCheck, checks, validate_release
+from deepaccident_devkit.validation import ScenarioCheck, validate_release
 from deepaccident_devkit.validation import validate as module
 from deepaccident_devkit.validation.validate import check_scenario
 
@@ -91,7 +91,7 @@ def test_what_was_found_in_other_files_or_ways_is_not_taken(
     del looked[:]
     (image, *_), (label, *_) = (sorted(small.glob(pattern)) for pattern in ("**/Camera_Front/*/*", "**/label/*/*"))
     if change == "version":
-        monkeypatch.setattr(checks, "__version__", "0.0")
+        monkeypatch.setattr(module, "__version__", "0.0")
     elif change == "limits":
         monkeypatch.setenv("DEEPACCIDENT_LIMITS", "label=1")
     elif change in ("label", "image"):

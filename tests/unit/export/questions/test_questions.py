@@ -20,7 +20,7 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.questions import Questions, WindowRules
-from deepaccident_devkit.export.questions.format import seconds_ahead
+from deepaccident_devkit.export.questions.questions import seconds_ahead
 from deepaccident_devkit.release import read_meta
 from deepaccident_devkit.release.meta import write_meta
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID

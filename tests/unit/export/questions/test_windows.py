@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.keyframes import keyframes
+from deepaccident_devkit.export.frames import keyframes
 from deepaccident_devkit.export.questions import WindowRules
 from deepaccident_devkit.export.questions.observed import digest
 

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from deepaccident_devkit.release.store.cache import FileCache
+from deepaccident_devkit.release.store.store import FileCache
 
 
 def test_the_least_used_copies_go_first(tmp_path: Path) -> None:

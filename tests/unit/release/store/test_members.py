@@ -7,8 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from deepaccident_devkit.release.store.members import Listing, Member, Members, write_members
-from deepaccident_devkit.release.store.names import release_folder
+from deepaccident_devkit.release.store.members import Listing, Member, Members, release_folder, write_members
 
 _PARTS = st.text(st.characters(exclude_characters="/", exclude_categories=["Cs"]), min_size=1, max_size=9)
 _FRAMES = st.integers(0, 1200).map(lambda number: f"name_{number:03d}.jpg")

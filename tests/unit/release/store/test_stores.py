@@ -17,8 +17,8 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingFileError, NotAvailableError, SomeFailedError
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.store import open_dataroot
-from deepaccident_devkit.release.store.cache import FileCache
 from deepaccident_devkit.release.store.sources import LocalSource, UrlSource
+from deepaccident_devkit.release.store.store import FileCache
 from deepaccident_devkit.support.reading import RefusedFileError
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.taxonomy import CHANNELS

@@ -17,7 +17,6 @@ from deepaccident_devkit.export.nuscenes.scenes import (
     VERSION,
     LidarAxes,
     Row,
-    Rows,
     Scene,
     Van,
     box_rows,
@@ -82,7 +81,9 @@ class NuScenes(Format):
             output.tally.samples += len(scene.frames)
             output.leave_out("frames between keyframes", scene.last - len(scene.frames))
         output.leave_out("agents of scenarios that are not in this release", len(self.agents) - len(rows))
-        write_part(output.parts, rows)
+        for table in _OF_UNITS:
+            lines = "".join(f"{json.dumps(row)}\n" for scene_rows in rows for row in scene_rows[table])
+            write_bytes(output.parts / f"{table}.jsonl", lines.encode())
 
     def finish(
         self,
@@ -91,8 +92,21 @@ class NuScenes(Format):
         output: Output,
         parts: Callable[[Unit], Path],
     ) -> None:
-        """Write the tables."""
-        write_tables([parts(unit) for unit in units], output)
+        """Write the 13 tables, `splits.json` and masks of maps; only rows of scenes and logs are in memory at once."""
+        folders = [parts(unit) for unit in units]
+        for table in _OF_UNITS:
+            _write_table(table, (line for folder in folders for line in _lines(folder, table)), output)
+        scenes, logs = (
+            [json.loads(line) for folder in folders for line in _lines(folder, each)] for each in ("scene", "log")
+        )
+        for table, rows in {**_fixed_tables(), "map": _maps(logs)}.items():
+            _write_table(table, map(json.dumps, rows), output)
+        for row in _maps(logs):
+            output.write(row["filename"], _blank_mask())
+        splits: dict[str, list[str]] = {f"deepaccident_{split}": [] for split in SPLITS}
+        for row in scenes:
+            splits.setdefault(f"deepaccident_{row['split'] or 'unknown'}", []).append(row["name"])
+        output.write(f"{VERSION}/splits.json", json.dumps(splits, indent=1).encode())
 
     def scenes(self, dataset: Dataset, unit: Unit) -> list[Scene]:
         """The scenes of a unit."""
@@ -101,39 +115,8 @@ class NuScenes(Format):
         ]
 
 
-def write_part(folder: Path, scenes: Sequence[Rows]) -> None:
-    """Keep the rows of a unit's scenes for `write_tables`, a row a line."""
-    for table in _OF_UNITS:
-        lines = "".join(f"{json.dumps(row)}\n" for rows in scenes for row in rows[table])
-        write_bytes(_part(folder, table), lines.encode())
-
-
-def write_tables(parts: Sequence[Path], output: Output) -> None:
-    """Write the 13 tables, `splits.json` and the masks of the maps, from what `write_part` left in these folders.
-
-    Only the rows of scenes and logs are in memory at once.
-    """
-    for table in _OF_UNITS:
-        _write_table(table, (line for folder in parts for line in _lines(folder, table)), output)
-    scenes, logs = (
-        [json.loads(line) for folder in parts for line in _lines(folder, each)] for each in ("scene", "log")
-    )
-    for table, rows in {**_fixed_tables(), "map": _maps(logs)}.items():
-        _write_table(table, map(json.dumps, rows), output)
-    for row in _maps(logs):
-        output.write(row["filename"], _blank_mask())
-    splits: dict[str, list[str]] = {f"deepaccident_{split}": [] for split in SPLITS}
-    for row in scenes:
-        splits.setdefault(f"deepaccident_{row['split'] or 'unknown'}", []).append(row["name"])
-    output.write(f"{VERSION}/splits.json", json.dumps(splits, indent=1).encode())
-
-
-def _part(folder: Path, table: str) -> Path:
-    return folder / f"{table}.jsonl"
-
-
 def _lines(folder: Path, table: str) -> list[str]:
-    return read_bytes(_part(folder, table), "bundle").decode().splitlines()
+    return read_bytes(folder / f"{table}.jsonl", "bundle").decode().splitlines()
 
 
 def _write_table(table: str, rows: Iterable[str], output: Output) -> None:

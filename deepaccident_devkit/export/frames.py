@@ -1,6 +1,8 @@
-"""The sensor files of a recording that are there, with their sizes, by one look into their folder."""
+"""The frames of a recording that formats take: keyframes, two a second counted back from its end; and their files."""
 
 from __future__ import annotations
+
+from typing import Final
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import PinholeCamera
@@ -10,14 +12,22 @@ from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CHANNEL_FORMAT
 
+KEY_STEP: Final = 5
+"""Recorded frames from one keyframe to the next."""
+
+
+def keyframes(last: int) -> range:
+    """The numbers of a recording's keyframes; frames are counted from 1 to `last`."""
+    return range((last - 1) % KEY_STEP + 1, last + 1, KEY_STEP)
+
+
+def keyframe_after(number: int, last: int) -> int:
+    """The keyframe that a frame leads to: itself, or the next one."""
+    return number + (last - number) % KEY_STEP
+
 
 def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> dict[int, tuple[ReleasePath, int]]:
-    """Frame number → path and bytes of the files of a channel that are in this (partial) release.
-
-    Raises:
-        TokenError: no such scenario, agent or channel.
-        DatarootError: their folder cannot be listed.
-    """
+    """Frame number → path and bytes of a channel's files that are there; raises TokenError and DatarootError."""
     count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
     folder = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}").parent
     ending = CHANNEL_FORMAT[channel]
@@ -30,16 +40,9 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
 
 
 def stored_camera(dataset: Dataset, camera: str, file: tuple[ReleasePath, int] | None) -> PinholeCamera:
-    """A camera with K and size of its image file, which may have another size than calib says.
+    """A camera, by its image's token, with K and size of its file of `sensor_files`; without a file, those of calib.
 
-    Args:
-        dataset: the release.
-        camera: token of the image.
-        file: of `sensor_files`; None where the image is not in this release: then K and size are those of calib.
-
-    Raises:
-        TokenError: no such image.
-        SensorFileError: the file is no image.
+    Raises TokenError, and SensorFileError if the file is no image.
     """
     lens = dataset.camera(camera)
     return lens if file is None else lens.resized(*image_size(file[0]))

@@ -15,6 +15,8 @@ import numpy as np
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation.accident import box_truth
 from deepaccident_devkit.export.bulk import Format, Output, Unit
+from deepaccident_devkit.export.frames import sensor_files
+from deepaccident_devkit.export.questions.answers import answer_schema, readme
 from deepaccident_devkit.export.questions.observed import (
     RATE,
     Observations,
@@ -25,8 +27,6 @@ from deepaccident_devkit.export.questions.observed import (
     names_of,
     question_facts,
 )
-from deepaccident_devkit.export.questions.texts import answer_schema, readme
-from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import read_bytes
@@ -279,12 +279,7 @@ def unanswerable(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:
 def seconds_ahead(frames_to_impact: int | None, frames_to_end: int, ahead: int) -> Seconds:
     """Whether there is an accident in each second: after n − 1 seconds, and up to n seconds, for n from 1 to `ahead`.
 
-    Nobody knows what comes after an impact, or after the recording: these seconds are None.
-
-    Args:
-        frames_to_impact: recorded frames from the present to the impact; None if there is none.
-        frames_to_end: to the recording's last frame.
-        ahead: number of seconds.
+    Counted in recorded frames. Nobody knows what comes after an impact, or after the recording: these seconds are None.
     """
     if frames_to_impact is None:
         return [False if second * _SECOND <= frames_to_end else None for second in range(1, ahead + 1)]
@@ -295,22 +290,11 @@ def seconds_ahead(frames_to_impact: int | None, frames_to_end: int, ahead: int) 
 def truth_facts(
     dataset: Dataset, sample: str, names: Names, ahead: int, contact: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """What is known of a question's answer.
+    """What is known of a question's answer; `contact` is why, as `why_facts` gives it. Raises NotAvailableError.
 
-    Args:
-        dataset: the release.
-        sample: token of the present.
-        names: of the question.
-        ahead: seconds that are asked about.
-        contact: why, as `why_facts` gives it for the scenario.
-
-    Returns:
-        `sample`, `last_frame`, the names, `accident` for each second, and for an accident in one of them `when`, `who`
-        (names, None for one that the question does not show), `actor_ids`, `where` (2, 2) in the present ego frame,
-        `last_seen` of each, and `why`; None where there is none.
-
-    Raises:
-        NotAvailableError: a label is missing without which the places are not known.
+    `sample`, `last_frame`, the names, `accident` for each second, and for an accident in one of them `when`, `who`
+    (names, None for one that the question does not show), `actor_ids`, `where` (2, 2) in the present ego frame,
+    `last_seen` of each, and `why`; None where there is none.
     """
     record = dataset.sample.get(sample)
     to_impact, to_end = record["time_to_impact"], record["time_to_end"]
