@@ -86,13 +86,10 @@ def _runs(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray
     row, first, last, line = _outlines(corners, ~whole, shape)
     owner = line // corners.shape[1]
     simple, others = whole[owner], np.flatnonzero(~whole)
-    inner, rest = (
-        [values[which] for values in (row, first, last, owner)]
-        for which in (np.flatnonzero(simple), np.flatnonzero(~simple))
-    )
+    runs = np.stack([row, first, last, owner])
     *between, whose = _between(corners[others], shape)
-    parts = zip(_merged(*inner), rest, (*between, others[whose]), strict=True)
-    row, first, last, owner = (np.concatenate(part) for part in parts)
+    parts = [np.stack(_merged(*runs[:, simple])), runs[:, ~simple], np.stack([*between, others[whose]])]
+    row, first, last, owner = np.concatenate(parts, axis=1)
     start = row * shape[1]
     return start + first, start + last, near[owner]
 

@@ -25,7 +25,7 @@ transformed points count. `source_from_target` maps points of the result's frame
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -68,6 +68,7 @@ _SINGLE = _Arithmetic(
     single_precision.pose_matrices, single_precision.rigid_inverse, single_precision.inverse, single_precision.product
 )
 _DOUBLE = _Arithmetic(conventions.matrices_of_six, np.linalg.inv, np.linalg.inv, np.matmul)
+_ARITHMETIC: Final[Mapping[str, _Arithmetic]] = {"stretched": _SINGLE, "fiery": _SINGLE, "exact": _DOUBLE}
 
 
 def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol) -> AnyArray:
@@ -117,7 +118,7 @@ def present_from_frames(
     Raises:
         GeometryError: another shape.
     """
-    arithmetic = _arithmetic(rules)
+    arithmetic = _ARITHMETIC[rules.warp]
     this_from_next = arithmetic.rigid_inverse(_native_matrices(egomotion, rules)[:-1])
     chain = [np.eye(4, dtype=this_from_next.dtype)]
     for step in this_from_next:
@@ -139,7 +140,7 @@ def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: A
     Raises:
         GeometryError: another shape.
     """
-    inverse = _arithmetic(rules).inverse(_native_matrices(egomotion, rules))
+    inverse = _ARITHMETIC[rules.warp].inverse(_native_matrices(egomotion, rules))
     return _augmented(inverse, rules, augmentation)
 
 
@@ -160,7 +161,7 @@ def present_from_past(egomotion: ArrayLike, rules: LabelProtocol, augmentation: 
     Raises:
         GeometryError: another shape.
     """
-    arithmetic = _arithmetic(rules)
+    arithmetic = _ARITHMETIC[rules.warp]
     steps = _native_matrices(egomotion, rules)
     chain = list(steps[-1:])
     for step in steps[-2::-1]:
@@ -176,20 +177,16 @@ def ego_from_agents(
     return _augmented(_native_matrices(relative_pose, rules), rules, augmentation)
 
 
-def _arithmetic(rules: LabelProtocol) -> _Arithmetic:
-    return _DOUBLE if rules.warp == "exact" else _SINGLE
-
-
 def _native_matrices(six: ArrayLike, rules: LabelProtocol) -> AnyArray:
     vectors = checked("egomotion", six, (None, 6))
-    return _arithmetic(rules).matrices(vectors if rules.right_handed else flip_six_vector(vectors))
+    return _ARITHMETIC[rules.warp].matrices(vectors if rules.right_handed else flip_six_vector(vectors))
 
 
 def _augmented(transforms: AnyArray, rules: LabelProtocol, augmentation: Augmentation | None) -> AnyArray:
     """A · transforms · A⁻¹."""
     if augmentation is None or not len(transforms):
         return transforms
-    arithmetic = _arithmetic(rules)
+    arithmetic = _ARITHMETIC[rules.warp]
     given = augmentation.matrix if rules.right_handed else flip_pose(augmentation.matrix)
     matrix = given[None].astype(transforms.dtype)
     return arithmetic.product(arithmetic.product(matrix, transforms), arithmetic.inverse(matrix))
@@ -236,7 +233,7 @@ def rounded_points(
     """`nearest_indices` from the sample points."""
     if grid.cells > _COUNTABLE:
         raise GeometryError(f"grid: {grid.cells} cells are more than a warp can number; choose at most {_COUNTABLE}")
-    row, column = (np.rint(point) for point in points)
+    row, column = np.rint(points[0]), np.rint(points[1])
     rows, columns = row.shape
     beside = (row < 0) | (row >= rows)
     beside |= column < 0

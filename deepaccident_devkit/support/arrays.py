@@ -65,7 +65,10 @@ class FrozenArrays(ShortRepr):
 
     def __post_init__(self) -> None:
         """Freeze the arrays; a class that checks them freezes them itself."""
-        _put(self, {name: getattr(self, name) for name in _field_names(type(self))})
+        kind: type[Any] = type(self)
+        for field in fields(kind):
+            if isinstance(value := getattr(self, field.name), np.ndarray):
+                object.__setattr__(self, field.name, readonly(value))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies go without `__init__`, since what they hold was checked."""
@@ -84,13 +87,9 @@ def checked(
         dtype: the element type wanted, None for that of `values`; an array that has it already is not copied. Of an
             integer type, numbers must be whole and in its range.
     """
-    if (
-        type(values) is np.ndarray
-        and values.dtype.kind in _NUMBERS
-        and values.dtype == dtype
-        and _fits(values.shape, shape)
-    ):
-        return values  # as nearly always; many small arrays of a sample's labels come here
+    if type(values) is np.ndarray and values.dtype.kind in _NUMBERS and _fits(values.shape, shape):
+        # as nearly always; many small arrays of a sample's labels come here
+        return values if values.dtype == dtype else as_numbers(name, values, dtype=dtype)
     array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
     if not _fits(array.shape, shape):
         remedy = "; transpose it (.T)" if array.ndim == 2 and _fits(array.shape[::-1], shape) else ""
@@ -269,13 +268,9 @@ def _remedy(values: object) -> str:
 def _restored(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArrays:
     """Undo `FrozenArrays.__reduce__`."""
     result = object.__new__(kind)
-    _put(result, values)
-    return result
-
-
-def _put(record: FrozenArrays, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
-        object.__setattr__(record, name, readonly(value) if isinstance(value, np.ndarray) else value)
+        object.__setattr__(result, name, readonly(value) if isinstance(value, np.ndarray) else value)
+    return result
 
 
 def _value_text(value: object) -> str:

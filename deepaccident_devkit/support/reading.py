@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO, Final, Literal, Protocol, TypeAlias
@@ -277,7 +278,7 @@ def open_zip(source: Path | bytes) -> zipfile.ZipFile:
         check_end(file, _MOST_DIRECTORY)
     # opened again by its path, so that the archive closes the file
     archive = zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source)
-    if min([entry.header_offset for entry in archive.infolist()], default=0):
+    if min(map(attrgetter("header_offset"), archive.infolist()), default=0):
         archive.close()
         raise zipfile.BadZipFile("bytes precede the archive")
     return archive

@@ -110,7 +110,10 @@ def meant_text(wrong: object, possible: Iterable[object]) -> str:
 def spelled(value: Any, words: Iterable[str]) -> Any:
     """The one of some words that a text is, in whatever case of letters; the value itself if no word is like it."""
     lowered = value.lower() if isinstance(value, str) else None
-    return next((word for word in words if word.lower() == lowered), value)
+    for word in words:
+        if word.lower() == lowered:
+            return word
+    return value
 
 
 def choice(name: str, value: object, words: Collection[Word], *, error: type[DeepAccidentError] = ChoiceError) -> Word:

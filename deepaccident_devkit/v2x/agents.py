@@ -153,7 +153,7 @@ def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = N
                 "unpack its archive, name the agents that are there, or use "
                 f"agents='{AVAILABLE}' (--agents {AVAILABLE}) for all that are there"
             )
-    return tuple(sorted(dict.fromkeys(wanted), key=lambda agent: agent != ego))
+    return tuple(sorted(dict.fromkeys(wanted), key=ego.__ne__))
 
 
 def is_available(agents: object) -> bool:
@@ -165,7 +165,7 @@ def agents_of(dataset: Dataset, scenario: RowArgument) -> tuple[AgentName, ...]:
     """The agents that a scenario has in this release, in the order of `taxonomy.AGENTS`; raises TokenError."""
     row, names = dataset.getind("scenario", scenario), dataset.columns("agent")
     first, last = names["scenario_row"].searchsorted((row, row + 1))
-    return tuple(AGENTS[code] for code in names["name"][first:last].tolist())
+    return tuple([AGENTS[code] for code in names["name"][first:last].tolist()])
 
 
 def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentName, ...]:
@@ -281,7 +281,7 @@ def pair_in_view(mask: ArrayLike, actor_ids: ArrayLike, pair: Collection[int], o
         pair: actor ids.
         own_id: the agent's; None for one that is no vehicle.
     """
-    others = {int(actor) for actor in pair} - {own_id}
+    others = set(map(int, pair)) - {own_id}
     return others <= set(visible_ids([mask], [actor_ids]).tolist())
 
 

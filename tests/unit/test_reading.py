@@ -115,9 +115,8 @@ OTHER_WAYS_TO_READ = re.compile(
     re.VERBOSE,
 )
 NOT_OF_STRANGERS = {
-    "reading.py": "the gate",
-    "archives.py": "its archives, of which the end was checked",
-    "files.py": "the system's processes",
+    "support/reading.py": "the gate",
+    "support/files.py": "the system's processes",
     "cli/streams.py": "nothing: the null device",
     "cli/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
@@ -125,7 +124,7 @@ NOT_OF_STRANGERS = {
     "explore/pages/answers.py": "the package's own styles and scripts",
     "explore/serving.py": "a browser",
     "export/questions/format.py": "the parts that the export wrote",
-    "pages.py": "the package's own templates",
+    "support/pages.py": "the package's own templates",
     "parallel/store.py": "locks, of which nothing is believed",
     "release/images.py": "the head of an image that the gate opened",
     "release/store/sources.py": "fsspec, and the gate's files",
