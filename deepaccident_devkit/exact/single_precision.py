@@ -93,7 +93,7 @@ def rigid_inverse(matrix: Float32Array) -> Float32Array:
 def inverse(matrix: Float32Array) -> Float32Array:
     """The inverses of transforms (N, 4, 4) whose last row is (0, 0, 0, 1), by elimination with row exchanges.
 
-    Of the last row all products are zero, and its own number is one: its steps change nothing and are left out.
+    Of the last row all products are zero, and its own number is one: its steps are left out.
     """
     mixed = matrix.copy()  # the lower and the upper factor in one array
     count = np.arange(len(mixed))
@@ -160,11 +160,9 @@ class SamplingLine(NamedTuple):
 
 
 def stretched_lines(planes: Float32Array, axes: tuple[Axis, Axis]) -> tuple[SamplingLine, SamplingLine]:
-    """Rows and columns at which the released warp samples.
+    """Rows and columns at which the released warp samples a raster with these axes of rows and columns.
 
-    Args:
-        planes: (N, 2, 3) for rows and for columns: factors of the target's metres along rows and columns, and a shift.
-        axes: of rows and of columns.
+    `planes` (N, 2, 3) are, for rows and for columns, factors of the target's metres along both, and a shift.
     """
     rows, columns = _released_coordinates(axes[0]), _released_coordinates(axes[1])
     lines = []

@@ -354,12 +354,7 @@ def _agents_text(agents: Agents) -> Any:
 
 
 def label_config(config: MotionLabelConfig | str | None) -> MotionLabelConfig:
-    """A configuration as it is given, by a preset's name, or the released one for None.
-
-    Raises:
-        ChoiceError: no such preset.
-        ConfigError: something else was given.
-    """
+    """A configuration as given, by a preset's name, or the released one for None; raises ChoiceError or ConfigError."""
     if config is None or isinstance(config, str):
         return MotionLabelConfig() if config is None else MotionLabelConfig.preset(config)
     if not isinstance(config, MotionLabelConfig):

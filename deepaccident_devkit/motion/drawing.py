@@ -237,14 +237,9 @@ class LabelMaps:
 def label_maps(
     covered: CoveredCells, centers: Float32Array, following: Float32Array, missing: BoolArray, config: MotionLabelConfig
 ) -> LabelMaps:
-    """The maps of instances and their centres.
+    """The maps of instances, from native cells and centres (T, 1 + ids, 2) here and at the next frame, or NaN.
 
-    Args:
-        covered: the rasterised cells, native.
-        centers: (T, 1 + ids, 2) each instance's centre, row and column, native; NaN where there is none.
-        following: (T, 1 + ids, 2) where it is at the next frame, seen from this one; NaN where that is not known.
-        missing: (T,) which frames are not in the recording.
-        config: of the labels.
+    `missing` (T,) says which frames are not in the recording.
     """
     maps, target = LabelMaps.empty(config), config.grid.orientation
     native = config.grid.with_orientation(config.rules.native)
@@ -323,11 +318,7 @@ def following_centers(
 ) -> Float32Array:
     """(T, 1 + ids, 2) centres of the instances at the next frame, warped to each frame; NaN where they are not seen.
 
-    Args:
-        footprints: of the T frames.
-        next_from_this: (T − 1, 4, 4) as `sampling_matrix` gives them, finite.
-        config: of the labels.
-        ids: the highest id.
+    `next_from_this` (T − 1, 4, 4) is as `sampling_matrix` gives it, finite.
     """
     grid, rules = config.grid.with_orientation(config.rules.native), config.rules
     lines = sampling_lines(next_from_this, grid, rules)

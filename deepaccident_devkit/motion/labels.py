@@ -175,17 +175,8 @@ def maps_to_present(
     Segmentation, instance, offset and flow take the nearest cell's values. The protocol says how (`warp`), what value
     cells from outside the grid have (`outside_is_zero`) and whether offset and flow turn with the frame
     (`vectors_not_rotated`). An augmentation of the configuration counts on both sides: A C A⁻¹ (docs/released_code.md,
-    Warps). A missing frame that is all `ignore_index` (not `missing_frames_are_empty`) is not warped.
-
-    Args:
-        maps: segmentation, instance, centerness, offset and flow, each frame in its own ego frame.
-        label_egomotion: (T, 6) right-handed 6-vectors from the present on.
-        missing: (T,) which frames are not in the recording.
-        config: of the labels.
-        centerness: how to sample it.
-
-    Raises:
-        ChoiceError: no such mode.
+    Warps). A missing frame (T,) that is all `ignore_index` is not warped. `label_egomotion` (T, 6) goes from the
+    present on.
     """
     centerness = checked_mode(centerness)
     rules = config.rules

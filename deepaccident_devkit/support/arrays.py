@@ -78,14 +78,10 @@ class FrozenArrays(ShortRepr):
 def checked(
     name: str, values: ArrayLike, shape: Sequence[int | None], dtype: DTypeLike | None = np.float64
 ) -> AnyArray:
-    """Return `values` as an array of `dtype`, or raise GeometryError if they are no numbers or of another shape.
+    """`values` as an array of `dtype`, or GeometryError if they are no numbers or not of `shape` (None: any length).
 
-    Args:
-        name: how the error names the array.
-        values: what the caller passed.
-        shape: the expected shape, None where any length is good.
-        dtype: the element type wanted, None for that of `values`; an array that has it already is not copied. Of an
-            integer type, numbers must be whole and in its range.
+    With dtype None they keep theirs; an array that has it already is not copied. For integers, numbers must be whole
+    and in range.
     """
     if type(values) is np.ndarray and values.dtype.kind in _NUMBERS and _fits(values.shape, shape):
         # as nearly always; many small arrays of a sample's labels come here
@@ -103,18 +99,8 @@ def as_numbers(
     """`checked` for any shape: the one way in for a caller's arrays, of any framework.
 
     Everything is taken that numpy can read without a copy from another device: its own arrays, sequences, and objects
-    with `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an
-    accelerator or unmasked silently; the error says how.
-
-    Args:
-        name: how the error names the array.
-        values: what the caller passed.
-        expected: what the caller should have passed, for the error.
-        dtype: the element type wanted, None for that of `values`; an array that has it already is not copied. Of an
-            integer type, numbers must be whole and in its range, of a float type in its range (NaN and inf pass).
-
-    Raises:
-        GeometryError: no numbers, masked ones, numbers that the type cannot hold, or an array that cannot be read.
+    with `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an accelerator
+    or unmasked silently; the error says how. Numbers must be in the range of a float type too (NaN and inf pass).
     """
     given = _read(name, values, expected)
     wanted = given.dtype if dtype is None else np.dtype(dtype)
@@ -208,12 +194,7 @@ def as_floats(values: ArrayLike) -> FloatArray:
 
 
 def known(values: ArrayLike | None, digits: int | None = None) -> Any:
-    """Numbers as JSON holds them, in lists as deep as the array: None for those that are not finite, and for None.
-
-    Args:
-        values: of any shape.
-        digits: decimals to round to; None for all.
-    """
+    """Numbers as JSON holds them, in lists as deep as the array, rounded; None for what is not finite."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim:
         return [known(each, digits) for each in array]

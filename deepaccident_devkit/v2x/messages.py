@@ -302,21 +302,10 @@ class Message:
 def messages(
     dataset: Dataset, sample: RowArgument, agents: Agents = None, link: Link | None = None, *, sweeps: int = 1
 ) -> Iterator[Message]:
-    """What the agents contribute at a sample and at the frames before it, the sample's own agent first.
+    """What the agents contribute at a sample and at the `sweeps` − 1 frames before it; nothing for a lost message.
 
-    Args:
-        dataset: the release.
-        sample: token or record: its agent is the ego, its frame the present.
-        agents: who cooperates (`cooperating_agents`).
-        link: what happens to the partners' data; None for nothing.
-        sweeps: number of frames, the present included; those before the recording began are left out.
-
-    Yields:
-        By frame, the present first and then backwards, and for each frame by agent; nothing for a lost message.
-
-    Raises:
-        TokenError, ChoiceError, NotAvailableError: as in `cooperating_agents`.
-        ConfigError: `link` is no Link, or its latency is longer than the scenario's past at the present.
+    By frame, the present first and then backwards, and for each frame by agent, the sample's own first. Raises what
+    `cooperating_agents` does, and ConfigError of the link.
     """
     link = checked_link(link)
     names = cooperating_agents(dataset, sample, agents)

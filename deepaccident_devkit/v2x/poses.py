@@ -193,12 +193,7 @@ def map_pointcloud_to_image(
 
 
 def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
-    """The pinhole camera of an image, with the image size that calib gives.
-
-    Raises:
-        TokenError: no such sensor file.
-        ChoiceError: the sensor is no camera.
-    """
+    """The pinhole camera of an image, with the image size that calib gives; raises TokenError or ChoiceError."""
     return dataset.camera(camera)
 
 
