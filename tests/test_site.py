@@ -11,24 +11,7 @@ from scripts import loaded_script
 import deepaccident_devkit
 
 DOCS = Path(__file__).parents[1] / "docs"
-NOT_FOR_USERS = {
-    *(
-        "archives",
-        "arrays",
-        "cli",
-        "dataset",
-        "deepaccident",
-        "files",
-        "json_text",
-        "nuscenes_names",
-        "overview",
-        "pages",
-        "parallel",
-        "reading",
-        "tables",
-        "text",
-    ),
-}
+NOT_FOR_USERS = {"cli", "dataset", "deepaccident", "exact", "overview", "parallel", "support", "tables"}
 """Command line, base of the facade, and what only the devkit itself calls."""
 
 

@@ -25,6 +25,18 @@ if TYPE_CHECKING:
 Role = Literal["behind", "other", "other_behind", "infrastructure"]
 """The role of a partner: the vehicle behind the ego, the two vehicles of the other side, the infrastructure."""
 Side = Literal["ego_vehicle", "other_vehicle"]
+SHEER_CURTAINS: Final = (
+    "Town05_type001_subtype0002_scenario00035",
+    "Town05_type001_subtype0002_scenario00004",
+)
+"""Names of scenarios whose vehicles a CARLA bug marks invisible: the released code never counts them as unseen."""
+VISIBILITIES: Final = ("visible", "partial", "invisible")
+_STEP: Final = 5
+"""Frames between two observations: the released code works at 2 Hz."""
+_OBSERVED: Final = 3
+"""Observations that count: the present one and two before it."""
+_EVALUATED: Final = 4
+"""Steps before the last frame at which the released code evaluates: 0.5, 1, 1.5 and 2 s."""
 _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
     "ego_vehicle": {
         "behind": "ego_vehicle_behind",
@@ -180,20 +192,6 @@ def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentNa
         return AGENT_CONFIGS[choice("agents", agents, AGENT_SETS)].agents_for(ego)
     names = _names("agents", "agents' names or a configuration", agents)
     return tuple(choice("agent", agent, AGENTS) for agent in names)
-
-
-SHEER_CURTAINS: Final = (
-    "Town05_type001_subtype0002_scenario00035",
-    "Town05_type001_subtype0002_scenario00004",
-)
-"""Names of scenarios whose vehicles a CARLA bug marks invisible: the released code never counts them as unseen."""
-VISIBILITIES: Final = ("visible", "partial", "invisible")
-_STEP: Final = 5
-"""Frames between two observations: the released code works at 2 Hz."""
-_OBSERVED: Final = 3
-"""Observations that count: the present one and two before it."""
-_EVALUATED: Final = 4
-"""Steps before the last frame at which the released code evaluates: 0.5, 1, 1.5 and 2 s."""
 
 
 def accident_visibility(dataset: Dataset, scenario: RowArgument) -> str | None:

@@ -21,6 +21,12 @@ from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName, OnError
 from deepaccident_devkit.v2x.agents import Agents, cooperating_agents
 
+POINT_BYTES: Final = 4 * 4
+"""x, y, z and intensity in single precision."""
+BOX_BYTES: Final = 9 * 4 + 4 + 1 + 4
+"""Centre, size, yaw and horizontal velocity in single precision, an id, a class and a score."""
+POSE_BYTES: Final = 6 * 4
+"""A 6-vector in single precision, which goes with every message."""
 _NORMAL: Final = NormalDist()
 _LONGEST: Final = 20.0
 """Seconds: no scenario is longer, so a longer latency is in milliseconds."""
@@ -182,14 +188,6 @@ def uniforms(key: str) -> tuple[float, float, float, float]:
     numbers = [int.from_bytes(digest[start : start + 8], "big") >> 12 for start in range(0, 32, 8)]
     first, second, third, fourth = ((number + 0.5) / 2**52 for number in numbers)
     return first, second, third, fourth
-
-
-POINT_BYTES: Final = 4 * 4
-"""x, y, z and intensity in single precision."""
-BOX_BYTES: Final = 9 * 4 + 4 + 1 + 4
-"""Centre, size, yaw and horizontal velocity in single precision, an id, a class and a score."""
-POSE_BYTES: Final = 6 * 4
-"""A 6-vector in single precision, which goes with every message."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
