@@ -30,18 +30,11 @@ Point = tuple[int, int]
 
 
 def first_contour(rows: IntArray, columns: IntArray, *, one_part: bool = False) -> list[Point]:
-    """The outer border of a mask's last part, which OpenCV lists first.
+    """The points where the outer border of a mask's last part turns, which OpenCV lists first.
 
-    The last part is the 8-connected part, in no hole of another part, whose first cell in row-major order comes last.
-    The border starts at this cell and runs down the left side.
-
-    Args:
-        rows: (P,) rows of the mask's cells, in row-major order.
-        columns: (P,) their columns.
-        one_part: whether the mask is known to be one part.
-
-    Returns:
-        The points at which the border turns.
+    The mask has cells in `rows` and `columns` (P,), in row-major order. Its last part is the 8-connected one, in no
+    hole of another part, whose first cell comes last. The border starts at this cell and runs down the left side.
+    `one_part` says that there is surely only one.
     """
     top, left = int(rows[0]), int(columns.min())
     width = int(columns.max()) - left + 3  # with a margin of one empty cell all around
@@ -54,13 +47,9 @@ def first_contour(rows: IntArray, columns: IntArray, *, one_part: bool = False) 
 
 
 def are_one_part(rows: IntArray, columns: IntArray, instance: IntArray, count: int) -> BoolArray:
-    """Which of many masks are surely one part: each row has one run of cells, which touches the next row's run.
+    """Which of `count` masks are surely one part: each row has one run of cells, which touches the next row's run.
 
-    Args:
-        rows: (P,) rows of the masks' cells, sorted by mask, row, column.
-        columns: (P,) their columns.
-        instance: (P,) which of the masks each belongs to, from 0.
-        count: how many masks there are.
+    The cells (P,) are sorted by mask, row, column; `instance` says whose each is, from 0.
     """
     if not count:
         return np.ones(0, dtype=bool)
@@ -165,13 +154,9 @@ _QUARTER_TURNS = np.array([[[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[-1, 0], [0, -1
 
 
 def min_area_rects(hulls: Sequence[Sequence[Point]]) -> tuple[AnyArray, AnyArray]:
-    """Widths and heights, and angles, of the smallest rectangles around convex hulls.
+    """Of the smallest rectangles around N hulls of `convex_hull`: widths and heights, and angles of the widths.
 
-    Args:
-        hulls: corners (x, y) of each, as `contours.convex_hull` lists them.
-
-    Returns:
-        (N, 2) float32 widths and heights, and (N,) float32 angles of the widths, degrees from x towards y.
+    (N, 2) and (N,) float32; degrees from x towards y.
     """
     size, side = np.zeros((len(hulls), 2), dtype=np.float32), np.zeros((len(hulls), 2))
     corners = np.array([len(hull) for hull in hulls], dtype=np.int64)
@@ -212,9 +197,8 @@ def _rectangles(points: IntArray, corners: IntArray) -> tuple[AnyArray, AnyArray
 def _rotate(points: IntArray, edges: IntArray, corners: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Turn four lines around all hulls at once, from edge to edge.
 
-    Returns:
-        For each step the corners (C, N, 4) that the lines touch after it, the edge (C, N) that one of them came to lie
-        on, and which of them (C, N) that was: 0 at the lowest corner, then 1 right, 2 highest, 3 left.
+    For each step: the corners (C, N, 4) that the lines touch after it, the edge (C, N) that one of them came to lie on,
+    and which of them (C, N) that was: 0 at the lowest corner, then 1 right, 2 highest, 3 left.
     """
     which = np.arange(len(points))
     x, y = points[..., 0], points[..., 1]
@@ -252,21 +236,13 @@ _CORNERS: Final = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]])
 def redrawn_cells(
     hulls: Sequence[Sequence[Point]], centers: FloatArray, exists: BoolArray, shape: tuple[int, int]
 ) -> tuple[list[IntArray], list[IntArray]]:
-    """Boxes of the first frame's instances in all frames.
+    """Boxes of ids 1 to I of the first frame, in all frames: (2, P) rows and columns of the cells, and (P,) their ids.
 
     An instance's first box has the length, width and angle of the smallest rectangle around its (last) part in the
     first frame; the later ones turn to where it moved if that was far enough. Boxes are rasterised in frames without a
     gap from the first on, as many as the instance is in: after a gap they are in the wrong frames. Later ids overwrite
-    earlier ones.
-
-    Args:
-        hulls: of ids 1 to I in the first frame, from `first_hulls`.
-        centers: (I, T, 2) rows and columns of the means of ids 1 to I.
-        exists: (I, T) whether the id is in the frame.
-        shape: rows and columns.
-
-    Returns:
-        For each frame (2, P) rows and columns of the cells rasterised, and (P,) their ids.
+    earlier ones. `hulls` are those of `first_hulls`, `centers` (I, T, 2) rows and columns of the means; `exists` (I,
+    T).
     """
     instances, frames = exists.shape
     if not instances:
@@ -290,10 +266,7 @@ def redrawn_cells(
 def first_hulls(position: IntArray, ids: IntArray, instances: int) -> list[list[Point]]:
     """The convex hulls, (x, y), of instances 1 to I: of each one the part that OpenCV lists first.
 
-    Args:
-        position: (2, P) rows and columns of the cells, in row-major order.
-        ids: (P,) the instance of each; 0 for what counts as background.
-        instances: how many there are.
+    `position` (2, P) are rows and columns in row-major order, `ids` (P,) whose; 0 is background.
     """
     order = np.argsort(ids, kind="stable")[np.count_nonzero(ids == 0) :]
     owner, (rows, columns) = ids[order], position[:, order]

@@ -57,16 +57,9 @@ _OPPOSITE: Final = (_BOTTOM, _RIGHT, _TOP, _LEFT)
 
 
 def pair_gaps(image: AnyArray, ids: IntArray, *, below: float = np.inf) -> tuple[IntArray, FloatArray]:
-    """The distances between the outlines of pairs of instances.
+    """Pairs (P, 2) of `ids`, ascending, and the distances (P,) between their outlines in a map (H, W), cells.
 
-    Args:
-        image: (H, W) ids, 0 elsewhere.
-        ids: (N,) int64, ascending, whose.
-        below: cells; pairs that cannot be nearer are left out.
-
-    Returns:
-        (P, 2) pairs in the order of `ids`: 0 1, 0 2, … 1 2, …; and (P,) cells: 0 where outlines overlap, `NO_OUTLINE`
-        where one has none.
+    0 where outlines overlap, `NO_OUTLINE` where one has none; pairs that cannot be nearer than `below` are left out.
     """
     places = _places(image, ids)
     first, second = np.triu_indices(len(ids), 1)
@@ -77,17 +70,10 @@ def pair_gaps(image: AnyArray, ids: IntArray, *, below: float = np.inf) -> tuple
 
 
 def first_outline(image: AnyArray, name: int, place: Place) -> FloatArray:
-    """The outline of an instance that scikit-image would list first: around its part with the highest cell.
+    """The outline (P, 2) of an instance that scikit-image lists first: around its part with the highest cell.
 
-    Cells that touch at a corner alone are two parts.
-
-    Args:
-        image: (H, W) ids.
-        name: the instance's.
-        place: rows and columns that it is in.
-
-    Returns:
-        (P, 2) row and column, as `find_contours` has them: beginning where the last segment in row-major order ends.
+    It lies in `place`. Cells that touch at a corner alone are two parts. Rows and columns as `find_contours` has them:
+    beginning where the last segment in row-major order ends.
     """
     rows, columns = place
     top, left = max(rows.start - 1, 0), max(columns.start - 1, 0)

@@ -20,15 +20,9 @@ _ROUNDING: Final = 1e-5
 
 
 def find_peaks(centerness: AnyArray, threshold: float, most: int) -> IntArray:
-    """Cells of one frame above `threshold` and not below any of their 8 neighbours; all cells of a plateau are peaks.
+    """(K, 2) rows and columns of the cells of a map (H, W) above `threshold` and not below any of their 8 neighbours.
 
-    Args:
-        centerness: (H, W) float32.
-        threshold: peaks are above it, not equal to it; not negative.
-        most: how many are kept: the first ones in row-major order, not the highest ones.
-
-    Returns:
-        (K, 2) int64 rows and columns, in row-major order.
+    All cells of a plateau are peaks. Of more than `most` the first ones in row-major order are kept, not the highest.
     """
     height, width = centerness.shape
     framed = np.full((height + 2, width + 2), -np.inf, dtype=np.float32)
@@ -41,16 +35,9 @@ def find_peaks(centerness: AnyArray, threshold: float, most: int) -> IntArray:
 
 
 def nearest_peaks(points: AnyArray, peaks: AnyArray) -> IntArray:
-    """The nearest peak of each point; of several equally near ones the first.
+    """Which of the peaks (K, 2) is nearest to each of the points (2, P), float32: (P,), the first of ties.
 
     Every distance is rounded to float32 at each step, the root included, so some different distances become equal.
-
-    Args:
-        points: (2, P) float32 rows and columns, finite.
-        peaks: (K, 2) float32 rows and columns; at least one unless there are no points.
-
-    Returns:
-        (P,) int64 indices into `peaks`.
     """
     count = points.shape[1]
     if count == 0:

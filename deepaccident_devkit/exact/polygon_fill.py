@@ -29,22 +29,7 @@ _BEYOND = np.int64(1) << 62
 def filled_cells(
     polygons: ArrayLike, shape: tuple[int, int], image: ArrayLike | None = None, images: int = 1
 ) -> tuple[IntArray, IntArray]:
-    """The cells that polygons cover, their outlines included; where several do, the last one counts.
-
-    Args:
-        polygons: (N, V, 2) whole numbers, column and row of V ≥ 3 corners in either direction; they may lie outside
-            the image, coincide or cross.
-        shape: rows and columns of one image.
-        image: (N,) which of the images each polygon is rasterised into; the first if None.
-        images: how many images there are.
-
-    Returns:
-        (P,) int64 indices into the flattened (images, rows, columns), ascending, each once; and (P,) int64, which
-        polygon is on top there.
-
-    Raises:
-        GeometryError: `polygons` or `image` has another shape, or an image does not exist.
-    """
+    """The cells that polygons cover: `topmost` as ascending indices (P,), and the polygon (P,) of each."""
     top = topmost(polygons, shape, image, images)
     covered = np.flatnonzero(top != 0)  # of bools: twice as fast
     return covered, top[covered] - np.int64(1)
@@ -53,13 +38,10 @@ def filled_cells(
 def topmost(
     polygons: ArrayLike, shape: tuple[int, int], image: ArrayLike | None = None, images: int = 1
 ) -> NDArray[np.int32]:
-    """`filled_cells` as one map.
+    """(images · rows · columns,) 1 + the number of the last polygon that covers each cell, 0 where there is none.
 
-    Returns:
-        (images · rows · columns,) 1 + the number of the polygon on top of each cell, 0 where there is none.
-
-    Raises:
-        GeometryError: as `filled_cells`.
+    `polygons` (N, V, 2) are columns and rows of V ≥ 3 whole corners in either direction, which may lie outside,
+    coincide or cross; `image` (N,) says which of the images each is drawn into, None the first. Raises GeometryError.
     """
     corners = checked("polygons", polygons, (None, None, 2), np.int64)
     where = checked("image", np.zeros(len(corners)) if image is None else image, (len(corners),), np.int64)
@@ -86,13 +68,10 @@ def _runs(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray
     row, first, last, line = _outlines(corners, ~whole, shape)
     owner = line // corners.shape[1]
     simple, others = whole[owner], np.flatnonzero(~whole)
-    inner, rest = (
-        [values[which] for values in (row, first, last, owner)]
-        for which in (np.flatnonzero(simple), np.flatnonzero(~simple))
-    )
+    runs = np.stack([row, first, last, owner])
     *between, whose = _between(corners[others], shape)
-    parts = zip(_merged(*inner), rest, (*between, others[whose]), strict=True)
-    row, first, last, owner = (np.concatenate(part) for part in parts)
+    parts = [np.stack(_merged(*runs[:, simple])), runs[:, ~simple], np.stack([*between, others[whose]])]
+    row, first, last, owner = np.concatenate(parts, axis=1)
     start = row * shape[1]
     return start + first, start + last, near[owner]
 

@@ -37,8 +37,7 @@ def pose_matrices(six: ArrayLike) -> Float32Array:
     """6-vectors (…, 6) → matrices (…, 4, 4): (Rx · Ry) · Rz, what the devkit does in float64."""
     vector = np.asarray(six, dtype=np.float32)
     sines, cosines = sines_and_cosines(vector[..., 3:])
-    cx, cy, cz = (cosines[..., axis] for axis in range(3))
-    sx, sy, sz = (sines[..., axis] for axis in range(3))
+    (cx, cy, cz), (sx, sy, sz) = np.moveaxis(cosines, -1, 0), np.moveaxis(sines, -1, 0)
     xy, yx = sx * sy, cx * sy
     rows = (
         (cy * cz, -cy * sz, sy),
@@ -57,8 +56,15 @@ def sines_and_cosines(angle: ArrayLike) -> Float32Array:
     radians = np.asarray(angle, dtype=np.float32).astype(np.float64)
     turns = radians / np.pi
     half_turns = np.rint(np.array([turns, turns + 0.5]))
-    cosines = half_turns[1] - 0.5
-    return _sine_within(np.array([radians - half_turns[0] * np.pi, radians - cosines * np.pi]), half_turns)
+    within = np.array([radians - half_turns[0] * np.pi, radians - (half_turns[1] - 0.5) * np.pi])  # [−π/2, π/2]
+    square = within * within
+    ratio = square * _SINE[0] + _SINE[1]
+    for factor in _SINE[2:]:
+        ratio *= square
+        ratio += factor
+    ratio *= within
+    result: Float32Array = np.where(half_turns % 2 == 0, ratio, -ratio).astype(np.float32)
+    return result
 
 
 def product(first: Float32Array, second: Float32Array) -> Float32Array:
@@ -87,28 +93,11 @@ def rigid_inverse(matrix: Float32Array) -> Float32Array:
 def inverse(matrix: Float32Array) -> Float32Array:
     """The inverses of transforms (N, 4, 4) whose last row is (0, 0, 0, 1), by elimination with row exchanges.
 
-    Of the last row all products are zero, and its own number is one: its steps change nothing and are left out.
+    Of the last row all products are zero, and its own number is one: its steps are left out.
     """
-    mixed, order = _eliminated(matrix)
-    every = np.arange(len(matrix))[:, None]
-    solved = np.zeros_like(matrix)
-    solved[every, np.arange(4), order] = 1
-    for row, others in ((1, (0,)), (2, (0, 1)), (2, (3,)), (1, (3, 2)), (0, (3, 2, 1))):
-        total = mixed[:, row, others[0], None] * solved[:, others[0]]
-        for other in others[1:]:
-            total += mixed[:, row, other, None] * solved[:, other]
-        solved[:, row] -= total
-        if others[0] == 3:
-            solved[:, row] *= np.float32(1) / mixed[:, row, row, None]
-    return solved
-
-
-def _eliminated(matrix: Float32Array) -> tuple[Float32Array, IntArray]:
-    """Lower and upper factor in one array, (N, 4, 4), and the order of the rows, (N, 4)."""
-    mixed = matrix.copy()
+    mixed = matrix.copy()  # the lower and the upper factor in one array
     count = np.arange(len(mixed))
-    order: IntArray = np.empty((len(mixed), 4), dtype=np.int64)
-    order[:] = np.arange(4)
+    order = np.tile(np.arange(4), (len(mixed), 1))
     for step in range(2):
         pivot = step + np.abs(mixed[:, step:3, step]).argmax(axis=1)
         if (pivot != step).any():
@@ -118,18 +107,16 @@ def _eliminated(matrix: Float32Array) -> tuple[Float32Array, IntArray]:
         # getrf multiplies by the reciprocal of the pivot
         mixed[:, below, step] *= np.float32(1) / mixed[:, step, step, None]
         mixed[:, below, step + 1 :] -= mixed[:, below, step, None] * mixed[:, step, None, step + 1 :]
-    return mixed, order
-
-
-def _sine_within(radians: FloatArray, half_turns: FloatArray) -> Float32Array:
-    """Sines of angles in [−π/2, π/2], after so many half turns."""
-    square = radians * radians
-    ratio = square * _SINE[0] + _SINE[1]
-    for factor in _SINE[2:]:
-        ratio *= square
-        ratio += factor
-    ratio *= radians
-    return np.where(half_turns % 2 == 0, ratio, -ratio).astype(np.float32)
+    solved = np.zeros_like(matrix)
+    solved[count[:, None], np.arange(4), order] = 1
+    for row, others in ((1, (0,)), (2, (0, 1)), (2, (3,)), (1, (3, 2)), (0, (3, 2, 1))):
+        total = mixed[:, row, others[0], None] * solved[:, others[0]]
+        for other in others[1:]:
+            total += mixed[:, row, other, None] * solved[:, other]
+        solved[:, row] -= total
+        if others[0] == 3:
+            solved[:, row] *= np.float32(1) / mixed[:, row, row, None]
+    return solved
 
 
 def _rigid(rotation: NDArray[Any] | np.float32, translation: NDArray[Any]) -> Float32Array:
@@ -173,30 +160,28 @@ class SamplingLine(NamedTuple):
 
 
 def stretched_lines(planes: Float32Array, axes: tuple[Axis, Axis]) -> tuple[SamplingLine, SamplingLine]:
-    """Rows and columns at which the released warp samples.
+    """Rows and columns at which the released warp samples a raster with these axes of rows and columns.
 
-    Args:
-        planes: (N, 2, 3) for rows and for columns: factors of the target's metres along rows and columns, and a shift.
-        axes: of rows and of columns.
+    `planes` (N, 2, 3) are, for rows and for columns, factors of the target's metres along both, and a shift.
     """
-    return _stretched_line(planes[:, 0], axes[0], axes), _stretched_line(planes[:, 1], axes[1], axes)
+    rows, columns = _released_coordinates(axes[0]), _released_coordinates(axes[1])
+    lines = []
+    for axis, plane in zip(axes, planes.swapaxes(0, 1), strict=True):
+        finish = functools.partial(_stretched, axis)
+        lines.append(SamplingLine(plane[:, :1] * rows, plane[:, 1:2] * columns, plane[:, 2], finish))
+    return lines[0], lines[1]
 
 
-def _stretched_line(plane: Float32Array, axis: Axis, axes: tuple[Axis, Axis]) -> SamplingLine:
+def _stretched(axis: Axis, point: AnyArray) -> AnyArray:
+    """Sums of metres (…) as cells along an axis, in place, as BEVerse's grid_sample takes the outermost points."""
     low, high, size = axis
-    middle, half = (low + high) / 2, np.float32((high - low) / 2)
-    scale = np.float32((round((high - low) / size) - 1) / 2)
-
-    def finish(point: AnyArray) -> AnyArray:
-        if middle:
-            point -= np.float32(middle)
-        point /= half
-        point += np.float32(1)
-        point *= scale
-        return point
-
-    rows, columns = (_released_coordinates(each) for each in axes)
-    return SamplingLine(plane[:, :1] * rows, plane[:, 1:2] * columns, plane[:, 2], finish)
+    middle = (low + high) / 2
+    if middle:
+        point -= np.float32(middle)
+    point /= np.float32((high - low) / 2)
+    point += np.float32(1)
+    point *= np.float32((round((high - low) / size) - 1) / 2)
+    return point
 
 
 def exact_lines(planes: FloatArray, axes: tuple[Axis, Axis]) -> tuple[SamplingLine, SamplingLine]:

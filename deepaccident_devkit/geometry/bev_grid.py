@@ -190,21 +190,10 @@ def _cell_count(name: str, axis: Axis) -> int:
 def to_orientation(
     array: AnyArray, *, vectors: bool, source: Orientation, target: Orientation, ignore: float | None = None
 ) -> AnyArray:
-    """Maps (…, H, W) in the orientation `source`, turned into the orientation `target`.
+    """Maps (…, H, W) of the orientation `source` in the orientation `target`; a view if no value changes.
 
-    Args:
-        array: any maps; with `vectors`, (…, 2, H, W), down the rows and along the columns.
-        vectors: whether the values point along rows and columns (offset, flow).
-        source: the orientation of `array`.
-        target: the orientation of the result.
-        ignore: the value of both channels where there is no vector; None if all values are vectors.
-
-    Returns:
-        A view if no value changes, or a new array.
-
-    Raises:
-        GeometryError: `vectors` have another shape.
-        ChoiceError: there is no such orientation.
+    `vectors` are (…, 2, H, W), down the rows and along the columns, and turn too, where not both are `ignore`. Raises
+    GeometryError of another shape, ChoiceError.
     """
     source, target = (choice("orientation", name, ORIENTATIONS) for name in (source, target))
     if source == target:

@@ -247,9 +247,8 @@ def time_to_collision(
 def side_gaps(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How pairs of boxes (…, 5) lie along the four directions of their sides; they touch while |gap| ≤ reach in all.
 
-    Returns:
-        (…, 4, 2) unit directions, the first's two and then the second's; (…, 4) gaps, from the first's centre to the
-        second's along them; and (…, 4) reaches, half of both boxes' extents along them. Metres.
+    (…, 4, 2) unit directions, the first's two and then the second's; (…, 4) gaps from centre to centre along them; and
+    (…, 4) reaches, half of both boxes' extents. Metres.
     """
     normal = normals(np.concatenate([side_yaws(first), side_yaws(second)], axis=-1))
     gap = along(normal, second[..., :2] - first[..., :2])
@@ -283,17 +282,11 @@ def half_extents(boxes: FloatArray, directions: FloatArray) -> FloatArray:
 def points_in_boxes(
     points: FloatArray, center: FloatArray, half: FloatArray, axes: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """Every pair of a box and a point in it, faces included: rows of boxes (K,) and rows of points (K,).
+    """Rows of boxes (K,) and rows of points (K,): every pair of a box and a point in it, faces included.
 
-    A point p is in a box if |(p − centre) · a| ≤ half for each of its three axes a, with the products summed as
-    (x + y) + z. Grid and windows only leave out points that cannot be inside, so the result is exactly that of this
-    rule. NaN lies in no box. Pairs are sorted by box, then by point.
-
-    Args:
-        points: (P, 3), metres.
-        center: (N, 3), metres, in the same coordinate frame.
-        half: (N, 3), half of length, width, height, metres.
-        axes: (N, 3, 3), rotation matrices: the columns are the box's axes.
+    The boxes have centres and half sizes (N, 3), metres, and axes (N, 3, 3) in columns. A point p is in a box if |(p −
+    centre) · a| ≤ half for each axis a, with the products summed as (x + y) + z: grid and windows only leave out points
+    that cannot be. NaN lies in no box. Pairs are sorted by box, then by point.
     """
     reach = (np.abs(axes) @ half[:, :, None])[:, :, 0] * 1.001 + 1e-6  # wider than any rounding
     low, high = center - reach, center + reach

@@ -80,11 +80,7 @@ _BATCHES: Final[Mapping[str, _Batch]] = {
 
 
 def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: BatchNames) -> dict[str, AnyArray]:
-    """Our maps, `future_egomotion` and `valid` under a code's names, as its sample has them; new, writable arrays.
-
-    Raises:
-        ChoiceError: no such code.
-    """
+    """Our maps, `future_egomotion` and `valid` under a code's names, in new, writable arrays; raises ChoiceError."""
     batch = _batch(names)
     result = {}
     for ours in MAPS:
@@ -115,15 +111,8 @@ def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: B
 def from_batch(batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames) -> dict[str, AnyArray]:
     """Our maps, `future_egomotion` and `valid` from one sample of another code: the reverse of `to_batch`.
 
-    Args:
-        batch: a sample, without a batch axis, of any framework's arrays (`arrays.as_numbers`).
-        config: what the labels were made with.
-        names: the code whose names they are.
-
-    Raises:
-        ChoiceError: no such code.
-        FieldError: the batch lacks an array.
-        GeometryError: an array has another shape than the configuration says.
+    `batch` has no batch axis, and any framework's arrays. Raises FieldError where one is missing, ChoiceError,
+    GeometryError.
     """
     code = _batch(names)
     missing = sorted(set(code.names.values()) - set(batch))

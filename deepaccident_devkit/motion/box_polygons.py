@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,11 +18,11 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.exact import single_precision
 from deepaccident_devkit.exact.polygon_fill import topmost
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.geometry.bev_grid import Axis, axes_of
+from deepaccident_devkit.geometry.bev_grid import axes_of
 from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.config import LabelProtocol, MotionLabelConfig
+from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,
@@ -41,6 +42,7 @@ _DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)
 _CORNERS: Final = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]], dtype=np.float32) / 2
 """mmdet3d's corners 0, 3, 7, 4 from above, in lengths and widths."""
 _UP: Final = np.array([0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
+_COLUMNS: Final = attrgetter("center", "size", "yaw", "actor_id", "category", "visible")
 _FAR: Final = 2**24
 """In cells: corners farther away are moved to this distance, which is far outside the grid."""
 _PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
@@ -177,9 +179,18 @@ def footprints_of(polygons: Sequence[FramePolygons | None], ids: IntArray, confi
     """The polygons with these ids, rasterised in native orientation; later polygons lie on top."""
     native = config.grid.with_orientation(config.rules.native)
     there = [(number, frame) for number, frame in enumerate(polygons) if frame is not None]
-    corners = np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *(frame.corners for _, frame in there)])
+    corners = np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *[frame.corners for _, frame in there]])
     frame = np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64)
-    vertices = _raster_corners(corners, config)
+    given = corners if config.rules.pose == "yaw" else corners.astype(np.float32, copy=False)
+    x, y = given[..., 0], given[..., 1] if config.rules.right_handed else -given[..., 1]
+    place = np.stack((y, x) if native.orientation == "fiery" else (x, y), axis=-1)
+    low, _, size = np.array(axes_of(native)[::-1]).T
+    if config.rules.half_cell_shift:
+        first_center, cell = (low + size / 2).astype(np.float32), size.astype(np.float32)
+        cells: AnyArray = np.rint((place - first_center + cell / np.float32(2)) / cell)
+    else:
+        cells = np.floor((place.astype(np.float64) - low) / size)
+    vertices = np.clip(cells, -_FAR, _FAR).astype(np.int64)
     return Footprints(vertices, frame, ids, topmost(vertices, native.shape, frame, len(polygons)))
 
 
@@ -205,10 +216,8 @@ class _Joined:
 
     @classmethod
     def of(cls, frames: Sequence[FrameBoxes]) -> _Joined:
-        center, size, yaw, actor_id, category, visible = (
-            np.concatenate([getattr(frame, name) for frame in frames])
-            for name in ("center", "size", "yaw", "actor_id", "category", "visible")
-        )
+        columns = zip(*map(_COLUMNS, frames), strict=True)
+        center, size, yaw, actor_id, category, visible = map(np.concatenate, columns)
         return cls(
             frame=np.repeat(np.arange(len(frames)), [len(frame.actor_id) for frame in frames]),
             values=_constructed(center, size, yaw),
@@ -312,24 +321,3 @@ def _leaning_corners(frames: Sequence[FrameBoxes], augmentation: Augmentation | 
         for each in frames
     ]
     return np.concatenate(corners) @ (np.eye(4) if augmentation is None else augmentation.matrix)[:2, :2].T
-
-
-def _raster_corners(corners: AnyArray, config: MotionLabelConfig) -> IntArray:
-    """Native column and row (n, 4, 2) at which corners (n, 4, 2), x and y (left), metres, are rasterised."""
-    rules = config.rules
-    given = corners if rules.pose == "yaw" else corners.astype(np.float32, copy=False)
-    native = config.grid.with_orientation(rules.native)
-    x, y = given[..., 0], given[..., 1] if rules.right_handed else -given[..., 1]
-    columns_and_rows = (y, x) if native.orientation == "fiery" else (x, y)
-    axes = reversed(axes_of(native))
-    return np.stack([_steps(values, axis, rules) for values, axis in zip(columns_and_rows, axes, strict=True)], axis=-1)
-
-
-def _steps(values: AnyArray, axis: Axis, rules: LabelProtocol) -> IntArray:
-    low, _, size = axis
-    if not rules.half_cell_shift:
-        cells: AnyArray = np.floor((values.astype(np.float64) - low) / size)
-    else:
-        first_center, cell = np.float32(low + size / 2), np.float32(size)
-        cells = np.rint((values - first_center + cell / np.float32(2)) / cell)
-    return np.clip(cells, -_FAR, _FAR).astype(np.int64)

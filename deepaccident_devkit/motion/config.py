@@ -183,6 +183,7 @@ LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
     }
 )
 """By name: the released code, the same without its quirks, and the two codes that it is based on."""
+_NAMES: Final = {rules: name for name, rules in LABEL_PROTOCOLS.items()}
 
 
 def label_protocol(protocol: str | LabelProtocol) -> LabelProtocol:
@@ -238,14 +239,16 @@ class MotionLabelConfig:
 
     def __post_init__(self) -> None:
         """Check and complete; raises ConfigError or ChoiceError, each with the remedy."""
-        grid = _checked_grid(self.grid, self.orientation)
+        if not isinstance(self.grid, BevGrid):
+            raise ConfigError(f"grid: expected a BevGrid, found {self.grid!r}; BevGrid(x=(-50, 50, 0.5)) makes one")
+        grid = self.grid if self.orientation is None else self.grid.with_orientation(self.orientation)
         values: dict[str, object] = {
             "grid": grid,
             "orientation": None,
             "ignore_index": _checked_mark(self.ignore_index, grid),
             "sigma": checked_setting("sigma", self.sigma, "cells from 0.01 to 10,000, such as 3", *_SIGMAS),
             "agents": _checked_agents(self.agents),
-            "protocol": _named(label_protocol(self.protocol)),
+            "protocol": _NAMES.get(label_protocol(self.protocol), self.protocol),
             **{name: checked_count(name, getattr(self, name), what, _MOST_FRAMES) for name, what in _COUNTS.items()},
             **{
                 name: checked_flag(name, getattr(self, name))
@@ -351,23 +354,12 @@ def _agents_text(agents: Agents) -> Any:
 
 
 def label_config(config: MotionLabelConfig | str | None) -> MotionLabelConfig:
-    """A configuration as it is given, by a preset's name, or the released one for None.
-
-    Raises:
-        ChoiceError: no such preset.
-        ConfigError: something else was given.
-    """
+    """A configuration as given, by a preset's name, or the released one for None; raises ChoiceError or ConfigError."""
     if config is None or isinstance(config, str):
         return MotionLabelConfig() if config is None else MotionLabelConfig.preset(config)
     if not isinstance(config, MotionLabelConfig):
         raise ConfigError(f"config: expected a MotionLabelConfig or the name of a preset, found {config!r}")
     return config
-
-
-def _checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
-    if not isinstance(grid, BevGrid):
-        raise ConfigError(f"grid: expected a BevGrid, found {grid!r}; BevGrid(x=(-50, 50, 0.5)) makes one")
-    return grid if orientation is None else grid.with_orientation(orientation)
 
 
 def _checked_mark(ignore_index: object, grid: BevGrid) -> int:
@@ -401,11 +393,6 @@ def _checked_agents(agents: object) -> AgentConfig | str | tuple[str, ...] | Non
     if not names:
         raise ChoiceError("agents: expected at least one agent, found none; None or 'available' stands for all agents")
     return names
-
-
-def _named(protocol: LabelProtocol) -> str | LabelProtocol:
-    """A protocol's name if it has one, or the protocol itself."""
-    return next((name for name, rules in LABEL_PROTOCOLS.items() if rules == protocol), protocol)
 
 
 _DEEPACCIDENT: Final = MotionLabelConfig()

@@ -94,7 +94,7 @@ def labels_from_polygons(
     past = config.receptive_field - 1
     there = np.array([True] * past + [frame is not None for frame in polygons])
     known = there if valid is None else there & checked("valid", valid, (config.frames,), np.bool_)
-    ids, continued = _numbered(polygons, config, _checked_ids(id_map, config))
+    ids, continued = _numbered(polygons, config, {} if id_map is None else _checked_ids(id_map, config))
     footprints = footprints_of(polygons, ids, config)
     covered = _covered(footprints, config)
     centers = covered.centers()
@@ -115,10 +115,8 @@ def labels_from_polygons(
     )
 
 
-def _checked_ids(id_map: Mapping[int, int] | None, config: MotionLabelConfig) -> dict[int, int]:
+def _checked_ids(id_map: Mapping[int, int], config: MotionLabelConfig) -> dict[int, int]:
     """A copy of the map to continue, or ConfigError."""
-    if id_map is None:
-        return {}
     if not config.rules.ids_kept_between_samples:
         raise ConfigError(
             "id_map: ids of this protocol count from 1 in every sample; leave it out, or choose a protocol with "
@@ -140,12 +138,13 @@ def _numbered(
     """The id of each polygon of all frames, and the extended map; ids count from 1 in the order of rasterising."""
     highest, ids = max(id_map.values(), default=0), []
     nobody = None if config.rules.untracked_share_an_id else UNTRACKED_ID
-    for key in (key for frame in polygons if frame is not None for key in frame.key.tolist()):
-        if key == nobody or key not in id_map:
-            highest += 1
-            if key != nobody:
-                id_map[key] = highest
-        ids.append(highest if key == nobody else id_map[key])
+    for frame in polygons:
+        for key in [] if frame is None else frame.key.tolist():
+            if key == nobody or key not in id_map:
+                highest += 1
+                if key != nobody:
+                    id_map[key] = highest
+            ids.append(highest if key == nobody else id_map[key])
     return np.array(ids, dtype=np.int64), id_map
 
 
@@ -196,11 +195,10 @@ class CoveredCells:
         slot, slots = self.slot, self.frames * (1 + self.ids)
         count = np.bincount(slot, minlength=slots).astype(np.float32)
         # sums of whole numbers are exact in float32, except on huge grids: so the mean is torch's
-        sums = [
-            np.bincount(slot, weights=values, minlength=slots).astype(np.float32) for values in (self.row, self.column)
-        ]
+        rows = np.bincount(slot, weights=self.row, minlength=slots).astype(np.float32)
+        columns = np.bincount(slot, weights=self.column, minlength=slots).astype(np.float32)
         with np.errstate(invalid="ignore"):
-            means: Float32Array = np.rint(np.stack(sums, axis=-1) / count[:, None])
+            means: Float32Array = np.rint(np.stack([rows, columns], axis=-1) / count[:, None])
         return means.reshape(self.frames, 1 + self.ids, 2)
 
 
@@ -239,14 +237,9 @@ class LabelMaps:
 def label_maps(
     covered: CoveredCells, centers: Float32Array, following: Float32Array, missing: BoolArray, config: MotionLabelConfig
 ) -> LabelMaps:
-    """The maps of instances and their centres.
+    """The maps of instances, from native cells and centres (T, 1 + ids, 2) here and at the next frame, or NaN.
 
-    Args:
-        covered: the rasterised cells, native.
-        centers: (T, 1 + ids, 2) each instance's centre, row and column, native; NaN where there is none.
-        following: (T, 1 + ids, 2) where it is at the next frame, seen from this one; NaN where that is not known.
-        missing: (T,) which frames are not in the recording.
-        config: of the labels.
+    `missing` (T,) says which frames are not in the recording.
     """
     maps, target = LabelMaps.empty(config), config.grid.orientation
     native = config.grid.with_orientation(config.rules.native)
@@ -325,11 +318,7 @@ def following_centers(
 ) -> Float32Array:
     """(T, 1 + ids, 2) centres of the instances at the next frame, warped to each frame; NaN where they are not seen.
 
-    Args:
-        footprints: of the T frames.
-        next_from_this: (T − 1, 4, 4) as `sampling_matrix` gives them, finite.
-        config: of the labels.
-        ids: the highest id.
+    `next_from_this` (T − 1, 4, 4) is as `sampling_matrix` gives it, finite.
     """
     grid, rules = config.grid.with_orientation(config.rules.native), config.rules
     lines = sampling_lines(next_from_this, grid, rules)
@@ -375,7 +364,8 @@ def _seen_near(
     before = np.cumsum(runs.length) - runs.length
     column = np.arange(len(run)) + (runs.first + runs.frame * columns - before).take(run)
     # the points are near the grid, so int32 holds them; below 0, uint32 is large
-    down, along = (np.rint(line.points_of(runs.frame, runs.row, column, run)).astype(np.int32) for line in lines)
+    down = np.rint(lines[0].points_of(runs.frame, runs.row, column, run)).astype(np.int32)
+    along = np.rint(lines[1].points_of(runs.frame, runs.row, column, run)).astype(np.int32)
     inside = down.view(np.uint32) < rows
     inside &= along.view(np.uint32) < columns
     source = ((runs.frame + 1) * grid.cells).take(run)
@@ -392,7 +382,7 @@ def _runs_near(footprints: Footprints, origin: FloatArray, inverse: FloatArray, 
     polygon = np.flatnonzero(footprints.frame > 0)
     corners, frame = footprints.corners[polygon, :, ::-1], footprints.frame[polygon] - 1
     last = np.array(grid.shape) - 1
-    low, high = (np.minimum(np.maximum(ends, 0), last) for ends in (corners.min(axis=1), corners.max(axis=1)))
+    low, high = np.minimum(np.maximum([corners.min(axis=1), corners.max(axis=1)], 0), last)
     center = (inverse[frame] @ ((low + high) / 2 - origin[frame])[..., None])[..., 0]
     reach = (np.abs(inverse)[frame] @ ((high - low) / 2 + _MARGIN)[..., None])[..., 0]
     first = np.maximum(np.ceil(center - reach), 0).astype(np.int64)

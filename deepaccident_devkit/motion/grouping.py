@@ -194,17 +194,10 @@ class FrameGroups:
 def group_cells(
     peaks: IntArray, position: AnyArray, offset: AnyArray, flow: AnyArray, *, all_cells: bool
 ) -> FrameGroups:
-    """Instances of one frame: the foreground's cells by the peak nearest to where their offset points.
+    """Instances of one frame: the foreground's cells by the peak (K, 2) nearest to where their offset points.
 
-    If all cells are foreground, the lowest instance becomes the background: ids are the ranks of all ids that occur,
-    from 0.
-
-    Args:
-        peaks: (K, 2) rows and columns; at least one unless there are no cells.
-        position: (2, P) float32 rows and columns of the foreground's cells.
-        offset: (2, P) float32 rows and columns from each to its instance's centre.
-        flow: (2, P) float32 rows and columns to where each is at the next frame.
-        all_cells: whether these are all cells of the frame.
+    `position`, `offset` and `flow` are (2, P) float32 rows and columns. If `all_cells` of the frame are foreground, the
+    lowest instance becomes the background: ids are the ranks of all ids that occur, from 0.
     """
     nearest = nearest_peaks(position + offset, peaks.astype(np.float32)) + 1
     occurs = np.bincount(nearest, minlength=len(peaks) + 1) > 0
@@ -231,19 +224,12 @@ def means(sums: FloatArray, counts: FloatArray) -> AnyArray:
 
 
 def link_frames(groups: Sequence[FrameGroups], distance: float) -> list[IntArray]:
-    """Consistent ids of the instances of consecutive frames.
+    """Consistent ids (I + 1,) of the instances of consecutive frames, 0 for 0.
 
     Instances are paired one to one with those of the frame before, which the flow has moved, so that the sum of the
-    distances is smallest. Pairs nearer than `distance` share an id. The others get new ids, counted from the first
-    frame's highest id. A frame without instances, and the frame after it, keep their own ids, which do not count as
-    given: later instances may get the same ids.
-
-    Args:
-        groups: the frames' instances.
-        distance: cells; a pair must be nearer.
-
-    Returns:
-        Per frame (I + 1,) int64: the consistent id of each of its instances; 0 for 0.
+    distances is smallest. Pairs nearer than `distance`, cells, share an id. The others get new ids, counted from the
+    first frame's highest id. A frame without instances, and the frame after it, keep their own ids, which do not count
+    as given: later instances may get the same ids.
     """
     names = [np.arange(groups[0].instances + 1)]
     newest = groups[0].instances

@@ -175,17 +175,8 @@ def maps_to_present(
     Segmentation, instance, offset and flow take the nearest cell's values. The protocol says how (`warp`), what value
     cells from outside the grid have (`outside_is_zero`) and whether offset and flow turn with the frame
     (`vectors_not_rotated`). An augmentation of the configuration counts on both sides: A C A⁻¹ (docs/released_code.md,
-    Warps). A missing frame that is all `ignore_index` (not `missing_frames_are_empty`) is not warped.
-
-    Args:
-        maps: segmentation, instance, centerness, offset and flow, each frame in its own ego frame.
-        label_egomotion: (T, 6) right-handed 6-vectors from the present on.
-        missing: (T,) which frames are not in the recording.
-        config: of the labels.
-        centerness: how to sample it.
-
-    Raises:
-        ChoiceError: no such mode.
+    Warps). A missing frame (T,) that is all `ignore_index` is not warped. `label_egomotion` (T, 6) goes from the
+    present on.
     """
     centerness = checked_mode(centerness)
     rules = config.rules
@@ -199,12 +190,14 @@ def maps_to_present(
     for frame in np.flatnonzero(~ignored[1:]) + 1:
         points = sample_points(matrices[frame], config.grid, rules)
         indices = rounded_points(points, config.grid, rules, config.grid.orientation)
-        source, target = ({name: array[frame] for name, array in each.items()} for each in (maps, warped))
+        source = {name: array[frame] for name, array in maps.items()}
+        target = {name: array[frame] for name, array in warped.items()}
         _warp_instances(source, target, indices, config)
         if centerness == "nearest":
-            target["centerness"][...] = _taken(source["centerness"], indices)
+            target["centerness"].reshape(-1)[:] = take_cells(source["centerness"].reshape(-1), indices)
         else:
-            _blend(source["centerness"], target["centerness"], points, config)
+            native = config.grid.reorient(source["centerness"], rules.native)
+            config.grid.reorient(target["centerness"], rules.native)[...] = blend_cells(native, points)
         if not rules.vectors_not_rotated:
             turn = _vector_turn(transforms[frame], config)
             here = target["instance"] != 0
@@ -220,7 +213,7 @@ def _empty_like(maps: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
     """
     block = np.empty(sum(given.nbytes for given in maps.values()), dtype=np.uint8)
     result, start = {}, 0
-    for name, given in sorted(maps.items(), key=lambda item: -item[1].itemsize):  # so that all are aligned
+    for name, given in reversed(list(maps.items())):  # segmentation's bytes last, so that all are aligned
         end = start + given.nbytes
         result[name] = block[start:end].view(given.dtype).reshape(given.shape)
         start = end
@@ -235,26 +228,17 @@ def _warp_instances(
     Outside instances segmentation is 0, offset and flow are `ignore_index` (see `MotionLabels`), so only the cells of
     instances are fetched.
     """
-    target["instance"][...] = _taken(source["instance"], indices)
+    target["instance"].reshape(-1)[:] = take_cells(source["instance"].reshape(-1), indices)
     on_instance = np.flatnonzero(target["instance"] != 0)  # seven times as fast on a mask as on integers
     fetched = indices[on_instance]
     background = np.full(indices.size, config.ignore_index, dtype=target["offset"].dtype)
     if config.rules.outside_is_zero:
         background *= indices != OUTSIDE
     for name, beside in (("segmentation", 0), ("offset", background), ("flow", background)):
-        cells, filled = (each[name].reshape(-1, indices.size) for each in (source, target))
+        cells, filled = source[name].reshape(-1, indices.size), target[name].reshape(-1, indices.size)
         filled[...] = beside
         for channel, values in zip(filled, cells, strict=True):
             channel[on_instance] = values[fetched]
-
-
-def _taken(raster: AnyArray, indices: CellIndices) -> AnyArray:
-    return take_cells(raster.reshape(-1), indices).reshape(raster.shape)
-
-
-def _blend(source: AnyArray, target: AnyArray, points: tuple[AnyArray, AnyArray], config: MotionLabelConfig) -> None:
-    given, filled = (config.grid.reorient(raster, config.rules.native) for raster in (source, target))
-    filled[...] = blend_cells(given, points)
 
 
 def _vector_turn(present_from_frame: AnyArray, config: MotionLabelConfig) -> FloatArray:

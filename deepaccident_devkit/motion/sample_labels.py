@@ -18,7 +18,7 @@ from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing import motion_labels_from_boxes
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warping import egomotion
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked_number
+from deepaccident_devkit.support.arrays import AnyArray, IntArray, checked_number
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.taxonomy import (
@@ -39,7 +39,6 @@ _KEY_STEP: Final = 5
 """Recorded frames from one key frame to the next, counted back from a scenario's last frame."""
 _STEPS: Final = {"train": 10, "evaluate": _KEY_STEP, "all": _KEY_STEP, "every": 1}
 _RELEASED_HORIZON: Final = 2.0
-_VISIBILITY_COLUMNS: Final = ("translation", "category", "num_lidar_pts", "camera_visible")
 
 
 def samples(
@@ -183,24 +182,19 @@ def motion_labels(
     present = row - first_row
     index: IntArray = present + np.array([*config.offsets, config.offsets[-1] + config.step])
     there = (index >= 0) & (index < length)
+    world_from_ego = np.tile(np.eye(4), (len(index), 1, 1))
+    world_from_ego[there] = stored_transforms(dataset.columns("ego_pose")["matrix"][first_row + index[there]])
     past = config.receptive_field - 1
     known = index[past:-1][there[past:-1]]
     frames = iter(_frames(dataset, sample, first_row, known, config))
     return motion_labels_from_boxes(
         [next(frames) if one else None for one in there[past:-1]],
-        egomotion(_world_from_ego(dataset, first_row + index, there), there, config.rules),
+        egomotion(world_from_ego, there, config.rules),
         config,
         valid=there[:-1],
         is_vehicle=AGENTS[samples["agent"].item(row)] != INFRASTRUCTURE,
         id_map=id_map,
     )
-
-
-def _world_from_ego(dataset: Dataset, rows: IntArray, there: BoolArray) -> FloatArray:
-    """(len(rows), 4, 4) poses of samples; the identity for rows that are not `there`."""
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[there] = stored_transforms(dataset.columns("ego_pose")["matrix"][rows[there]])
-    return poses
 
 
 def _frames(
@@ -245,12 +239,16 @@ def _seen(dataset: Dataset, sample: RowArgument, index: IntArray, config: Motion
         first_row = dataset.columns("agent")["first_sample_row"].item(dataset.getind("agent", f"{scenario}/{agent}"))
         slices = _annotations(dataset, first_row + index)
         actors = [boxes["actor_id"][one] for one in slices]
-        center, category, points, camera = (
-            np.concatenate([boxes[name][one] for one in slices]) for name in _VISIBILITY_COLUMNS
-        )
-        actor = np.concatenate(actors)
-        by_points = visible_mask(center[:, :2], category, points, camera, infrastructure=agent == INFRASTRUCTURE)
-        mask = camera if config.rules.sight == "camera" else by_points & (actor != UNTRACKED_ID)
+        actor, mask = np.concatenate(actors), np.concatenate([boxes["camera_visible"][one] for one in slices])
+        if config.rules.sight != "camera":
+            by_points = visible_mask(
+                np.concatenate([boxes["translation"][one] for one in slices])[:, :2],
+                np.concatenate([boxes["category"][one] for one in slices]),
+                np.concatenate([boxes["num_lidar_pts"][one] for one in slices]),
+                mask,
+                infrastructure=agent == INFRASTRUCTURE,
+            )
+            mask = by_points & (actor != UNTRACKED_ID)
         pairs.append(_pairs(actors, slices)[mask & (actor != OWN_ACTOR_ID)])
     return np.concatenate(pairs)
 

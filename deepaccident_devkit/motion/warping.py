@@ -25,7 +25,7 @@ transformed points count. `source_from_target` maps points of the result's frame
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -68,24 +68,14 @@ _SINGLE = _Arithmetic(
     single_precision.pose_matrices, single_precision.rigid_inverse, single_precision.inverse, single_precision.product
 )
 _DOUBLE = _Arithmetic(conventions.matrices_of_six, np.linalg.inv, np.linalg.inv, np.matmul)
+_ARITHMETIC: Final[Mapping[str, _Arithmetic]] = {"stretched": _SINGLE, "fiery": _SINGLE, "exact": _DOUBLE}
 
 
 def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol) -> AnyArray:
-    """An agent's motion from each of its moments to the next, as `v2x.future_egomotion`, in a protocol's arithmetic.
+    """`v2x.future_egomotion` of poses (T + 1, 4, 4) in a protocol's arithmetic: (T, 6) float32.
 
     The released code has the poses in float32. If a sample point lies on a border between cells, their last bits decide
     to which cell it belongs.
-
-    Args:
-        world_from_ego: (T + 1, 4, 4) right-handed poses in the order of time.
-        valid: (T + 1,) whether each moment is in the recording.
-        rules: whose arithmetic.
-
-    Returns:
-        (T, 6) right-handed `next_from_this`, float32; zero where a moment or the next is not in the recording.
-
-    Raises:
-        GeometryError: another shape.
     """
     if rules.warp == "exact":
         return future_egomotion(world_from_ego, valid).astype(np.float32)
@@ -104,20 +94,12 @@ def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol)
 def present_from_frames(
     egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
 ) -> AnyArray:
-    """Transforms of the present and each future frame to the present: C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹.
+    """Transforms (T, 4, 4) of the present and each future frame to the present: C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹.
 
-    Args:
-        egomotion: (T, 6) right-handed, `next_from_this` from the present on; the last row is not used.
-        rules: whose arithmetic and handedness.
-        augmentation: of both frames; C becomes A C A⁻¹.
-
-    Returns:
-        (T, 4, 4); the first is the identity.
-
-    Raises:
-        GeometryError: another shape.
+    `egomotion` (T, 6) is `next_from_this` from the present on; of the last row nothing is used. Augmented, C becomes A
+    C A⁻¹.
     """
-    arithmetic = _arithmetic(rules)
+    arithmetic = _ARITHMETIC[rules.warp]
     this_from_next = arithmetic.rigid_inverse(_native_matrices(egomotion, rules)[:-1])
     chain = [np.eye(4, dtype=this_from_next.dtype)]
     for step in this_from_next:
@@ -126,41 +108,21 @@ def present_from_frames(
 
 
 def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
-    """Transforms from each frame's next frame to that frame; the released code has a special way to invert these.
+    """Transforms (T, 4, 4) from each frame's next frame to that frame, of `next_from_this` (T, 6).
 
-    Args:
-        egomotion: (T, 6) right-handed, `next_from_this`.
-        rules: whose arithmetic and handedness.
-        augmentation: of both frames; E⁻¹ becomes A E⁻¹ A⁻¹.
-
-    Returns:
-        (T, 4, 4).
-
-    Raises:
-        GeometryError: another shape.
+    The released code has a special way to invert these.
     """
-    inverse = _arithmetic(rules).inverse(_native_matrices(egomotion, rules))
+    inverse = _ARITHMETIC[rules.warp].inverse(_native_matrices(egomotion, rules))
     return _augmented(inverse, rules, augmentation)
 
 
 def present_from_past(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
-    """Transforms of each past moment to the present.
+    """Transforms (P, 4, 4) of past moments to the present, of their `next_from_this` (P, 6), the oldest first.
 
     The released code and FIERY multiply the motions in the order of time, E_0 E_1, and so are wrong from the second
     moment before the present on; `exact` multiplies E_1 E_0.
-
-    Args:
-        egomotion: (P, 6) right-handed, `next_from_this` of the P moments before the present, the oldest first.
-        rules: whose arithmetic, handedness and order.
-        augmentation: of both frames; the product becomes A · product · A⁻¹.
-
-    Returns:
-        (P, 4, 4), the oldest first.
-
-    Raises:
-        GeometryError: another shape.
     """
-    arithmetic = _arithmetic(rules)
+    arithmetic = _ARITHMETIC[rules.warp]
     steps = _native_matrices(egomotion, rules)
     chain = list(steps[-1:])
     for step in steps[-2::-1]:
@@ -176,31 +138,23 @@ def ego_from_agents(
     return _augmented(_native_matrices(relative_pose, rules), rules, augmentation)
 
 
-def _arithmetic(rules: LabelProtocol) -> _Arithmetic:
-    return _DOUBLE if rules.warp == "exact" else _SINGLE
-
-
 def _native_matrices(six: ArrayLike, rules: LabelProtocol) -> AnyArray:
     vectors = checked("egomotion", six, (None, 6))
-    return _arithmetic(rules).matrices(vectors if rules.right_handed else flip_six_vector(vectors))
+    return _ARITHMETIC[rules.warp].matrices(vectors if rules.right_handed else flip_six_vector(vectors))
 
 
 def _augmented(transforms: AnyArray, rules: LabelProtocol, augmentation: Augmentation | None) -> AnyArray:
     """A · transforms · A⁻¹."""
     if augmentation is None or not len(transforms):
         return transforms
-    arithmetic = _arithmetic(rules)
+    arithmetic = _ARITHMETIC[rules.warp]
     given = augmentation.matrix if rules.right_handed else flip_pose(augmentation.matrix)
     matrix = given[None].astype(transforms.dtype)
     return arithmetic.product(arithmetic.product(matrix, transforms), arithmetic.inverse(matrix))
 
 
 def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyArray:
-    """`source_from_target` of transforms (N, 4, 4), as the protocol computes it: float32, by elimination, or float64.
-
-    Raises:
-        GeometryError: another shape.
-    """
+    """`source_from_target` of transforms (N, 4, 4), as the protocol computes it: in float32 or float64."""
     if rules.warp == "stretched":
         return single_precision.inverse(checked("target_from_source", target_from_source, (None, 4, 4), np.float32))
     result: FloatArray = np.linalg.inv(checked("target_from_source", target_from_source, (None, 4, 4)))
@@ -210,22 +164,10 @@ def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyA
 def nearest_indices(
     source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol, *, orientation: Orientation | None = None
 ) -> CellIndices:
-    """The source cell of each target cell.
+    """The source cell (H · W,) of each target cell: row · W + column, `OUTSIDE` where the sample point is off the grid.
 
-    Points half-way between two cells go to the even one.
-
-    Args:
-        source_from_target: (4, 4) metres, in the protocol's handedness.
-        grid: the cells of both rasters; its own orientation does not matter.
-        rules: the protocol that says how to sample.
-        orientation: of the rasters that the indices are for; None for the protocol's native orientation.
-
-    Returns:
-        (H·W,) intp, row · W + column of the source cell, in the order of the target's cells; −1 (`OUTSIDE`) where the
-        sample point is outside the grid.
-
-    Raises:
-        GeometryError: the matrix has another shape or is not finite, or the grid has more than 2²⁴ cells.
+    `source_from_target` (4, 4) is in metres and the protocol's handedness. Both rasters lie in `orientation`, None for
+    the protocol's native one. Points half-way between two cells go to the even one. Raises GeometryError.
     """
     return rounded_points(sample_points(source_from_target, grid, rules), grid, rules, orientation)
 
@@ -236,7 +178,7 @@ def rounded_points(
     """`nearest_indices` from the sample points."""
     if grid.cells > _COUNTABLE:
         raise GeometryError(f"grid: {grid.cells} cells are more than a warp can number; choose at most {_COUNTABLE}")
-    row, column = (np.rint(point) for point in points)
+    row, column = np.rint(points[0]), np.rint(points[1])
     rows, columns = row.shape
     beside = (row < 0) | (row >= rows)
     beside |= column < 0
@@ -263,24 +205,10 @@ def warp(
     fill: float = 0,
     orientation: Orientation | None = None,
 ) -> AnyArray:
-    """Rasters in another frame; all of them (leading axes) the same way.
+    """Rasters (…, H, W) in another frame, all the same way: of the same dtype if `nearest`, float32 if `bilinear`.
 
-    Args:
-        raster: (…, H, W) in `orientation`.
-        source_from_target: (4, 4) metres, in the protocol's handedness.
-        grid: the cells; its own orientation does not matter.
-        rules: the protocol that says how to sample.
-        mode: the value of the nearest cell, or of the four around the sample point, weighted.
-        fill: the value outside the grid; if the mode is bilinear, it mixes with the border's cells.
-        orientation: how the rasters lie; None for the protocol's native orientation. Only cells change places: vectors
-            do not turn.
-
-    Returns:
-        The same shape and orientation; of the same dtype if `nearest`, float32 if `bilinear`.
-
-    Raises:
-        GeometryError: a shape that does not fit, or a matrix that is not finite.
-        ChoiceError: no such mode.
+    `source_from_target`, `orientation` and errors as in `nearest_indices`; `fill` is the value outside the grid, which
+    mixes with the border's cells if bilinear. Only cells change places: vectors do not turn.
     """
     native = rules.native
     lying = grid.with_orientation(orientation or native)

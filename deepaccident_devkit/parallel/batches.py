@@ -34,6 +34,27 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress: TypeAlias = "bool | Callable[[float], object]"
 """Whether to show a progress bar; or a function that gets each item's share of the work, for a bar of the caller's."""
+_SAME_SIGNAL: Final = 0.1
+"""Seconds in which a signal that ended a worker ends this process too, if it was sent to all processes of a job."""
+_AHEAD: Final = 4
+"""Items under way for each one that the workers do at once."""
+_FAR_AHEAD: Final = 32
+"""The same, counted from the oldest item that is not done: what is needed in order waits for it in memory."""
+_WIDTH_SECONDS: Final = 5.0
+"""Time after which an executor is asked again: workers join and leave."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Places:
+    """Files and folders that all workers must see.
+
+    Attributes:
+        reads: what they read.
+        writes: folders that they write into; made where needed.
+    """
+
+    reads: tuple[Path, ...] = ()
+    writes: tuple[Path, ...] = ()
 
 
 class Engine(TypedDict, total=False):
@@ -50,16 +71,6 @@ class Engine(TypedDict, total=False):
     workers: int | None
     executor: Executor | None
     progress: Progress
-
-
-_SAME_SIGNAL: Final = 0.1
-"""Seconds in which a signal that ended a worker ends this process too, if it was sent to all processes of a job."""
-_AHEAD: Final = 4
-"""Items under way for each one that the workers do at once."""
-_FAR_AHEAD: Final = 32
-"""The same, counted from the oldest item that is not done: what is needed in order waits for it in memory."""
-_WIDTH_SECONDS: Final = 5.0
-"""Time after which an executor is asked again: workers join and leave."""
 
 
 def run_batch(
@@ -189,19 +200,6 @@ def _on(
     finally:
         for future in running if cancel else ():
             future.cancel()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Places:
-    """Files and folders that all workers must see.
-
-    Attributes:
-        reads: what they read.
-        writes: folders that they write into; made where needed.
-    """
-
-    reads: tuple[Path, ...] = ()
-    writes: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,7 +67,10 @@ class FrozenArrays(ShortRepr):
 
     def __post_init__(self) -> None:
         """Freeze the arrays; a class that checks them freezes them itself."""
-        _put(self, {name: getattr(self, name) for name in _field_names(type(self))})
+        kind: type[Any] = type(self)
+        for field in fields(kind):
+            if isinstance(value := getattr(self, field.name), np.ndarray):
+                object.__setattr__(self, field.name, readonly(value))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies go without `__init__`, since what they hold was checked."""
@@ -103,22 +106,14 @@ class BitView(Sequence[bool]):
 def checked(
     name: str, values: ArrayLike, shape: Sequence[int | None], dtype: DTypeLike | None = np.float64
 ) -> AnyArray:
-    """Return `values` as an array of `dtype`, or raise GeometryError if they are no numbers or of another shape.
+    """`values` as an array of `dtype`, or GeometryError if they are no numbers or not of `shape` (None: any length).
 
-    Args:
-        name: how the error names the array.
-        values: what the caller passed.
-        shape: the expected shape, None where any length is good.
-        dtype: the element type wanted, None for that of `values`; an array that has it already is not copied. Of an
-            integer type, numbers must be whole and in its range.
+    With dtype None they keep theirs; an array that has it already is not copied. For integers, numbers must be whole
+    and in range.
     """
-    if (
-        type(values) is np.ndarray
-        and values.dtype.kind in _NUMBERS
-        and values.dtype == dtype
-        and _fits(values.shape, shape)
-    ):
-        return values  # as nearly always; many small arrays of a sample's labels come here
+    if type(values) is np.ndarray and values.dtype.kind in _NUMBERS and _fits(values.shape, shape):
+        # as nearly always; many small arrays of a sample's labels come here
+        return values if values.dtype == dtype else as_numbers(name, values, dtype=dtype)
     array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
     if not _fits(array.shape, shape):
         remedy = "; transpose it (.T)" if array.ndim == 2 and _fits(array.shape[::-1], shape) else ""
@@ -132,18 +127,8 @@ def as_numbers(
     """`checked` for any shape: the one way in for a caller's arrays, of any framework.
 
     Everything is taken that numpy can read without a copy from another device: its own arrays, sequences, and objects
-    with `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an
-    accelerator or unmasked silently; the error says how.
-
-    Args:
-        name: how the error names the array.
-        values: what the caller passed.
-        expected: what the caller should have passed, for the error.
-        dtype: the element type wanted, None for that of `values`; an array that has it already is not copied. Of an
-            integer type, numbers must be whole and in its range, of a float type in its range (NaN and inf pass).
-
-    Raises:
-        GeometryError: no numbers, masked ones, numbers that the type cannot hold, or an array that cannot be read.
+    with `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an accelerator
+    or unmasked silently; the error says how. Numbers must be in the range of a float type too (NaN and inf pass).
     """
     given = _read(name, values, expected)
     wanted = given.dtype if dtype is None else np.dtype(dtype)
@@ -243,12 +228,7 @@ def in_range(numbers: AnyArray | float) -> BoolArray:
 
 
 def known(values: ArrayLike | None, digits: int | None = None) -> Any:
-    """Numbers as JSON holds them, in lists as deep as the array: None for those that are not finite, and for None.
-
-    Args:
-        values: of any shape.
-        digits: decimals to round to; None for all.
-    """
+    """Numbers as JSON holds them, in lists as deep as the array, rounded; None for what is not finite."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim:
         return [known(each, digits) for each in array]
@@ -303,13 +283,9 @@ def _remedy(values: object) -> str:
 def _restored(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArrays:
     """Undo `FrozenArrays.__reduce__`."""
     result = object.__new__(kind)
-    _put(result, values)
-    return result
-
-
-def _put(record: FrozenArrays, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
-        object.__setattr__(record, name, readonly(value) if isinstance(value, np.ndarray) else value)
+        object.__setattr__(result, name, readonly(value) if isinstance(value, np.ndarray) else value)
+    return result
 
 
 def _value_text(value: object) -> str:

@@ -85,12 +85,8 @@ def remove_leftovers(folder: Path, dead: Collection[str] = ()) -> None:
     """Remove the temporary files and folders of dead writers; what cannot be removed is left to the next time.
 
     A writer on this host is dead if no process has its number and its start time; one on another host if nothing was
-    changed for a day. A name without a host, as earlier versions gave, may be another program's, and is left.
-
-    Args:
-        folder: whose own entries are looked through.
-        dead: final names whose writers are dead, on whatever host: the caller holds a lock without which nobody writes
-            these.
+    changed for a day. A name without a host, as earlier versions gave, may be another program's, and is left. `dead`
+    are final names whose writers are dead, on whatever host: the caller holds a lock without which nobody writes these.
     """
     beginnings = {name[:_NAME_LENGTH] for name in dead}
     with suppress(OSError), os.scandir(folder) as entries:
@@ -174,18 +170,12 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def place_in(folder: Path, path: str | PurePath, *, opened: bool = False) -> Path:
-    """The path of something below a folder; writing or removing it changes nothing outside.
+    """The path of something below a folder; writing or removing it changes nothing outside, or OutputFolderError.
 
     No folder on the way is a link. This is so at the moment of the call: ask for each file, right before it is used.
-    The given folder may be a link. So may the file, if it is not `opened`: `replacing` and `remove_in` follow no link.
-
-    Args:
-        folder: which may hold a stranger's files.
-        path: relative to it; it may be empty, for the folder itself, if that is `opened`.
-        opened: whether it must be no link itself, as a lock, or a folder into which others write.
-
-    Raises:
-        OutputFolderError: there is a link, or the path is absolute, has `..`, or is empty.
+    The given folder may be a link. So may the file, if it is not `opened` (as a lock, or a folder into which others
+    write): `replacing` and `remove_in` follow no link. The path may be empty, for the folder itself, if that is
+    `opened`.
     """
     inside = PurePath(path)
     if inside.is_absolute() or ".." in inside.parts or not (inside.parts or opened):
@@ -202,9 +192,7 @@ def place_in(folder: Path, path: str | PurePath, *, opened: bool = False) -> Pat
 def remove_in(folder: Path, path: str | PurePath) -> None:
     """Remove a file or a whole folder below a folder, if it is there; of a link the link itself, never its target.
 
-    Raises:
-        OutputFolderError: as of `place_in`.
-        OSError: it cannot be removed.
+    Raises what `place_in` does, and OSError.
     """
     place = place_in(folder, path)
     if os.path.isdir(place) and not os.path.islink(place):  # noqa: PTH112, PTH114 - as above
@@ -214,12 +202,7 @@ def remove_in(folder: Path, path: str | PurePath) -> None:
 
 
 def plain_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:
-    """Name → the name of a file or folder of its own: letters, digits, `_`, `-` and `.` alone, on any file system.
-
-    Args:
-        names: such as tokens.
-        taken: names of files that none of them gets.
-    """
+    """Name → the name of a file or folder of its own, none of `taken`: letters, digits, `_`, `-` and `.` alone."""
     used = {name.lower() for name in taken}
     plain: dict[str, str] = {}
     for name in names:

@@ -38,17 +38,10 @@ class _Fault(str):
 
 
 def parsed_json(content: bytes, *, constants: bool = False, levels: int = MOST_LEVELS) -> Any:
-    """The value of JSON text.
+    """The value of JSON text, not nested deeper than `levels`; too large numbers are infinite, so callers check them.
 
-    A number too large for a float is infinite; callers check the numbers that they use.
-
-    Args:
-        content: of a file.
-        constants: whether NaN and Infinity may stand there, which are no JSON, and which Python writes.
-        levels: how deeply it may be nested.
-
-    Raises:
-        ValueError: it is no JSON, or against these rules; half a sentence, which names the place of the fault.
+    `constants` lets NaN and Infinity stand there, which are no JSON, and which Python writes. Raises ValueError: half a
+    sentence, which names the place of the fault.
     """
     faults: list[_Fault] = []
 
@@ -96,9 +89,7 @@ def parsed_record(content: bytes, kind: type[Record]) -> Record:
 def as_record(value: object, kind: type[Record]) -> Record:
     """The record that a value of `parsed_json` describes: a `msgspec.Struct` or a dataclass.
 
-    Raises:
-        ValueError: a field is missing, of another type or out of bounds; half a sentence, which names its place, such
-            as ``expected `float`, got `str` - at `$.results[0].size```.
+    Raises ValueError: half a sentence, such as ``expected `float`, got `str` - at `$.results[0].size```.
     """
     import msgspec
 

@@ -59,14 +59,10 @@ def rendered(template: str, **context: Any) -> str:
 
 
 def document(template: str, *, style: str, policy: str = _POLICY, script: str = "", **context: Any) -> str:
-    """A page that is one file, by a template that extends `document.html`.
+    """A page that is one file, by a template that extends `document.html`, and the context that it shows.
 
-    Args:
-        template: its name.
-        style: rules of CSS.
-        policy: the Content-Security-Policy: what a browser may load and run.
-        script: the only one that runs, after the page is read; the policy then allows it too.
-        **context: what the template shows.
+    `policy` is the Content-Security-Policy: what a browser may load and run. `script` is the only one that runs, after
+    the page is read; the policy then allows it too.
     """
     if script:
         policy += f"; script-src '{source_hash(script)}'"

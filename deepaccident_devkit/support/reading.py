@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO, Final, Literal, Protocol, TypeAlias
@@ -117,11 +118,7 @@ class RefusedFileError(OSError):
 
 
 def limit_of(kind: FileKind) -> int:
-    """Bytes that a file of a kind, or what is decoded from it, may have.
-
-    Raises:
-        RefusedFileError: `DEEPACCIDENT_LIMITS` cannot be understood.
-    """
+    """Bytes that a file of a kind, or what is decoded from it, may have; or RefusedFileError."""
     changed = os.environ.get(LIMITS_VARIABLE)
     return LIMITS[kind] if not changed else _changed_limits(changed).get(kind, LIMITS[kind])
 
@@ -133,16 +130,9 @@ def bytes_of(text: str) -> int | None:
 
 
 def read_bytes(path: Path | StoredFile, kind: FileKind) -> bytes:
-    """A file's bytes. Plain system calls: `open` would double the time of a small file.
+    """The bytes of a file, or of one in a store, which reads itself. Plain system calls: `open` would double the time.
 
-    Args:
-        path: a real path, or a file in a store, which reads itself.
-        kind: of the file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        RefusedFileError: it is no regular file, or too large for its kind.
-        OSError: it cannot be read.
+    Raises FileNotFoundError, RefusedFileError (no regular file, or too large for its kind), or another OSError.
     """
     content = _read(path, kind) if isinstance(path, Path) else path.content(kind)
     if (observer := _observer.get()) is not None:
@@ -179,13 +169,7 @@ def observed(observer: Callable[[Path | StoredFile, bytes], None]) -> Iterator[N
 
 
 def open_file(path: Path) -> BinaryIO:
-    """A file of any size, opened for readers that take it in bounded parts (`open_zip`).
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        RefusedFileError: it is no regular file.
-        OSError: it cannot be read.
-    """
+    """A regular file of any size, opened for readers that take it in bounded parts; raises as `read_bytes`."""
     descriptor, _ = _opened(path)
     return os.fdopen(descriptor, "rb")
 
@@ -200,16 +184,7 @@ def file_checksum(path: Path) -> str:
 
 
 def check_size(size: int, kind: FileKind, what: str = "") -> None:
-    """Refuse what would be larger than its kind may be.
-
-    Args:
-        size: bytes.
-        kind: of the file.
-        what: what has this size, in words, such as `its array`; empty for the file itself.
-
-    Raises:
-        RefusedFileError: `size` is above the limit.
-    """
+    """RefusedFileError of what would be larger than its kind may be; `what` has this size, empty for the file."""
     if size > (limit := limit_of(kind)):
         head = f"{what} takes" if what else "has"
         more = f"more than {limit:,}, the limit for {kind}; if the file is sound, set {LIMITS_VARIABLE}={kind}"
@@ -269,28 +244,20 @@ def _changed_limits(text: str) -> Mapping[str, int]:
 def open_zip(source: Path | bytes) -> zipfile.ZipFile:
     """The archive in a file or in its bytes, whose directory Python can read without much memory.
 
-    Raises:
-        OSError: there is no such regular file, or its directory is too large.
-        zipfile.BadZipFile: it is no zip, or does not begin at its first and end at its last byte.
+    Raises OSError, or zipfile.BadZipFile if it does not begin at the first and end at the last byte.
     """
     with io.BytesIO(source) if isinstance(source, bytes) else open_file(source) as file:
         check_end(file, _MOST_DIRECTORY)
     # opened again by its path, so that the archive closes the file
     archive = zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source)
-    if min([entry.header_offset for entry in archive.infolist()], default=0):
+    if min(map(attrgetter("header_offset"), archive.infolist()), default=0):
         archive.close()
         raise zipfile.BadZipFile("bytes precede the archive")
     return archive
 
 
 def read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, kind: FileKind) -> bytes:
-    """The content of an archive's member, which agrees with its stored size and its checksum.
-
-    Raises:
-        OSError: it would be larger than its kind may be, or the file cannot be read.
-        zipfile.BadZipFile: it is encrypted, compressed by another method than deflation, or does not agree.
-        zlib.error: it cannot be unpacked.
-    """
+    """The content of an archive's member, which agrees with its stored size and checksum; or `DAMAGED_ARCHIVE`."""
     for size in (entry.file_size, entry.compress_size):
         check_size(size, kind, shortened(entry.filename))
     if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -311,12 +278,9 @@ def read_array(archive: zipfile.ZipFile, name: str, kind: FileKind) -> AnyArray:
 
 
 def array_of(content: bytes, kind: FileKind) -> AnyArray:
-    """The array of numbers or text in the bytes of a `.npy`, which has the size that its header says; writable.
+    """The array of numbers or text in the bytes of a `.npy`, of the size that its header says; writable.
 
-    Raises:
-        OSError: it would be larger than its kind may be.
-        ValueError: it is damaged, or holds something else.
-        Exception: another of `DAMAGED_ARCHIVE`.
+    Raises `DAMAGED_ARCHIVE`: an OSError if it would be larger than its kind may be.
     """
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
@@ -336,9 +300,7 @@ def array_of(content: bytes, kind: FileKind) -> AnyArray:
 def check_end(file: BinaryIO, most: int) -> None:
     """Look at the end of an archive before Python reads its directory, which takes some twenty times as much memory.
 
-    Raises:
-        RefusedFileError: the directory has more than `most` bytes.
-        zipfile.BadZipFile: the file does not end with an archive's end.
+    Raises RefusedFileError of a directory of more than `most` bytes, zipfile.BadZipFile of another end.
     """
     size = file.seek(0, os.SEEK_END)
     start = file.seek(max(0, size - _LONGEST_END))

@@ -125,20 +125,16 @@ def meant_text(wrong: object, possible: Iterable[object]) -> str:
 def spelled(value: Any, words: Iterable[str]) -> Any:
     """The one of some words that a text is, in whatever case of letters; the value itself if no word is like it."""
     lowered = value.lower() if isinstance(value, str) else None
-    return next((word for word in words if word.lower() == lowered), value)
+    for word in words:
+        if word.lower() == lowered:
+            return word
+    return value
 
 
 def choice(name: str, value: object, words: Collection[Word], *, error: type[DeepAccidentError] = ChoiceError) -> Word:
-    """The one of some words that a caller means, in its own spelling; small letters may stand for capital ones.
+    """The one of some words, None perhaps among them, that a caller means, in its own spelling; else ChoiceError.
 
-    Args:
-        name: of the argument.
-        value: the caller's.
-        words: all that it can be; None may be among them.
-        error: the kind of error.
-
-    Raises:
-        ChoiceError: there is no such word (or the other kind).
+    Small letters may stand for capital ones. `error` is another kind of error.
     """
     lowered = value.lower() if isinstance(value, str) else None
     for word in words:
@@ -158,15 +154,10 @@ def settle_choices(
 
 
 def path_text(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> str:
-    """The text of what a caller gives as a path.
+    """The text of what a caller gives as a path: a text, or a path object of one; else ConfigError, or another kind.
 
-    Args:
-        given: a text, or a path object of one.
-        expected: how the message begins, such as `out: expected a folder`.
-        error: the kind of error.
-
-    Raises:
-        ConfigError: it is something else, or empty, or no file can have this name (or the other kind).
+    `expected` is how the message begins, such as `out: expected a folder`. An empty one is refused, and what no file
+    can be named.
     """
     with suppress(TypeError, ValueError, RuntimeError):  # no path; half a character; `~` of nobody
         text = os.fspath(given)  # type: ignore[call-overload]

@@ -25,6 +25,18 @@ if TYPE_CHECKING:
 Role = Literal["behind", "other", "other_behind", "infrastructure"]
 """The role of a partner: the vehicle behind the ego, the two vehicles of the other side, the infrastructure."""
 Side = Literal["ego_vehicle", "other_vehicle"]
+SHEER_CURTAINS: Final = (
+    "Town05_type001_subtype0002_scenario00035",
+    "Town05_type001_subtype0002_scenario00004",
+)
+"""Names of scenarios whose vehicles a CARLA bug marks invisible: the released code never counts them as unseen."""
+VISIBILITIES: Final = ("visible", "partial", "invisible")
+_STEP: Final = 5
+"""Frames between two observations: the released code works at 2 Hz."""
+_OBSERVED: Final = 3
+"""Observations that count: the present one and two before it."""
+_EVALUATED: Final = 4
+"""Steps before the last frame at which the released code evaluates: 0.5, 1, 1.5 and 2 s."""
 _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
     "ego_vehicle": {
         "behind": "ego_vehicle_behind",
@@ -153,7 +165,7 @@ def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = N
                 "unpack its archive, name the agents that are there, or use "
                 f"agents='{AVAILABLE}' (--agents {AVAILABLE}) for all that are there"
             )
-    return tuple(sorted(dict.fromkeys(wanted), key=lambda agent: agent != ego))
+    return tuple(sorted(dict.fromkeys(wanted), key=ego.__ne__))
 
 
 def is_available(agents: object) -> bool:
@@ -165,7 +177,7 @@ def agents_of(dataset: Dataset, scenario: RowArgument) -> tuple[AgentName, ...]:
     """The agents that a scenario has in this release, in the order of `taxonomy.AGENTS`; raises TokenError."""
     row, names = dataset.getind("scenario", scenario), dataset.columns("agent")
     first, last = names["scenario_row"].searchsorted((row, row + 1))
-    return tuple(AGENTS[code] for code in names["name"][first:last].tolist())
+    return tuple([AGENTS[code] for code in names["name"][first:last].tolist()])
 
 
 def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentName, ...]:
@@ -180,20 +192,6 @@ def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentNa
         return AGENT_CONFIGS[choice("agents", agents, AGENT_SETS)].agents_for(ego)
     names = _names("agents", "agents' names or a configuration", agents)
     return tuple(choice("agent", agent, AGENTS) for agent in names)
-
-
-SHEER_CURTAINS: Final = (
-    "Town05_type001_subtype0002_scenario00035",
-    "Town05_type001_subtype0002_scenario00004",
-)
-"""Names of scenarios whose vehicles a CARLA bug marks invisible: the released code never counts them as unseen."""
-VISIBILITIES: Final = ("visible", "partial", "invisible")
-_STEP: Final = 5
-"""Frames between two observations: the released code works at 2 Hz."""
-_OBSERVED: Final = 3
-"""Observations that count: the present one and two before it."""
-_EVALUATED: Final = 4
-"""Steps before the last frame at which the released code evaluates: 0.5, 1, 1.5 and 2 s."""
 
 
 def accident_visibility(dataset: Dataset, scenario: RowArgument) -> str | None:
@@ -281,7 +279,7 @@ def pair_in_view(mask: ArrayLike, actor_ids: ArrayLike, pair: Collection[int], o
         pair: actor ids.
         own_id: the agent's; None for one that is no vehicle.
     """
-    others = {int(actor) for actor in pair} - {own_id}
+    others = set(map(int, pair)) - {own_id}
     return others <= set(visible_ids([mask], [actor_ids]).tolist())
 
 

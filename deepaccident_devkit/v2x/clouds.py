@@ -81,16 +81,10 @@ def aggregate_point_cloud(
 
 
 def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
-    """Points (P, 3), each moved with the box that it lies in.
+    """Points (P, 3), each moved with the box of `then` that it lies in to the same actor's box of `now`, in one frame.
 
-    Args:
-        points: in the coordinate frame of the boxes, metres.
-        then: the actors when the points were recorded.
-        now: actors at another moment, each id once; actors that are not among `then` are ignored.
-
-    Returns:
-        (P, 3): a point in a box of `then` has the same place in that actor's box of `now`. If it lies in several
-        boxes, the last one counts. Points outside all boxes do not move.
+    Actors that are not in both are ignored. If a point lies in several boxes, the last one counts; outside all it
+    stays.
     """
     both, row_then, row_now = np.intersect1d(then.actor_id, now.actor_id, return_indices=True)
     before, after = then.select(row_then), now.select(row_now)

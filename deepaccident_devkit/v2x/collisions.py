@@ -73,11 +73,7 @@ class Contact(FrozenArrays):
 
 
 def first_accident(dataset: Dataset) -> str:
-    """The token of the first scenario that ends in an accident, of those whose labels show both actors if there are.
-
-    Raises:
-        NotAvailableError: no meta file names an accident.
-    """
+    """The first scenario that ends in an accident, preferably with labels of both; or NotAvailableError."""
     accidents = [record for record in dataset.scenario if record["collision"] is not None]
     for record in accidents:
         if labelled_pair(record["collision"], scenario_tracks(dataset, record["token"]).actor_id) is not None:
@@ -92,11 +88,7 @@ def first_accident(dataset: Dataset) -> str:
 
 
 def default_scenario(dataset: Dataset) -> str:
-    """The token of the first scenario that ends in an accident, or if none does, of the first one.
-
-    Raises:
-        NotAvailableError: there is no scenario at all.
-    """
+    """The first scenario that ends in an accident, or if none does, the first one; or NotAvailableError."""
     try:
         return first_accident(dataset)
     except NotAvailableError:
@@ -170,13 +162,9 @@ def colliding_pair(record: ScenarioRecord) -> tuple[int, int] | None:
 
 
 def labelled_pair(collision: CollisionRecord | None, actor_ids: IntArray) -> tuple[int, int] | None:
-    """The actor ids of the pair that collides, if labels show both; the one place that decides this.
+    """The ids of the pair that collides, if `actor_ids` (N,) of labels have both; the one place that decides it.
 
     Meta may name one actor twice, or one that no label has: id 0, or of an agent that is not here.
-
-    Args:
-        collision: of the scenario; None if meta names none.
-        actor_ids: (N,) of all who are labelled in it, such as of its tracks; one may come several times.
     """
     first, second = (0, 0) if collision is None else collision["ids"]
     return (first, second) if first != second and np.isin((first, second), actor_ids).all() else None
@@ -232,11 +220,7 @@ def _contact(pair: Boxes, facing: FloatArray) -> tuple[FloatArray, float, FloatA
 
 
 def _facing(pair: Boxes) -> tuple[FloatArray, tuple[ContactSide, ContactSide]]:
-    """The normal (2,) of a side, from first to second, along which the gap is widest (or the overlap smallest).
-
-    Returns:
-        The unit vector, and the side of each box that faces the other along it.
-    """
+    """The normal (2,) along which the gap is widest, first to second, and the sides that face each other."""
     axes = quaternions.to_matrix(pair.rotation)[:, :2, :2]  # box, xy, along or across
     normals = np.concatenate([axes[0].T, axes[1].T])
     reach = np.einsum("nbk,bk->n", np.abs(np.einsum("na,bak->nbk", normals, axes)), pair.size[:, :2] / 2)
@@ -288,10 +272,7 @@ def _agent_ids(dataset: Dataset, scenario: str) -> dict[str, int | None]:
 def _other_agents(ids: Mapping[str, int | None], pair: Sequence[int], told: Sequence[str | None] | None) -> list[str]:
     """How the colliding agents in the meta file differ from those that have the pair's ids, in words.
 
-    Args:
-        ids: the vehicles that are agents here → their actor ids; None if the meta file does not say.
-        pair: actor ids.
-        told: names of agents from the meta file, None for a road user that is no agent; None if it does not say.
+    `ids` are the vehicles that are agents here → actor ids; `told` the meta file's names, None for no agent.
     """
     if told is None:
         return []

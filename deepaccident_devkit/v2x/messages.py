@@ -21,6 +21,12 @@ from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName, OnError
 from deepaccident_devkit.v2x.agents import Agents, cooperating_agents
 
+POINT_BYTES: Final = 4 * 4
+"""x, y, z and intensity in single precision."""
+BOX_BYTES: Final = 9 * 4 + 4 + 1 + 4
+"""Centre, size, yaw and horizontal velocity in single precision, an id, a class and a score."""
+POSE_BYTES: Final = 6 * 4
+"""A 6-vector in single precision, which goes with every message."""
 _NORMAL: Final = NormalDist()
 _LONGEST: Final = 20.0
 """Seconds: no scenario is longer, so a longer latency is in milliseconds."""
@@ -184,14 +190,6 @@ def uniforms(key: str) -> tuple[float, float, float, float]:
     return first, second, third, fourth
 
 
-POINT_BYTES: Final = 4 * 4
-"""x, y, z and intensity in single precision."""
-BOX_BYTES: Final = 9 * 4 + 4 + 1 + 4
-"""Centre, size, yaw and horizontal velocity in single precision, an id, a class and a score."""
-POSE_BYTES: Final = 6 * 4
-"""A 6-vector in single precision, which goes with every message."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MessageSize:
     """Bytes of one agent's message at one moment, uncompressed, for each kind of data; each includes a pose (24 bytes).
@@ -302,21 +300,10 @@ class Message:
 def messages(
     dataset: Dataset, sample: RowArgument, agents: Agents = None, link: Link | None = None, *, sweeps: int = 1
 ) -> Iterator[Message]:
-    """What the agents contribute at a sample and at the frames before it, the sample's own agent first.
+    """What the agents contribute at a sample and at the `sweeps` − 1 frames before it; nothing for a lost message.
 
-    Args:
-        dataset: the release.
-        sample: token or record: its agent is the ego, its frame the present.
-        agents: who cooperates (`cooperating_agents`).
-        link: what happens to the partners' data; None for nothing.
-        sweeps: number of frames, the present included; those before the recording began are left out.
-
-    Yields:
-        By frame, the present first and then backwards, and for each frame by agent; nothing for a lost message.
-
-    Raises:
-        TokenError, ChoiceError, NotAvailableError: as in `cooperating_agents`.
-        ConfigError: `link` is no Link, or its latency is longer than the scenario's past at the present.
+    By frame, the present first and then backwards, and for each frame by agent, the sample's own first. Raises what
+    `cooperating_agents` does, and ConfigError of the link.
     """
     link = checked_link(link)
     names = cooperating_agents(dataset, sample, agents)

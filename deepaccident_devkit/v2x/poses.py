@@ -1,4 +1,4 @@
-"""Poses of agents, and transforms between them.
+"""Poses of agents, transforms between them, and points of any agent in the images of any.
 
 See docs/released_code.md, Poses. Every function works for both kinds of handedness: right-handed poses (the devkit's)
 give right-handed 6-vectors, CARLA's raw poses give those of the released code; `geometry.conventions.flip_six_vector`
@@ -193,12 +193,7 @@ def map_pointcloud_to_image(
 
 
 def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
-    """The pinhole camera of an image, with the image size that calib gives.
-
-    Raises:
-        TokenError: no such sensor file.
-        ChoiceError: the sensor is no camera.
-    """
+    """The pinhole camera of an image, with the image size that calib gives; raises TokenError or ChoiceError."""
     return dataset.camera(camera)
 
 
