@@ -86,13 +86,7 @@ def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> Columns:
     signalized = "_subtype1_" in f"{scenario.scenario_type}_"
     collision = asdict(meta.collision) if meta and meta.collision else None
     design = accident_type(meta, signalized=signalized)
-    from_meta = {
-        "weather": meta.weather if meta else None,
-        "road_type": meta.road_type if meta else None,
-        "spawn_side": meta.spawn_side if meta else None,
-        "ego_direction": meta.ego_direction if meta else None,
-        "other_direction": meta.other_direction if meta else None,
-    }
+    from_meta = ("weather", "road_type", "spawn_side", "ego_direction", "other_direction")
     return {
         "name": [scenario.name],
         "scenario_type": [scenario.scenario_type],
@@ -100,8 +94,8 @@ def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> Columns:
         "signalized": [signalized],
         "designed_accident": [scenario.scenario_type.endswith("_accident")],
         "town": [scenario.name.split("_")[0]],
-        **{name: [word] for name, word in from_meta.items()},
-        "time_of_day": [_time_of_day_code(meta)],
+        **{name: [getattr(meta, name, None)] for name in from_meta},
+        "time_of_day": [TIMES_OF_DAY.index(meta.time_of_day) if meta and meta.time_of_day else NULL_INTEGER],
         "collision": [collision],
         "accident_type": [NULL_INTEGER if design is None else design],
         "velocity_frame": [NULL_INTEGER if velocity_frame is None else [*VELOCITY_FRAMES].index(velocity_frame)],
@@ -237,10 +231,6 @@ def _times_to_impact(files: ScenarioFiles) -> FloatArray:
     """(F,) seconds to the last frame where meta names a collision (the recording ends at it), else NaN."""
     frames = files.scan.num_frames
     return _times_to_end(frames) if _collider_ids(files) else np.full(frames, np.nan)
-
-
-def _time_of_day_code(meta: Meta | None) -> int:
-    return TIMES_OF_DAY.index(meta.time_of_day) if meta and meta.time_of_day else NULL_INTEGER
 
 
 def accident_type(meta: Meta | None, *, signalized: bool) -> int | None:

@@ -247,10 +247,5 @@ def _check_once(table: Any, folder: AnyArray, folders: Sequence[str], archives: 
         members = (np.frombuffer(table["member"][each].as_py(), _NUMBERS) for each in (row, row + 1))
         first, second = (archives[int(member["archive"][0])] for member in members)
         where = f"in {first} and in {second}" if first != second else f"twice in {first}"
-        raise DatarootError(
-            f"{folders[folder[row]]}/{name}: is {where}{_more(int(same.sum()) - 1)}; keep one of them in this folder"
-        )
-
-
-def _more(count: int) -> str:
-    return f", and so are {count:,} more" if count else ""
+        more = f", and so are {same.sum() - 1:,} more" if same.sum() > 1 else ""
+        raise DatarootError(f"{folders[folder[row]]}/{name}: is {where}{more}; keep one of them in this folder")

@@ -154,7 +154,8 @@ def _has_scenarios(folder: Path) -> bool:
 
 def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path], **how: Unpack[Engine]) -> StorePath:
     base = path.parent if archives == [path] else path
-    files = [*archives, *(each for each in _split_paths(path) if each.is_file())]
+    split_files = (path / below / name for below in ("", SPLIT_FILE_FOLDER) for name in SPLIT_FILES)
+    files = [*archives, *filter(Path.is_file, split_files)]
     states = {file.relative_to(base).as_posix(): state_of(file) for file in files}
     name = list_name(sorted(states.items()))
     for known in (place / name for place in places if (place / name).is_file()):
@@ -165,11 +166,6 @@ def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path
     beside = {file: state for file, state in states.items() if _is_split(file)}
     known = _written(places, name, _with_loose(listings, beside))
     return StorePath(opened_store(str(path), str(base), known))
-
-
-def _split_paths(folder: Path) -> list[Path]:
-    """Where split files may lie beside archives."""
-    return [folder / below / name for below in ("", SPLIT_FILE_FOLDER) for name in SPLIT_FILES]
 
 
 def state_of(file: Path) -> tuple[int, str]:

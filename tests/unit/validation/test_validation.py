@@ -22,7 +22,7 @@ from deepaccident_devkit.errors import DatarootError, LabelError, TokenError
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.release import read_labels
 from deepaccident_devkit.release.npz import read_npz
-from deepaccident_devkit.tables import build
+from deepaccident_devkit.tables import scan
 from deepaccident_devkit.validation import CODES, Finding, ValidationReport, validate_release
 from deepaccident_devkit.validation.sensors import ORIENTATIONS, out_of_sequence
 
@@ -369,7 +369,7 @@ def test_labels_that_are_good_alone_but_not_together_are_a_finding(
             raise LabelError("the labels: do not go together; mend them")
         return read_labels(paths)
 
-    monkeypatch.setattr(build, "read_labels", read)
+    monkeypatch.setattr(scan, "read_labels", read)
     (finding,) = validate_new(small)
     assert (finding.code, str(finding)) == ("label-unreadable", "the labels: do not go together; mend them")
 
