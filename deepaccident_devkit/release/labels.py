@@ -41,7 +41,7 @@ def label_from_world_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArr
 
     Args:
         velocity: (N, 2) m/s in world.
-        yaw: (N,) radians, each box's in the LiDAR frame of the label, of the same conventions.
+        yaw: (N,) radians, each box's in the LiDAR frame of the label, of the same handedness.
     """
     return turned(velocity, yaw)
 
