@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.pictures import save_picture
+from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.synth.roads import Junction, RoadSpec
 from deepaccident_devkit.synth.roads.layout import OUTWARD
 from deepaccident_devkit.synth.traffic.users import middle_of, road_crossing

@@ -18,14 +18,13 @@ from deepaccident_devkit.explore.keeping import Kept, KeptFiles
 from deepaccident_devkit.explore.models import Model, open_models
 from deepaccident_devkit.explore.scenarios import Scenarios
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.best_view import best_view
-from deepaccident_devkit.render.boxes import EDGES, segments_in_image
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, MISSING_COLOR
-from deepaccident_devkit.render.legends import is_there
-from deepaccident_devkit.render.pictures import figure_png
+from deepaccident_devkit.render.boxes import EDGES, actor_color, recorders_of, segments_in_image
+from deepaccident_devkit.render.camera import best_view
+from deepaccident_devkit.render.captions import is_there
+from deepaccident_devkit.render.figures import figure_png
 from deepaccident_devkit.render.replay import recording_of, served_replay
-from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.render.roles import actor_color, recorders_of
+from deepaccident_devkit.render.replay.entries import Recording
+from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR
 from deepaccident_devkit.support.arrays import as_floats
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.configurations import agents_of

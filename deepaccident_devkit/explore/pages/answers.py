@@ -20,8 +20,8 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import Route
 
 from deepaccident_devkit.explore.explorer import Explorer
-from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.replay import replay_script, replay_style
+from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.pages import part, path_in_address
 from deepaccident_devkit.support.pages import rendered as filled
 

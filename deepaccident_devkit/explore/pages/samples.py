@@ -22,7 +22,7 @@ from deepaccident_devkit.explore.models import Model
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, part_of, picture
 from deepaccident_devkit.explore.pages.pictures import sample_of
 from deepaccident_devkit.explore.sample_lists import ORDERS, SampleChoices, is_sample, listed
-from deepaccident_devkit.render.axes import detached_figure
+from deepaccident_devkit.render.figures import detached_figure
 from deepaccident_devkit.render.outcomes import render_evaluation, render_outcome_in_cameras
 from deepaccident_devkit.support.pages import path_in_address
 from deepaccident_devkit.taxonomy import FRAME_PERIOD

@@ -17,8 +17,8 @@ from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, rendered, root_of, with_slash
 from deepaccident_devkit.explore.pages.pictures import SCENARIO, sample_of, token_of
 from deepaccident_devkit.interactions import interactions
+from deepaccident_devkit.render.boxes import recorders_of
 from deepaccident_devkit.render.replay import script_json
-from deepaccident_devkit.render.roles import recorders_of
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, describe, lead_times, twin_diff, twin_of
 from deepaccident_devkit.taxonomy import short_name
 from deepaccident_devkit.validation import findings

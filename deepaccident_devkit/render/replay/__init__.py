@@ -1,6 +1,6 @@
 """A scenario as one HTML file that plays in a browser without a network; its parts serve other pages too."""
 
-from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.entries import recording_of
 from deepaccident_devkit.render.replay.replay import (
     render_replay,
     replay_script,

@@ -12,21 +12,15 @@ from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
-from deepaccident_devkit.render.colors import (
-    CATEGORY_MARKERS,
-    COLLIDER_COLOR,
-    COLORS,
-    GRID_COLOR,
-    OUTCOME_COLORS,
-    POINT_COLOR,
-)
-from deepaccident_devkit.render.legends import is_there
-from deepaccident_devkit.render.replay.recording import (
+from deepaccident_devkit.render.captions import is_there
+from deepaccident_devkit.render.replay.entries import (
+    Foreseen,
     Recording,
     actor_entries,
     agent_entries,
     camera_entries,
     camera_title,
+    foreseen_entries,
     recording_of,
 )
 from deepaccident_devkit.render.replay.road import road_picture
@@ -40,7 +34,14 @@ from deepaccident_devkit.render.replay.sensors import (
     follow_pair,
     lidar_points,
 )
-from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
+from deepaccident_devkit.render.styles import (
+    CATEGORY_MARKERS,
+    COLLIDER_COLOR,
+    COLORS,
+    GRID_COLOR,
+    OUTCOME_COLORS,
+    POINT_COLOR,
+)
 from deepaccident_devkit.support.files import path_of, write_bytes
 from deepaccident_devkit.support.pages import document, part, source_hash
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
@@ -59,26 +60,14 @@ def facts(recording: Recording) -> list[list[str]]:
 
 
 def notes(recording: Recording, files: CameraFiles, settings: PictureSettings | None, *, points: bool) -> list[str]:
-    """Sentences on what is missing in the release or was left out.
-
-    Args:
-        recording: the scenario and the agents.
-        files: of all cameras.
-        settings: how their pictures are written; None if there is none.
-        points: whether there are LiDAR points.
-    """
+    """Sentences on what is missing in the release or was left out; the settings are None if there is no picture."""
     title = short_name(recording.agents[0])
     absent = f"No LiDAR points: no file of {title} is here; unpack the archive of lidar01."
     return [*_labels(recording), *_missing_pictures(files), *_pictures(files, settings), *[absent] * (not points)]
 
 
 def served_notes(recording: Recording, files: CameraFiles) -> list[str]:
-    """Sentences on what is missing in the release, for a page that has no pictures itself.
-
-    Args:
-        recording: the scenario and the agents.
-        files: of all cameras.
-    """
+    """Sentences on what is missing in the release, for a page that has no pictures itself."""
     return [*_labels(recording), *_missing_pictures(files)]
 
 
@@ -217,14 +206,7 @@ def render_replay(
 
 
 def tried_replay(dataset: Dataset, scenario: str, path: Path, *, prediction: Foreseen | None = None) -> str | None:
-    """Write a scenario's replay; None, or why there is none: a file cannot be read, or the prediction not be shown.
-
-    Args:
-        dataset: the release.
-        scenario: token.
-        path: the file to write.
-        prediction: as of `render_replay`.
-    """
+    """Write a scenario's replay; None, or why there is none: a file cannot be read, or the prediction not be shown."""
     try:
         render_replay(dataset, scenario, path, prediction=prediction)
     except (NotAvailableError, SensorFileError) as error:
@@ -237,17 +219,8 @@ def served_replay(
 ) -> dict[str, Any]:
     """What the scripts play on a page whose server has the pictures and points, for all cameras and agents.
 
-    They ask below `folder` for `images/AGENT/CHANNEL/FRAME?width=PIXELS` (JPEG) and `points/AGENT/FRAME`, which answers
-    with `cloud_text`.
-
-    Args:
-        dataset: the release.
-        scenario: token or record.
-        folder: address that the page has of the scenario's files, ending in a slash.
-        prediction: as of `render_replay`.
-
-    Raises:
-        TokenError, NotAvailableError, EvaluationError, SensorFileError: as of `render_replay`.
+    They ask below `folder`, an address that ends in a slash, for `images/AGENT/CHANNEL/FRAME?width=PIXELS` (JPEG) and
+    `points/AGENT/FRAME`, which answers with `cloud_text`. Errors are those of `render_replay`.
     """
     recording = recording_of(dataset, scenario, None)
     files = camera_files(recording)
@@ -292,7 +265,7 @@ def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles)
         "agents": agent_entries(recording),
         "actors": actor_entries(recording),
         "road": road_picture(recording),
-        "prediction": None if prediction is None else verdicts(recording, prediction),
+        "prediction": None if prediction is None else foreseen_entries(recording, prediction),
         "cameras": camera_entries(recording),
     }
     seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
@@ -323,14 +296,10 @@ def _coded(jpeg: bytes | None) -> str | None:
 
 
 def replay_page(title: str, data: Mapping[str, Any]) -> str:
-    """A complete HTML page.
+    """A complete HTML page with the title of its window and the data that its scripts play.
 
     By its policy a browser runs only this script, uses only this style, and loads nothing. The script shows all text
     of the data as text, never as HTML.
-
-    Args:
-        title: of the window.
-        data: what the scripts play, as JSON holds it.
     """
     style = COLORS + replay_style()
     policy = f"default-src 'none'; img-src data:; style-src '{source_hash(style)}'; base-uri 'none'; form-action 'none'"

@@ -24,7 +24,7 @@ from deepaccident_devkit.explore import Explorer, make_app
 from deepaccident_devkit.explore.pages import scenarios
 from deepaccident_devkit.explore.pages.scenario import PARTS
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.entries import recording_of
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 
