@@ -17,7 +17,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.cli.demo import demo
 from deepaccident_devkit.errors import DeepAccidentError, OutputFolderError
-from deepaccident_devkit.explore.keeping import KeptFiles
+from deepaccident_devkit.explore.explorer import KeptFiles
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
 from deepaccident_devkit.release.store.cache import FileCache

@@ -50,14 +50,7 @@ def page(request: Request, template: str, *, status: int = 200, **context: Any) 
 
 
 def rendered(explorer: Explorer, template: str, root: str, **context: Any) -> str:
-    """A template as text.
-
-    Args:
-        explorer: whose page it is.
-        template: its file.
-        root: relative address of the first page.
-        **context: what it shows; all texts are escaped.
-    """
+    """A template as text, given the relative address of the first page (`root`); all texts are escaped."""
     addresses = {"asset": asset, "scenario_at": scenario_address, "thumbnail_at": thumbnail_address}
     served = {"root": root, "models": [*explorer.models], "static": False, "frame_number": frame_button}
     return filled(template, **addresses, **served, **context)
