@@ -34,9 +34,9 @@ from deepaccident_devkit.model.detection import (
     TargetConfig,
     TaskMaps,
 )
-from deepaccident_devkit.model.entry import Handedness, ModelInputs
 from deepaccident_devkit.model.fusion import FusionConfig, fusion
 from deepaccident_devkit.model.images import EncoderConfig, image_encoder, normalised
+from deepaccident_devkit.model.inputs import Handedness, ModelInputs
 from deepaccident_devkit.model.lift import LiftConfig, LiftSplat
 from deepaccident_devkit.model.motion import (
     MotionHead,
