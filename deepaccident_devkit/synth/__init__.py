@@ -7,7 +7,7 @@ things are made of), `roads` and `stage` (what stands still), `actors`, `collisi
 happens in one), `sensors` (what the agents record), `recording` and `generate` (the files).
 """
 
-from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.generate import make_release
+from deepaccident_devkit.synth.plan import SynthConfig
 
 __all__ = ["SynthConfig", "make_release"]

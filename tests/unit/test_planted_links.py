@@ -23,7 +23,7 @@ from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
 from deepaccident_devkit.release.store.cache import FileCache
 from deepaccident_devkit.support.files import place_in, remove_in, temporary_path, write_bytes
 from deepaccident_devkit.synth import SynthConfig, generate, make_release
-from deepaccident_devkit.synth.recording import RecordingJob
+from deepaccident_devkit.synth.scenario import RecordingJob
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 PRECIOUS = b"precious\0"
