@@ -78,7 +78,7 @@ class _Given(Sampler[int]):
 
 
 def batches(moments: Moments, numbers: Iterable[int], config: TrainConfig, *, workers: int = 0) -> DataLoader[Any]:
-    """Batches of moments in the order of their numbers (`positions`); worker processes change nothing, 0 is this."""
+    """Batches of moments in the order of their numbers (`positions`), read by worker processes, or by this one (0)."""
     return DataLoader(
         moments,
         batch_size=config.moments,

@@ -58,6 +58,134 @@ _EDGE: Final = 0.01
 _FREE: Final = 22.0
 """Points, about, at the top of an image in which tags may cover a car: it may fill the image."""
 _HIDDEN: Final = (0, (3, 2))
+COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
+"""Seconds before the impact."""
+_SHOWN: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
+_WIDTH: Final = 3.3
+"""Width of a panel in inches."""
+_LEAST_WIDTH: Final = 1.6
+"""Inches of a camera's panel below which agents are left out."""
+_TITLE: Final = 1.0
+"""Inches of the height that titles take, about."""
+_MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
+"""The panels of a video's picture."""
+_DASHES: Final = ("-", "--")
+
+
+@in_own_settings
+def render_accident(
+    dataset: Dataset,
+    scenario: RowArgument,
+    *,
+    seconds: Sequence[float] = COUNTDOWN,
+    agents: Agents = None,
+    layers: Iterable[Layer] | None = None,
+    fig: Figure | None = None,
+) -> Figure:
+    """Render the countdown to an accident: a column for each moment, a row for each agent, and one from above.
+
+    In a wide figure rows are columns. Each agent has a part of the image that shows the colliding pair best, of those
+    that were downloaded; if none was, a grey panel. If no camera shows the pair, it is the last one that did, or the
+    front one. The pair's boxes are dashed where the agent's label says that no camera sees them. The view from above
+    has the place of contact (a cross), the pair's speeds, and the pair's paths up to the contact; its scale is that of
+    its bar. `E` is the ego vehicle, `O` the other one.
+
+    Args:
+        dataset: the release.
+        scenario: token or record of one with a collision.
+        seconds: before the impact, which is the recording's last frame; moments before the first are left out.
+        agents: whose images are shown; an empty list for none. None is for all that are there or, where their images
+            would be narrower than 1.6 inches, as on a slide, for those that see the pair best; the title says so.
+        layers: `image`, `bev` (the road), `boxes`, `trajectories` and `grid` are the default; also
+            `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image` no image file is read.
+        fig: an empty figure to render on; a new one if None.
+
+    Returns:
+        The figure; its title says who hits whom, how fast and at which angle, and whether the recording ends before
+        the pair are near enough to touch.
+
+    Raises:
+        TokenError: no such scenario.
+        NotAvailableError: nobody collides in it (the nearest approach of a normal scenario is no accident), it has no
+            meta, or an agent is not in this release.
+        ChoiceError: no such agent, configuration or layer, or none of the moments was recorded.
+    """
+    shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
+    contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
+    record = dataset.get("scenario", scenario)
+    cut = _cut_words(contact, record["num_frames"])
+    moments = _moments(seconds, record["num_frames"])
+    there = agents_of(dataset, scenario)
+    first = sample_token(record["token"], there[0], record["num_frames"])
+    names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
+    fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1))
+    pair, best = Pair.of(dataset, contact), ""
+    room = _agents_with_room(fig, len(names), len(moments)) if agents is None else len(names)
+    if room < len(names):
+        best = f"the {room} of {len(names)} agents that see the pair best"
+        names = _best_agents(pair, names, [index for _, index in moments], room)
+    axes, across = _panels(fig, len(names), len(moments))
+    for column, (left, index) in enumerate(moments):
+        for agent, ax in zip(names, axes[:, column], strict=False):
+            channel = draw_pair_in_camera(pair, agent, index, shown, ax)
+            _write_name(channel, ax)
+        draw_pair_from_above(pair, index, shown, axes[-1, column])
+        end = "the last frame" if cut else "the impact"
+        _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
+    for agent, ax in zip(names, axes[:, 0], strict=False):
+        _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
+    _write_head("from above", "black", axes[-1, 0], above=across)
+    words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
+    set_scene_title(fig, dataset, record["token"], best, below=words, fontsize=11)
+    return settled(fig)
+
+
+def draw_countdown(
+    dataset: Dataset, frame: str, *, agents: Sequence[str], layers: Collection[Layer] | None, fig: Figure
+) -> None:
+    """Render a moment of an accident on an empty figure of about 16 to 9: five cameras, the contact, the pair's speeds.
+
+    Cameras are chosen and layers named as in `render_accident`. Raises NotAvailableError if nobody collides.
+    """
+    shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
+    record = dataset.get("frame", frame)
+    index = record["index"]
+    contact = _contact(dataset, record["scenario_token"], "the view 'frame'")
+    pair = Pair.of(dataset, contact)
+    axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 0.8))
+    for agent in AGENTS:
+        if agent not in agents:
+            axes[agent].set_axis_off()
+            continue
+        channel = draw_pair_in_camera(pair, agent, index, shown, axes[agent])
+        words = channel.replace("\n", " ")
+        axes[agent].set_title(f"{short_name(agent)}: {words}", fontsize="medium", color=AGENT_COLORS[agent])
+    draw_pair_from_above(pair, index, shown, axes["above"])
+    axes["above"].set_title(f"from above, {axes['above'].get_title()}", fontsize="medium")
+    _draw_speeds(pair, index, axes["speeds"])
+    set_scene_title(fig, dataset, frame, below=accident_words(dataset, contact).replace("\n", "; "), fontsize=12)
+
+
+def accident_words(dataset: Dataset, contact: Contact) -> str:
+    """Two lines: who hits whom, with which sides, how fast and at which angle."""
+    scenario = contact.frame.rsplit("/", 1)[0]
+    owners = {
+        dataset.agent.get(f"{scenario}/{agent}")["actor_id"]: short_name(agent)
+        for agent in agents_of(dataset, scenario)
+    }
+    names = []
+    for instance, actor in zip(contact.instances, contact.actor_ids, strict=True):
+        category = dataset.instance.get(instance)["category"]
+        names.append(f"{owners[actor]} ({category} {actor})" if actor in owners else f"{category} {actor}")
+    order = (1, 0) if contact.sides[1] == "front" and contact.sides[0] != "front" else (0, 1)
+    hitting, hit = (names[each] for each in order)
+    verb = "hits" if contact.sides[order[0]] == "front" else "touches"
+    sides = " to ".join(contact.sides[each] for each in order)
+    speeds = " and ".join(number_words(contact.speeds[each]) for each in order)
+    return (
+        f"{hitting} {verb} {hit}, {sides}\n{speeds} m/s, closing at {number_words(contact.closing_speed)} m/s, "
+        f"{np.degrees(contact.impact_angle):.0f}° between their headings"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -227,136 +355,6 @@ def _write_tags(tags: list[str], places: FloatArray, ax: Axes) -> None:
     edge = _EDGE * (high - low)
     places = places.clip(low + edge, high - edge)
     place_chips(ax, zip(tags, places, strict=True), colors=[COLLIDER_COLOR] * len(tags))
-
-
-COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
-"""Seconds before the impact."""
-_SHOWN: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
-_WIDTH: Final = 3.3
-"""Width of a panel in inches."""
-_LEAST_WIDTH: Final = 1.6
-"""Inches of a camera's panel below which agents are left out."""
-_TITLE: Final = 1.0
-"""Inches of the height that titles take, about."""
-_MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
-"""The panels of a video's picture."""
-_DASHES: Final = ("-", "--")
-
-
-@in_own_settings
-def render_accident(
-    dataset: Dataset,
-    scenario: RowArgument,
-    *,
-    seconds: Sequence[float] = COUNTDOWN,
-    agents: Agents = None,
-    layers: Iterable[Layer] | None = None,
-    fig: Figure | None = None,
-) -> Figure:
-    """Render the countdown to an accident: a column for each moment, a row for each agent, and one from above.
-
-    In a wide figure rows are columns. Each agent has a part of the image that shows the colliding pair best, of those
-    that were downloaded; if none was, a grey panel. If no camera shows the pair, it is the last one that did, or the
-    front one. The pair's boxes are dashed where the agent's label says that no camera sees them. The view from above
-    has the place of contact (a cross), the pair's speeds, and the pair's paths up to the contact; its scale is that of
-    its bar. `E` is the ego vehicle, `O` the other one.
-
-    Args:
-        dataset: the release.
-        scenario: token or record of one with a collision.
-        seconds: before the impact, which is the recording's last frame; moments before the first are left out.
-        agents: whose images are shown; an empty list for none. None is for all that are there or, where their images
-            would be narrower than 1.6 inches, as on a slide, for those that see the pair best; the title says so.
-        layers: `image`, `bev` (the road), `boxes`, `trajectories` and `grid` are the default; also
-            `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image` no image file is read.
-        fig: an empty figure to render on; a new one if None.
-
-    Returns:
-        The figure; its title says who hits whom, how fast and at which angle, and whether the recording ends before
-        the pair are near enough to touch.
-
-    Raises:
-        TokenError: no such scenario.
-        NotAvailableError: nobody collides in it (the nearest approach of a normal scenario is no accident), it has no
-            meta, or an agent is not in this release.
-        ChoiceError: no such agent, configuration or layer, or none of the moments was recorded.
-    """
-    shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
-    contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
-    record = dataset.get("scenario", scenario)
-    cut = _cut_words(contact, record["num_frames"])
-    moments = _moments(seconds, record["num_frames"])
-    there = agents_of(dataset, scenario)
-    first = sample_token(record["token"], there[0], record["num_frames"])
-    names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
-    fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1))
-    pair, best = Pair.of(dataset, contact), ""
-    room = _agents_with_room(fig, len(names), len(moments)) if agents is None else len(names)
-    if room < len(names):
-        best = f"the {room} of {len(names)} agents that see the pair best"
-        names = _best_agents(pair, names, [index for _, index in moments], room)
-    axes, across = _panels(fig, len(names), len(moments))
-    for column, (left, index) in enumerate(moments):
-        for agent, ax in zip(names, axes[:, column], strict=False):
-            channel = draw_pair_in_camera(pair, agent, index, shown, ax)
-            _write_name(channel, ax)
-        draw_pair_from_above(pair, index, shown, axes[-1, column])
-        end = "the last frame" if cut else "the impact"
-        _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
-    for agent, ax in zip(names, axes[:, 0], strict=False):
-        _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
-    _write_head("from above", "black", axes[-1, 0], above=across)
-    words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
-    set_scene_title(fig, dataset, record["token"], best, below=words, fontsize=11)
-    return settled(fig)
-
-
-def draw_countdown(
-    dataset: Dataset, frame: str, *, agents: Sequence[str], layers: Collection[Layer] | None, fig: Figure
-) -> None:
-    """Render a moment of an accident on an empty figure of about 16 to 9: five cameras, the contact, the pair's speeds.
-
-    Cameras are chosen and layers named as in `render_accident`. Raises NotAvailableError if nobody collides.
-    """
-    shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
-    record = dataset.get("frame", frame)
-    index = record["index"]
-    contact = _contact(dataset, record["scenario_token"], "the view 'frame'")
-    pair = Pair.of(dataset, contact)
-    axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 0.8))
-    for agent in AGENTS:
-        if agent not in agents:
-            axes[agent].set_axis_off()
-            continue
-        channel = draw_pair_in_camera(pair, agent, index, shown, axes[agent])
-        words = channel.replace("\n", " ")
-        axes[agent].set_title(f"{short_name(agent)}: {words}", fontsize="medium", color=AGENT_COLORS[agent])
-    draw_pair_from_above(pair, index, shown, axes["above"])
-    axes["above"].set_title(f"from above, {axes['above'].get_title()}", fontsize="medium")
-    _draw_speeds(pair, index, axes["speeds"])
-    set_scene_title(fig, dataset, frame, below=accident_words(dataset, contact).replace("\n", "; "), fontsize=12)
-
-
-def accident_words(dataset: Dataset, contact: Contact) -> str:
-    """Two lines: who hits whom, with which sides, how fast and at which angle."""
-    scenario = contact.frame.rsplit("/", 1)[0]
-    owners = {
-        dataset.agent.get(f"{scenario}/{agent}")["actor_id"]: short_name(agent)
-        for agent in agents_of(dataset, scenario)
-    }
-    names = []
-    for instance, actor in zip(contact.instances, contact.actor_ids, strict=True):
-        category = dataset.instance.get(instance)["category"]
-        names.append(f"{owners[actor]} ({category} {actor})" if actor in owners else f"{category} {actor}")
-    order = (1, 0) if contact.sides[1] == "front" and contact.sides[0] != "front" else (0, 1)
-    hitting, hit = (names[each] for each in order)
-    verb = "hits" if contact.sides[order[0]] == "front" else "touches"
-    sides = " to ".join(contact.sides[each] for each in order)
-    speeds = " and ".join(number_words(contact.speeds[each]) for each in order)
-    return (
-        f"{hitting} {verb} {hit}, {sides}\n{speeds} m/s, closing at {number_words(contact.closing_speed)} m/s, "
-        f"{np.degrees(contact.impact_angle):.0f}° between their headings"
-    )
 
 
 def _cut_words(contact: Contact, frames: int) -> str:

@@ -43,6 +43,15 @@ _TOKEN_TEXT: Final = 7.5
 _BENEATH: Final = "token"
 """Marks the token in a figure."""
 _CAPITALS: Final = re.compile(r"(?<=[a-z])(?=[A-Z])")
+INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
+"""A place in axes, so that nothing stands beside them."""
+_HANDLE: Final = 0.4
+"""Inches of a sign and the blanks around it."""
+_SPACING: Final[Mapping[str, Any]] = {"handlelength": 1.2, "columnspacing": 1.0}
+_MISSING: Final = "missing"
+"""Marks the words in a figure, so that `missing_words` finds them."""
+_CORNER_LETTERS: Final = 50
+"""In a line of a corner."""
 
 
 def scene_words(dataset: Dataset, scenario: str) -> str:
@@ -177,17 +186,6 @@ def _width_in(file: str, text: str, size: float) -> float:
 
     font = FontProperties(fname=file, size=size)
     return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0]) if text else 0.0
-
-
-INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
-"""A place in axes, so that nothing stands beside them."""
-_HANDLE: Final = 0.4
-"""Inches of a sign and the blanks around it."""
-_SPACING: Final[Mapping[str, Any]] = {"handlelength": 1.2, "columnspacing": 1.0}
-_MISSING: Final = "missing"
-"""Marks the words in a figure, so that `missing_words` finds them."""
-_CORNER_LETTERS: Final = 50
-"""In a line of a corner."""
 
 
 def box_handles(colors: Collection[str]) -> list[Artist]:

@@ -25,6 +25,8 @@ Layer = Literal[
 """`image` is the camera's picture, `map` the town's ground by all its recordings, `bev` the simulator's camera from
 above, `labels` what the motion labels say."""
 LAYERS: tuple[Layer, ...] = get_args(Layer)
+_UNDATED: Final[Mapping[str, dict[str, Any]]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
 
 
 def layers_of(
@@ -103,10 +105,6 @@ def settled(fig: Figure, passes: int = 1) -> Figure:
             for _ in range(passes):
                 engine.execute(fig)
     return fig
-
-
-_UNDATED: Final[Mapping[str, dict[str, Any]]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:

@@ -91,17 +91,18 @@ COLORS: Final = f"""
 }}
 """
 """Dark for readers whose system is."""
+Drawing = TypeVar("Drawing", bound=Callable[..., Any])
+StyleName = Literal["paper", "slide"]
+_ROOM_FOR_WORDS: Final = 0.8
+"""Inches of a picture's height that words take, about: they do not shrink with the picture."""
+_TEXT: Final = {"font.size": 9, "axes.titlesize": 9, "figure.titlesize": 10, "pdf.fonttype": 42, "ps.fonttype": 42}
+_applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
+_ONE_AT_A_TIME: Final = RLock()  # matplotlib has its settings once for all threads
 
 
 def page_style() -> str:
     """The rules of all pages but replays."""
     return COLORS + part("pages.css")
-
-
-Drawing = TypeVar("Drawing", bound=Callable[..., Any])
-StyleName = Literal["paper", "slide"]
-_ROOM_FOR_WORDS: Final = 0.8
-"""Inches of a picture's height that words take, about: they do not shrink with the picture."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,16 +126,17 @@ class _Style:
     rc: Mapping[str, Any]
 
 
-_TEXT: Final = {"font.size": 9, "axes.titlesize": 9, "figure.titlesize": 10, "pdf.fonttype": 42, "ps.fonttype": 42}
 _STYLES: Final[Mapping[str, _Style]] = {
     "paper": _Style(dpi=300, panel=3.5, figure=7.2, tokens=False, rc=_TEXT),
     # letters of 9 points are large on a slide that is 8 inches wide
     "slide": _Style(dpi=240, panel=8.0, figure=8.0, ratio=16 / 9, tokens=False, rc=_TEXT),
 }
+
+
 _NOTEBOOK: Final = _Style(dpi=100, rc={})
+
+
 _current: ContextVar[_Style] = ContextVar("style", default=_NOTEBOOK)
-_applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
-_ONE_AT_A_TIME: Final = RLock()  # matplotlib has its settings once for all threads
 
 
 @contextmanager

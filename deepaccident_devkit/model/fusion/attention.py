@@ -40,7 +40,7 @@ class Windows:
         return parts.reshape(batch * down * along, agents * size * size, channels)
 
     def join(self, tokens: Tensor, shape: torch.Size) -> Tensor:
-        """Tokens (B · windows, A · size², C) → maps (B, A, H, W, C) of the shape that `split` had, no cells added."""
+        """Tokens (B · windows, A · size², C) → maps (B, A, H, W, C) of the shape that `split` had."""
         batch, agents, height, width = shape
         size = self.size
         down, along = -(-height // size), -(-width // size)

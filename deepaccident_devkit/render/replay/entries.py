@@ -37,6 +37,12 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
+Foreseen = Results | Mapping[str, MotionOutput | Iterable[Accident]]
+"""A results file of motion or accidents, or predictions by sample token."""
+_RULES: Final = BoxAccidents()
+_SHOWN: Final = 3
+"""The most alarms of a sample that are shown: right alarms first, then the surest ones."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recording(FrozenArrays):
@@ -236,13 +242,6 @@ def _seen(recording: Recording, ids: IntArray) -> AnyArray:
 
 def _milliradians(angle: float) -> int:
     return round(angle * 1000)
-
-
-Foreseen = Results | Mapping[str, MotionOutput | Iterable[Accident]]
-"""A results file of motion or accidents, or predictions by sample token."""
-_RULES: Final = BoxAccidents()
-_SHOWN: Final = 3
-"""The most alarms of a sample that are shown: right alarms first, then the surest ones."""
 
 
 def foreseen_entries(recording: Recording, prediction: Foreseen) -> dict[str, Any]:

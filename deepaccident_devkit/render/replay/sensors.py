@@ -278,7 +278,10 @@ def _jpeg(image: ByteArray, settings: PictureSettings, *, large: bool) -> bytes:
 
 
 def lidar_points(recording: Recording, agent: str) -> list[str | None] | None:
-    """A cloud a frame: int16 x, y, x, y, …, little-endian, decimetres from the origin, base64; None if all lack."""
+    """A cloud for each frame: int16 x, y, x, y, …, little-endian, in decimetres from the origin, as base64.
+
+    None stands for a missing file; if all are missing there is no list. Raises SensorFileError.
+    """
     clouds = [cloud_text(recording, agent, frame) for frame in recording.frames]
     return clouds if any(cloud is not None for cloud in clouds) else None
 
