@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from deepaccident_devkit.render import colors
+from deepaccident_devkit.render import styles
 
 EYES = {
     "normal": np.eye(3),
@@ -29,15 +29,15 @@ XYZ_FROM_RGB = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
 GROUPS = {
-    "agents and the pair": (*colors.AGENT_COLORS.values(), colors.COLLIDER_COLOR),
-    "verdicts": tuple(colors.OUTCOME_COLORS.values()),
-    "classes of vehicles": tuple(colors.CATEGORY_COLORS[name] for name in ("car", "truck", "van")),
-    "all classes": tuple(colors.CATEGORY_COLORS.values()),
-    "series": colors.SERIES_COLORS,
-    "splits": tuple(colors.SPLIT_COLORS.values()),
+    "agents and the pair": (*styles.AGENT_COLORS.values(), styles.COLLIDER_COLOR),
+    "verdicts": tuple(styles.OUTCOME_COLORS.values()),
+    "classes of vehicles": tuple(styles.CATEGORY_COLORS[name] for name in ("car", "truck", "van")),
+    "all classes": tuple(styles.CATEGORY_COLORS.values()),
+    "series": styles.SERIES_COLORS,
+    "splits": tuple(styles.SPLIT_COLORS.values()),
 }
 """Colours that stand together in a picture and must be distinguished."""
-GROUNDS = {"white": "#ffffff", "road": colors.BEV_COLORS["road"], "mid-grey image": "#808080"}
+GROUNDS = {"white": "#ffffff", "road": styles.BEV_COLORS["road"], "mid-grey image": "#808080"}
 
 
 def linear(names: Iterable[str]) -> NDArray[np.float64]:

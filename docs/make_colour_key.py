@@ -7,10 +7,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render import colors, detached_figure
+from deepaccident_devkit.render import detached_figure, styles
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
+from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.render.motion_maps import direction_colors
-from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 PICTURE = Path(__file__).parent / "images" / "colour_key.png"
@@ -39,19 +39,19 @@ def draw_key(fig: Figure) -> Figure:
     rows.set(xlim=(-22, 6 * STEP - 4), ylim=(-4.3 * ROW, 0.6 * ROW), aspect="equal")
     rows.set_axis_off()
     vehicles = [agent for agent in AGENTS if agent != "infrastructure"]
-    hues = [colors.AGENT_COLORS[agent] for agent in vehicles]
+    hues = [styles.AGENT_COLORS[agent] for agent in vehicles]
     draw_row(rows, 0, "agents", [(short_name(agent), "car", hue) for agent, hue in zip(vehicles, hues, strict=True)])
     place = (len(vehicles) * STEP, 0.0)
-    rows.plot(*place, "o", color=colors.AGENT_COLORS["infrastructure"], markersize=9)
+    rows.plot(*place, "o", color=styles.AGENT_COLORS["infrastructure"], markersize=9)
     write(rows, "infrastructure", *place)
-    red = colors.COLLIDER_COLOR
+    red = styles.COLLIDER_COLOR
     draw_row(rows, 1, "colliding pair", [("a car", "car", red), ("a pedestrian", "pedestrian", red)])
-    draw_row(rows, 2, "other actors", [(name, name, colors.CATEGORY_COLORS[name]) for name in SIZES])
-    draw_patches(rows, 3, "predictions", {**colors.OUTCOME_COLORS, "no verdict": colors.PREDICTED_COLOR})
+    draw_row(rows, 2, "other actors", [(name, name, styles.CATEGORY_COLORS[name]) for name in SIZES])
+    draw_patches(rows, 3, "predictions", {**styles.OUTCOME_COLORS, "no verdict": styles.PREDICTED_COLOR})
     draw_patches(
-        rows, 4, "charts", dict(zip(("first", "second", "third", "fourth"), colors.SERIES_COLORS, strict=True))
+        rows, 4, "charts", dict(zip(("first", "second", "third", "fourth"), styles.SERIES_COLORS, strict=True))
     )
-    for name, colormap in (("depth", colors.DEPTH_COLORMAP), ("height", colors.HEIGHT_COLORMAP)):
+    for name, colormap in (("depth", styles.DEPTH_COLORMAP), ("height", styles.HEIGHT_COLORMAP)):
         parts[name].imshow(np.linspace(0, 1, 256)[None], cmap=colormap, aspect="auto", extent=(0, 1, 0, 1))
         parts[name].set(xticks=(0, 1), yticks=(), box_aspect=0.16)
         parts[name].set_xticks((0, 1), ("near", "far") if name == "depth" else ("low", "high"), fontsize=8)

@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.best_view import best_view
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.pictures import save_picture
+from deepaccident_devkit.render.camera import best_view
+from deepaccident_devkit.render.figures import save_picture
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, read_design
 from deepaccident_devkit.v2x import Contact

@@ -7,10 +7,10 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.pictures import save_picture
+from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.synth.roads import Junction, RoadSpec
 from deepaccident_devkit.synth.roads.layout import OUTWARD
-from deepaccident_devkit.synth.traffic.users import middle_of, road_crossing
+from deepaccident_devkit.synth.traffic.driving import middle_of, road_crossing
 
 PICTURE = Path(__file__).parent / "images" / "scenario_sketch.png"
 SPEC = RoadSpec(lanes=2)

@@ -18,11 +18,11 @@ import synth_beside
 
 from deepaccident_devkit.release import Labels
 from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.collision import gap, separation
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.scenario import Scenario, build_scenario
 from deepaccident_devkit.synth.sensors.rig import make_rig
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, read_design
+from deepaccident_devkit.synth.traffic.simulate import gap, separation
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.build import accident_type
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS, frame_timestamp

@@ -16,7 +16,7 @@ from make_accident_tables import HERE, put
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import outlook
-from deepaccident_devkit.baselines.collisions import accidents_ahead
+from deepaccident_devkit.baselines.predict import accidents_ahead
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, WarningEvaluator
 from deepaccident_devkit.evaluation.accident import AccidentContext, accident_context
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables

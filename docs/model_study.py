@@ -48,10 +48,9 @@ from deepaccident_devkit.model.checkpoint import FINAL, read_weights, write_weig
 from deepaccident_devkit.model.checkpoint import SHIPPED as SHIPPED_WEIGHTS
 from deepaccident_devkit.model.presets import ModelChoice, load_model
 from deepaccident_devkit.model.results import PredictConfig
-from deepaccident_devkit.model.training.config import TrainConfig
-from deepaccident_devkit.model.training.data import SCORE, validated, validation_samples
-from deepaccident_devkit.model.training.state import read_log
-from deepaccident_devkit.model.training.train import train
+from deepaccident_devkit.model.training_loop import train
+from deepaccident_devkit.model.training_run import TrainConfig, read_log
+from deepaccident_devkit.model.training_step import SCORE, validated, validation_samples
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.layout import write_split_file
 from deepaccident_devkit.support.files import write_bytes

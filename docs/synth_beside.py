@@ -22,7 +22,7 @@ from deepaccident_devkit.release import (
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.recording import RecordingJob, forget_scenario, record_scenario
+from deepaccident_devkit.synth.scenario import RecordingJob, forget_scenario, record_scenario
 from deepaccident_devkit.synth.spec import design_text
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, STATIC_ACTOR_ID
 

@@ -7,15 +7,14 @@ import numpy as np
 
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Meta, write_calib, write_label, write_meta
-from deepaccident_devkit.synth.collision import separation
-from deepaccident_devkit.synth.recording import RecordingJob
-from deepaccident_devkit.synth.scenario import Scenario, build_scenario
+from deepaccident_devkit.synth.scenario import RecordingJob, Scenario, build_scenario
 from deepaccident_devkit.synth.sensors.agents import Agent
 from deepaccident_devkit.synth.sensors.annotate import TRACKING_RANGE, camera_visible
 from deepaccident_devkit.synth.sensors.lidar import Scan
 from deepaccident_devkit.synth.sensors.rig import make_rig
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
+from deepaccident_devkit.synth.traffic.simulate import separation
 from deepaccident_devkit.taxonomy import AGENTS, frame_timestamp
 
 STEP, STEPS_A_FRAME = 0.02, 5

@@ -6,8 +6,8 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
-from deepaccident_devkit.render.axes import settled
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
+from deepaccident_devkit.render.figures import settled
 
 TOUCHING = 1.5
 """Pixels that count as nothing: letters do not fill the boxes of their texts."""

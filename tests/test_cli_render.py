@@ -19,7 +19,7 @@ from deepaccident_devkit.cli.render import _PICTURES
 from deepaccident_devkit.cli.render_targets import rows_to_draw
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.render import detached_figure, render_bev, render_sample_data
-from deepaccident_devkit.render.pictures import figure_of_pixels, save_picture
+from deepaccident_devkit.render.figures import figure_of_pixels, save_picture
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 SIZE = (480, 480)

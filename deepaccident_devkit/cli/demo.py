@@ -27,9 +27,9 @@ from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_result
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.render import detached_figure, render_replay
-from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
-from deepaccident_devkit.render.pictures import save_picture
+from deepaccident_devkit.render.figures import save_picture
+from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.files import place_in, remove_leftovers, write_bytes
 from deepaccident_devkit.support.pages import document
 from deepaccident_devkit.support.text import columns_text

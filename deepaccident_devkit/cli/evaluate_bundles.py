@@ -23,7 +23,7 @@ from deepaccident_devkit.evaluation.runs.verification import check_repeated
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.render.evaluation import render_comparison
-from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, save_picture
+from deepaccident_devkit.render.figures import PICTURE_SUFFIXES, save_picture
 from deepaccident_devkit.reports import write_csv
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.tables import place_outside

@@ -28,16 +28,15 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.render.accident import COUNTDOWN, render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
-from deepaccident_devkit.render.axes import LAYERS, Layer
 from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.camera import ColorBy, render_pointcloud_in_image, render_sample_data
-from deepaccident_devkit.render.legends import missing_words
+from deepaccident_devkit.render.captions import missing_words
+from deepaccident_devkit.render.figures import LAYERS, PICTURE_SUFFIXES, Layer, figure_of_pixels, save_picture
 from deepaccident_devkit.render.link import render_link
-from deepaccident_devkit.render.moments import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
-from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, figure_of_pixels, save_picture
 from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.samples import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.styles import StyleName, current_style, style
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, check_target, render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix

@@ -8,8 +8,8 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES
-from deepaccident_devkit.render.roles import collider_ids
+from deepaccident_devkit.render.boxes import collider_ids
+from deepaccident_devkit.render.figures import PICTURE_SUFFIXES
 from deepaccident_devkit.tables.tokens import annotation_token, frame_token, instance_token, sample_token
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.agents import agents_of

@@ -18,8 +18,7 @@ from deepaccident_devkit.cli.options import (
 )
 from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.render.axes import detached_figure
-from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.figures import detached_figure, write_figure
 from deepaccident_devkit.render.safety import render_lead_times, save_safety_report
 from deepaccident_devkit.render.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability
 from deepaccident_devkit.render.safety.report import REPLAYS

@@ -8,7 +8,7 @@ import click
 from deepaccident_devkit.cli.options import PATH, engine_of, engine_parameters, pixel_size, refuse_unused
 from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
+from deepaccident_devkit.synth.plan import IMAGE_SIZE, RELEASED_IMAGE_SIZE
 from deepaccident_devkit.synth.sensors.caster import has_embree
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, read_spec
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 from deepaccident_devkit.explore.explorer import Explorer
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.explore.application import make_app
+    from deepaccident_devkit.explore.pages import make_app
     from deepaccident_devkit.explore.static_pages import export_pages
 
 __all__ = ["Explorer", "explore", "export_pages", "make_app"]
 
-_LATER = {"export_pages": "static_pages", "make_app": "application"}
+_LATER = {"export_pages": "static_pages", "make_app": "pages"}
 """What needs the extra, and where it is."""
 
 
@@ -53,7 +53,7 @@ def explore(
     from deepaccident_devkit.explore.serving import need_extra, serve
 
     need_extra()
-    from deepaccident_devkit.explore.application import make_app
+    from deepaccident_devkit.explore.pages import make_app
 
     app = make_app(explorer)
     explorer.begin()

@@ -65,11 +65,8 @@ class Choices:
     def of(cls, given: Sequence[tuple[str, str]], scenarios: Scenarios | None = None) -> Choices:
         """Those of the parameters of an address; what makes no sense is left out, so that no address fails.
 
-        An address may come from anyone, so it cannot ask for more than a page has.
-
-        Args:
-            given: names and values.
-            scenarios: values that these have all count, others only if they are few; None if they are not known.
+        An address may come from anyone, so it cannot ask for more than a page has. Values that the scenarios have all
+        count, others only if they are few.
         """
         known = {} if scenarios is None else {each.name: frozenset(each.values) for each in scenarios.facets()}
         others = {name: value for name, value in given if name not in FIELDS}
@@ -148,13 +145,7 @@ class Found:
 
 
 def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Model]) -> Found:
-    """The scenarios that match all that was chosen.
-
-    Args:
-        scenarios: of the release.
-        choices: of the reader.
-        scores: `score:MODEL` → the model, whose scores may still be computed.
-    """
+    """The scenarios that match all that was chosen; models' scores (`score:MODEL`) may still be computed."""
     facets = scenarios.facets()
     chosen = {each.name: choices.facets[each.name] for each in facets if each.name in choices.facets}
     masks = {each.name: _matching(each, chosen[each.name]) for each in facets if each.name in chosen}
@@ -183,10 +174,7 @@ def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[dict[
 
 
 def _by_query(scenarios: Scenarios, choices: Choices, plain: Sequence[str]) -> tuple[BoolArray, list[str], list[str]]:
-    """Which scenarios match the query, and the chosen values of fields that are no facets (yet).
-
-    Also what is wrong in them, and what is waited for.
-    """
+    """Which scenarios match the query, chosen values of fields that are no facets (yet), faults, what is awaited."""
     matching = np.ones(len(scenarios), dtype=bool)
     faults, waiting = [], []
     for line in [*(f"{name}={','.join(choices.facets[name])}" for name in plain), *choices.lines]:

@@ -185,10 +185,10 @@ def _headline_row(headline: Json, group: Json | None) -> dict[str, str]:
 
 
 def _bar(group: Json, main: MainNumber | None) -> dict[str, Any]:
-    """The main number of the samples that have one value of an attribute.
+    """The main number of the samples that have one `value` of an attribute.
 
-    `value` is the attribute's, `samples` and `scenarios` count them, `text` and `interval` are for readers; `width` of
-    the bar and both `ends` of the interval are percents of the longest bar, None where there is no number.
+    `samples` and `scenarios` count them, `text` and `interval` are for readers; `width` of the bar and both `ends` of
+    the interval are percents of the longest bar, None where there is no number.
     """
     value = None if main is None else finite(group["headlines"].get(main.path))
     ends = None if main is None else _ends(group, main.path)
@@ -235,10 +235,8 @@ def finite(value: object) -> float | None:
 def verdict(task: str, row: Row, *, whole: bool = False) -> str:
     """A sample's verdict: `FN`, or `TP, places 1.2 m off in sum, time 0.1 s off`.
 
-    Args:
-        task: of the evaluation.
-        row: of the sample; its values may be anything.
-        whole: whether at all distances, ranges and thresholds; if not, at the widest, and at the middle threshold.
+    The values of the row may be anything. The `whole` one is at all distances, ranges and thresholds, else it is at the
+    widest, and at the middle threshold.
     """
     return _WORDS[task](row, whole=whole)
 

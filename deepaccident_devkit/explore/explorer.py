@@ -1,41 +1,46 @@
-"""`Explorer`: what all pages read of a release and of models, and what they keep."""
+"""`Explorer`: what all pages read of a release and of models, and what they keep in memory and in files."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
-from collections.abc import Iterable, Mapping
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import SensorFileError
+from deepaccident_devkit.errors import IndexStoreError, SensorFileError
 from deepaccident_devkit.explore.background import Jobs
 from deepaccident_devkit.explore.choices import SCORE
-from deepaccident_devkit.explore.keeping import Kept, KeptFiles
 from deepaccident_devkit.explore.models import Model, open_models
 from deepaccident_devkit.explore.scenarios import Scenarios
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.best_view import best_view
-from deepaccident_devkit.render.boxes import EDGES, segments_in_image
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, MISSING_COLOR
-from deepaccident_devkit.render.legends import is_there
-from deepaccident_devkit.render.pictures import figure_png
+from deepaccident_devkit.parallel import Store
+from deepaccident_devkit.release.store.store import FileCache
+from deepaccident_devkit.render.boxes import EDGES, actor_color, recorders_of, segments_in_image
+from deepaccident_devkit.render.camera import best_view
+from deepaccident_devkit.render.captions import is_there
+from deepaccident_devkit.render.figures import figure_png
 from deepaccident_devkit.render.replay import recording_of, served_replay
-from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.render.roles import actor_color, recorders_of
+from deepaccident_devkit.render.replay.entries import Recording
+from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR
 from deepaccident_devkit.support.arrays import as_floats
+from deepaccident_devkit.support.files import is_writable_folder, place_in
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable
-
     from deepaccident_devkit.tables.records import ScenarioRecord
 
+Value = TypeVar("Value")
+_THUMBNAILS: Final = "thumbnails"
 SIZE: Final = (320, 180)
 """Pixels."""
 VERSION: Final = 1
@@ -52,77 +57,6 @@ DPI: Final = 80
 """Pixels of rendered figures to an inch."""
 _MANY: Final = 64
 """Scenarios from which on processes are worth their start."""
-
-
-def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
-    """A scenario's last moment as JPEG: the colliding pair in the best camera with red boxes; of others, the front one.
-
-    Where no image was downloaded it is the actors from above; without labels a grey panel.
-    """
-    boxes = scenario_tracks(dataset, record).at(record["num_frames"])
-    told = record["collision"]
-    pair = boxes.select(np.isin(boxes.actor_id, [] if told is None else told["ids"]))
-    samples = [f"{record['token']}/{agent}/{record['num_frames']:03d}" for agent in agents_of(dataset, record)]
-    camera = _camera(dataset, samples, pair)
-    image: Any = None
-    if camera is not None:
-        image = _photo(dataset, camera, pair)
-    if image is None:
-        image = _from_above(dataset, record, boxes, pair)
-    written = io.BytesIO()
-    image.save(written, "JPEG", quality=_QUALITY)
-    return written.getvalue()
-
-
-def _camera(dataset: Dataset, samples: list[str], pair: Boxes) -> str | None:
-    """The camera (token) that is shown; None where no image is there."""
-    view = best_view(dataset, samples, pair) if len(pair) else None
-    if view is not None and is_there(dataset, view.camera):
-        return view.camera
-    front = (f"{sample}/{_FRONT}" for sample in samples)
-    return next((camera for camera in front if is_there(dataset, camera)), None)
-
-
-def _photo(dataset: Dataset, camera: str, pair: Boxes) -> Any:
-    """What a camera saw, with the pair's boxes; None if the file cannot be read."""
-    from PIL import Image, ImageDraw
-
-    width, height = SIZE
-    try:
-        picture = Image.fromarray(dataset.load_image(camera, least=(height, width), size=(height, width)))
-    except SensorFileError:
-        return None
-    sample, channel = camera.rsplit("/", 1)
-    lens = dataset.camera(camera)
-    optical = pair.transform(dataset.world_from(sample, channel).inverse(), channel)
-    own = dataset.get("agent", sample.rsplit("/", 1)[0])["actor_id"]
-    pen, scale = ImageDraw.Draw(picture), as_floats([width / lens.width, height / lens.height])
-    for corners in optical.select(optical.actor_id != own).corners():
-        segments, _ = segments_in_image(corners[np.array(EDGES)], lens)
-        for start, end in (segments * scale).tolist():
-            pen.line([*start, *end], fill=COLLIDER_COLOR, width=1)
-    return picture
-
-
-def _from_above(dataset: Dataset, record: ScenarioRecord, boxes: Boxes, pair: Boxes) -> Any:
-    """All actors from above, around the pair or the middle of all."""
-    from PIL import Image, ImageDraw
-
-    width, height = SIZE
-    picture = Image.new("RGB", SIZE, "#ffffff" if len(boxes) else MISSING_COLOR)
-    if not len(boxes):
-        return picture
-    middle = (pair if len(pair) else boxes).center[:, :2].mean(axis=0)
-    scale = width / 2 / _REACH
-    recorders = recorders_of(dataset, record["token"])
-    pen = ImageDraw.Draw(picture)
-    places = (boxes.bottom_corners()[..., :2] - middle) * as_floats([scale, -scale]) + as_floats(
-        [width / 2, height / 2]
-    )
-    for outline, actor, category in zip(places, boxes.actor_id.tolist(), boxes.category_names, strict=True):
-        color = actor_color(category, recorders.get(actor), collides=actor in pair.actor_id)
-        pen.polygon([tuple(place) for place in outline.tolist()], fill=color)
-    return picture
 
 
 class Explorer:
@@ -213,3 +147,139 @@ class Explorer:
 def _few_workers(scenarios: int) -> int:
     """Processes in the background, which leave others on the machine theirs; a small release needs none of its own."""
     return max(2, min(4, (os.cpu_count() or 2) // 2)) if scenarios >= _MANY else 1
+
+
+class Kept(Generic[Value]):
+    """Values that are made when they are asked for the first time; those that were not asked for the longest go.
+
+    Each is made once, also if several threads ask for it at the same time; other values are made meanwhile.
+    """
+
+    def __init__(self, most: float, size: Callable[[Value], float] = lambda _: 1.0) -> None:
+        """Keep values as long as their sizes are at most so much in sum; by default so many values."""
+        self._most, self._size = most, size
+        self._values: OrderedDict[Hashable, Value] = OrderedDict()
+        self._total = 0.0
+        self._lock = threading.Lock()
+        self._making: dict[Hashable, threading.Lock] = {}
+
+    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """The value of a key; raises what `make` raises, of which nothing is kept."""
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+            making = self._making.setdefault(key, threading.Lock())
+        with making:
+            with self._lock:
+                if key in self._values:
+                    return self._values[key]
+            try:
+                value = make()
+                self._keep(key, value)
+            finally:
+                with self._lock:
+                    self._making.pop(key, None)
+        return value
+
+    def _keep(self, key: Hashable, value: Value) -> None:
+        with self._lock:
+            self._values[key] = value
+            self._total += self._size(value)
+            while self._total > self._most and len(self._values) > 1:
+                _, old = self._values.popitem(last=False)
+                self._total -= self._size(old)
+
+
+class KeptFiles:
+    """Small files that are made once: beside the index, and where that cannot be written, in the user's cache."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        """Take the release whose index they lie beside: they go when the tables are made again."""
+        self.folder = place_in(dataset.tables_folder, _THUMBNAILS, opened=True)
+        if not is_writable_folder(dataset.tables_folder):
+            self.folder = FileCache.of_user().folder.with_name(_THUMBNAILS)
+        self._store = Store(self.folder, self.folder, "keeps thumbnails", IndexStoreError)
+
+    def get(self, identity: str, name: str, make: Callable[[], bytes]) -> bytes:
+        """The content of a file; `identity` tells it from all others. Raises what `make` raises."""
+        digest = hashlib.blake2b(identity.encode(errors="surrogateescape"), digest_size=16).hexdigest()
+        place = f"{digest[:2]}/{digest[2:]}/{name}"
+        kept = self._store.kept(place, digest, "image")
+        if kept is not None:
+            return kept
+        content = make()
+        with suppress(OSError):  # no room, or a folder that may not be written to: it is made again the next time
+            self._store.keep(place, digest, content)
+        return content
+
+
+def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
+    """A scenario's last moment as JPEG: the colliding pair in the best camera with red boxes; of others, the front one.
+
+    Where no image was downloaded it is the actors from above; without labels a grey panel.
+    """
+    boxes = scenario_tracks(dataset, record).at(record["num_frames"])
+    told = record["collision"]
+    pair = boxes.select(np.isin(boxes.actor_id, [] if told is None else told["ids"]))
+    samples = [f"{record['token']}/{agent}/{record['num_frames']:03d}" for agent in agents_of(dataset, record)]
+    camera = _camera(dataset, samples, pair)
+    image: Any = None
+    if camera is not None:
+        image = _photo(dataset, camera, pair)
+    if image is None:
+        image = _from_above(dataset, record, boxes, pair)
+    written = io.BytesIO()
+    image.save(written, "JPEG", quality=_QUALITY)
+    return written.getvalue()
+
+
+def _camera(dataset: Dataset, samples: list[str], pair: Boxes) -> str | None:
+    """The camera (token) that is shown; None where no image is there."""
+    view = best_view(dataset, samples, pair) if len(pair) else None
+    if view is not None and is_there(dataset, view.camera):
+        return view.camera
+    front = (f"{sample}/{_FRONT}" for sample in samples)
+    return next((camera for camera in front if is_there(dataset, camera)), None)
+
+
+def _photo(dataset: Dataset, camera: str, pair: Boxes) -> Any:
+    """What a camera saw, with the pair's boxes; None if the file cannot be read."""
+    from PIL import Image, ImageDraw
+
+    width, height = SIZE
+    try:
+        picture = Image.fromarray(dataset.load_image(camera, least=(height, width), size=(height, width)))
+    except SensorFileError:
+        return None
+    sample, channel = camera.rsplit("/", 1)
+    lens = dataset.camera(camera)
+    optical = pair.transform(dataset.world_from(sample, channel).inverse(), channel)
+    own = dataset.get("agent", sample.rsplit("/", 1)[0])["actor_id"]
+    pen, scale = ImageDraw.Draw(picture), as_floats([width / lens.width, height / lens.height])
+    for corners in optical.select(optical.actor_id != own).corners():
+        segments, _ = segments_in_image(corners[np.array(EDGES)], lens)
+        for start, end in (segments * scale).tolist():
+            pen.line([*start, *end], fill=COLLIDER_COLOR, width=1)
+    return picture
+
+
+def _from_above(dataset: Dataset, record: ScenarioRecord, boxes: Boxes, pair: Boxes) -> Any:
+    """All actors from above, around the pair or the middle of all."""
+    from PIL import Image, ImageDraw
+
+    width, height = SIZE
+    picture = Image.new("RGB", SIZE, "#ffffff" if len(boxes) else MISSING_COLOR)
+    if not len(boxes):
+        return picture
+    middle = (pair if len(pair) else boxes).center[:, :2].mean(axis=0)
+    scale = width / 2 / _REACH
+    recorders = recorders_of(dataset, record["token"])
+    pen = ImageDraw.Draw(picture)
+    places = (boxes.bottom_corners()[..., :2] - middle) * as_floats([scale, -scale]) + as_floats(
+        [width / 2, height / 2]
+    )
+    for outline, actor, category in zip(places, boxes.actor_id.tolist(), boxes.category_names, strict=True):
+        color = actor_color(category, recorders.get(actor), collides=actor in pair.actor_id)
+        pen.polygon([tuple(place) for place in outline.tolist()], fill=color)
+    return picture

@@ -159,13 +159,10 @@ def _badness(value: float | None, *, higher: bool) -> tuple[bool, float]:
 
 
 def open_models(bundles: Iterable[Path], results: Iterable[Path], jobs: Jobs) -> dict[str, Model]:
-    """The models of bundles and results, by name in the order given.
+    """The models of bundles and results, by name in the order given; raises ResultsError.
 
     A bundle's results are its own copy, or those of the given ones that have its fingerprint: the path that it names is
     not opened, since a bundle may come from anywhere.
-
-    Raises:
-        ResultsError: one of them cannot be read, or is no bundle.
     """
     given = {str(path): read_results(path) for path in results}
     models: dict[str, Model] = {}
@@ -194,20 +191,17 @@ def _free(name: str, taken: Mapping[str, object]) -> str:
     return next(each for each in names if each not in taken)
 
 
-def standings_job(jobs: Jobs, model: Model) -> Job:
-    """The work that gives the `standings` of a model that has a bundle, after that which gives its scores."""
+def sample_values_job(jobs: Jobs, model: Model) -> Job:
+    """The work that gives the `sample_values` of a model that has a bundle, after that which gives its scores."""
     _ = model.job  # which comes first
-    return jobs.ask(f"order {model.name}", f"the worst samples of {model.name}", lambda: standings(model))
+    return jobs.ask(f"order {model.name}", f"the worst samples of {model.name}", lambda: sample_values(model))
 
 
-def standings(model: Model) -> dict[str, float | None]:
-    """Sample → its main number, the worst first.
+def sample_values(model: Model) -> dict[str, float | None]:
+    """Sample → its main number, the worst first; raises EvaluationError if the model has no scores.
 
     Some protocols have no such number of a sample where there is nothing to find. It counts as 0 if something is
     predicted there, so that false alarms are among the worst; a sample with nothing at all has None, and is last.
-
-    Raises:
-        EvaluationError: the model has no scores.
     """
     scores = scores_of(model)
     found = {token: score.value for token, score in scores.samples.items()}

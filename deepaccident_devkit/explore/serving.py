@@ -48,19 +48,11 @@ def serve(
     open_browser: bool = True,
     say: Callable[[str], object],
 ) -> None:
-    """Show the pages until an exception, such as that of Ctrl-C, ends it.
+    """Show the pages on a host and port of this machine until an exception, such as that of Ctrl-C, ends it.
 
-    Args:
-        app: the pages, an ASGI application.
-        host: name or address of this machine on which to listen.
-        port: port to listen on; by default the first free one from 8765 on.
-        root_path: path or URL at which a proxy shows the pages.
-        open_browser: whether to open a browser here, if there is a display and no proxy.
-        say: gets the addresses, line by line.
-
-    Raises:
-        MissingExtraError: the extra `explore` is not installed.
-        ConfigError: the server cannot listen there, or the root path is neither a path nor a URL.
+    The port is by default the first free one from 8765 on; the root path is the path or URL at which a proxy shows the
+    pages. A browser is opened if there is a display and no proxy; `say` gets the addresses, line by line. Raises
+    MissingExtraError, and ConfigError if the server cannot listen there or the root path is neither.
     """
     with serving(app, host=host, port=port, root_path=root_path) as served:
         for line in served.lines():

@@ -20,14 +20,14 @@ from deepaccident_devkit.explore.background import Jobs
 from deepaccident_devkit.explore.choices import find_call, where_words
 from deepaccident_devkit.explore.explorer import thumbnail
 from deepaccident_devkit.explore.models import Model, open_models
-from deepaccident_devkit.explore.pages.answers import assets
+from deepaccident_devkit.explore.pages.release import SLOW, cell, entry
+from deepaccident_devkit.explore.pages.responses import assets
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_context
-from deepaccident_devkit.explore.pages.scenarios import SLOW, cell, entry
 from deepaccident_devkit.explore.scenarios import accident_columns
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.parallel import Engine, Places, run_batch
 from deepaccident_devkit.render.replay import recording_of, tried_replay
-from deepaccident_devkit.render.replay.replay import facts
+from deepaccident_devkit.render.replay.page import facts
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.selection import find
 from deepaccident_devkit.selection.fields import measures_of_moving_pairs
@@ -67,11 +67,7 @@ _POLICY: Final = (
 
 
 def target_folder(folder: str | os.PathLike[str]) -> Path:
-    """The real path of a folder for an export.
-
-    Raises:
-        ConfigError: it cannot be written to, is a file, or holds files that no export wrote.
-    """
+    """The real path of a folder for an export; raises ConfigError if it cannot be written to, or holds other files."""
     target = path_of(folder, "expected a folder to write to").resolve()
     writable_folder(target.parent)
     if target.exists() and not target.is_dir():
@@ -270,12 +266,7 @@ class _Pages:
         self._names = _folders(records)
 
     def write(self, filters: Sequence[str], **how: Unpack[Engine]) -> None:
-        """Write all pages, and what they show.
-
-        Args:
-            filters: by which the scenarios were found.
-            **how: as of `export_pages`.
-        """
+        """Write all pages of scenarios that were found by filters, and what they show; `how` as of `export_pages`."""
         items = [
             Work(token=token, folder=name, predictions=self._predictions(token)) for token, name in self._names.items()
         ]

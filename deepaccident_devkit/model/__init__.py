@@ -26,13 +26,12 @@ except ModuleNotFoundError as error:
     ) from error
 
 from deepaccident_devkit.model.checkpoint import Loaded, Weights, load_weights, read_weights, write_weights
-from deepaccident_devkit.model.entry import ModelInputs, model_inputs
+from deepaccident_devkit.model.inputs import ModelInputs, model_inputs
 from deepaccident_devkit.model.network import ModelConfig, Predictions, V2XFormer
 from deepaccident_devkit.model.presets import PRESETS, ModelChoice, load_model
 from deepaccident_devkit.model.results import PredictConfig, SamplePrediction, predict_results, predictions
-from deepaccident_devkit.model.training.config import TrainConfig
-from deepaccident_devkit.model.training.state import checked_device
-from deepaccident_devkit.model.training.train import train
+from deepaccident_devkit.model.training_loop import train
+from deepaccident_devkit.model.training_run import TrainConfig, checked_device
 
 __all__ = [
     "PRESETS",

@@ -19,21 +19,11 @@ from deepaccident_devkit.support.arrays import check_least
 
 
 def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:
-    """Features of one grid at another grid's cell centres, by bilinear sampling (the released `BevFeatureSlicer`).
+    """Features (N, C, H, W) of one grid at another's cell centres, bilinear (the released `BevFeatureSlicer`).
 
-    Both grids are in metres of the same ego frame. Outside the source grid features are zero; within half a cell of its
-    edge, on either side, they fade. If the grids are equal, nothing is sampled.
-
-    Args:
-        features: (N, C, H, W) in the orientation of `source`.
-        source: the features' cells.
-        target: the wanted cells, in the same orientation.
-
-    Returns:
-        (N, C, H', W').
-
-    Raises:
-        GeometryError: the features do not have the shape of `source`, or the grids' orientations differ.
+    Both grids are in metres of the same ego frame and in the same orientation, else GeometryError is raised. Outside
+    the source grid features are zero; within half a cell of its edge, on either side, they fade. If the grids are
+    equal, nothing is sampled.
     """
     rows, columns = source.shape
     if features.dim() != 4 or tuple(features.shape[-2:]) != (rows, columns):
@@ -100,14 +90,7 @@ class BevEncode(nn.Module):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """Encode.
-
-        Args:
-            features: (N, in_channels, H, W); H and W even.
-
-        Returns:
-            (N, out_channels, H, W).
-        """
+        """(N, in_channels, H, W), H and W even → (N, out_channels, H, W)."""
         fine = self.layers[0](features)
         coarse = self.layers[2](self.layers[1](fine))
         return self.up2(self.up1(coarse, fine))
@@ -144,14 +127,7 @@ class BevUNet(nn.Module):
         self.join = nn.Sequential(*_convolution(fine + coarse, config.out_channels))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Encode.
-
-        Args:
-            features: (N, in_channels, H, W).
-
-        Returns:
-            (N, out_channels, H / 2, W / 2), odd sizes rounded up.
-        """
+        """(N, in_channels, H, W) → (N, out_channels, H / 2, W / 2), odd sizes rounded up."""
         fine = self.fine(features)
         coarse = functional.interpolate(self.coarse(fine), size=fine.shape[-2:], mode="bilinear", align_corners=False)
         return self.join(torch.cat([fine, coarse], dim=1))

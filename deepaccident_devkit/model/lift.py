@@ -130,17 +130,10 @@ class LiftSplat(nn.Module):
         self.register_buffer("frustum", _frustum(config))
 
     def forward(self, features: Tensor, cameras: CameraGeometry) -> Tensor:
-        """One map of each frame.
+        """Features (B, P, N, C, h', w') → one map of each frame, (B, P, `channels`, Y, X); float32 under autocast too.
 
-        Args:
-            features: (B, P, N, C, h', w').
-            cameras: their cameras.
-
-        Returns:
-            (B, P, `channels`, Y, X), row = y ascending, column = x ascending; float32 under autocast too.
-
-        Raises:
-            GeometryError: features or cells do not have the configured shape.
+        Row = y ascending, column = x ascending. Raises GeometryError: features or cells do not have the configured
+        shape.
         """
         depths, rows, columns = self.config.frustum_shape
         if tuple(features.shape[-2:]) != (rows, columns):
@@ -159,11 +152,7 @@ class LiftSplat(nn.Module):
 
     @torch.no_grad()
     def cells(self, cameras: CameraGeometry) -> Tensor:
-        """The cell of the map in which each point of the frustum lies.
-
-        Returns:
-            (B, P, N, D, h', w') int64, row · X + column, −1 for points that do not count.
-        """
+        """The cell of each frustum point, (B, P, N, D, h', w') int64: row · X + column, −1 if it does not count."""
         config = self.config
         points = self.points(cameras)
         axes = (config.x, config.y, config.z)

@@ -2,7 +2,7 @@
 
 | step | from → to | where |
 |---|---|---|
-| the devkit's batch | tensors in the model's frame | `entry` |
+| the devkit's batch | tensors in the model's frame | `inputs` |
 | images | features of each image | `images` |
 | lift | features → a map from above, each frame of each agent | `lift` |
 | time | P frames → one map of each agent | `temporal` |
@@ -34,9 +34,9 @@ from deepaccident_devkit.model.detection import (
     TargetConfig,
     TaskMaps,
 )
-from deepaccident_devkit.model.entry import Handedness, ModelInputs
 from deepaccident_devkit.model.fusion import FusionConfig, fusion
 from deepaccident_devkit.model.images import EncoderConfig, image_encoder, normalised
+from deepaccident_devkit.model.inputs import Handedness, ModelInputs
 from deepaccident_devkit.model.lift import LiftConfig, LiftSplat
 from deepaccident_devkit.model.motion import (
     MotionHead,
@@ -68,7 +68,7 @@ class ModelConfig:
         motion: the motion head.
         detection: the detection head.
         labels: the motion labels that it learns; their grid is the motion grid.
-        handedness: of the model's frame, `left` in the release (`entry`).
+        handedness: of the model's frame, `left` in the release (`inputs`).
         motion_loss: weights of the motion losses.
         detection_loss: of the detection losses.
         targets: how detection targets are made.

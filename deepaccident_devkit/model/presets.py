@@ -127,13 +127,10 @@ def load_model(path: str | os.PathLike[str]) -> V2XFormer:
 
 
 def fusion_config(name: str, channels: int) -> FusionConfig:
-    """A fusion by its name, in the size that fits so many channels.
+    """A fusion by its name, in the size that fits so many channels; raises ChoiceError.
 
     The release's own fusion is `released`. `disconet`, `cobevt` and `v2xvit` are written from those models' papers: the
     paper's table names them, and the release has none of them.
-
-    Raises:
-        ChoiceError: no such fusion.
     """
     small = channels < 64
     made: Mapping[str, Callable[[], FusionConfig]] = {

@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.export.torch import V2XDataset, collate
 from deepaccident_devkit.model.detection import decode_detections, detected_boxes
-from deepaccident_devkit.model.entry import mirrored_boxes, model_inputs
+from deepaccident_devkit.model.inputs import mirrored_boxes, model_inputs
 from deepaccident_devkit.model.motion import MotionMaps
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -111,13 +111,7 @@ def check_images(dataset: Dataset, tokens: Sequence[str]) -> None:
 
 
 def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig) -> SamplePrediction:
-    """The prediction of a batch of one item.
-
-    Args:
-        model: in evaluation mode.
-        batch: of `export.torch.collate`, as `ModelConfig.inputs` describes it.
-        config: its seed, device and latency.
-    """
+    """The prediction of a batch of one item of `export.torch.collate`, by a model in evaluation mode."""
     [token] = batch["token"]
     delay = 0 if config.link is None else config.link.latency_frames
     inputs = model_inputs(batch, model.config.handedness, delay=delay).to(config.device)

@@ -30,13 +30,7 @@ from deepaccident_devkit.support.text import settle_choices
 
 
 class ConvBnRelu3d(nn.Module):
-    """A convolution without bias, batch norm and ReLU; keeps T, H and W.
-
-    Args:
-        in_channels: C of the input.
-        out_channels: C of the output.
-        kernel: steps, rows, columns; rows and columns odd.
-    """
+    """A convolution (kernel: steps, rows, columns) without bias, batch norm and ReLU; keeps T, H and W."""
 
     def __init__(self, in_channels: int, out_channels: int, kernel: tuple[int, int, int] = (1, 1, 1)) -> None:
         super().__init__()
@@ -187,21 +181,12 @@ class Temporal3D(nn.Module):
     def forward(
         self, features: Tensor, egomotion: Tensor, valid: Tensor, bev_transform: Tensor | None = None
     ) -> Tensor:
-        """One map of the present.
+        """Maps (N, P, C, H, W), each in its own frame, the present last → the present's (N, C, H, W).
 
-        Frames up to the *first* one that is not valid are replaced by the frame after it, as the released code does;
-        of [no, no, yes] frame 0 so becomes frame 1. In its batches invalid frames repeat the present with identity
-        motion, so that this does no harm.
-
-        Args:
-            features: (N, P, C, H, W) each in its own frame, the present last.
-            egomotion: (N, P, 6) row t moves frame t to t + 1, in the handedness of the maps, without augmentation
-                where `bev_transform` is given; the last row is not used.
-            valid: (N, P) bool; the present is.
-            bev_transform: (N, 4, 4) the maps' BEV augmentation.
-
-        Returns:
-            (N, C, H, W).
+        Frames up to the *first* one that is not `valid` (N, P) are replaced by the frame after it, as the released code
+        does; of [no, no, yes] frame 0 so becomes frame 1. In its batches invalid frames repeat the present with
+        identity motion, so that this does no harm. Row t of `egomotion` (N, P, 6) moves frame t to t + 1, in the
+        handedness of the maps, before their BEV augmentation (N, 4, 4); the last row is not used.
         """
         present = features[:, -1]
         if self.config.frames == 1:

@@ -1,6 +1,6 @@
 """Transforms between frames of moments and agents, and BEV feature maps in another frame, with gradients.
 
-The sibling of `geometry.conventions` and `motion.warping`, for whole batches. Nothing here depends on the
+The sibling of `geometry.six_vectors` and `motion.warps.chains`, for whole batches. Nothing here depends on the
 handedness, so long as all that goes in has the same. Products are written as sums, because `autocast` would
 round a matrix product to bfloat16, and metres need more digits than that.
 
@@ -23,7 +23,7 @@ Chain = Literal["released", "exact"]
 
 
 def matrices_from_six(six: Tensor) -> Tensor:
-    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4), as `geometry.conventions.matrices_of_six`."""
+    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4), as `geometry.six_vectors.to_matrices`."""
     cx, cy, cz = torch.cos(six[..., 3:]).unbind(-1)
     sx, sy, sz = torch.sin(six[..., 3:]).unbind(-1)
     tx, ty, tz = six[..., :3].unbind(-1)
@@ -47,13 +47,7 @@ def six_from_matrices(matrix: Tensor) -> Tensor:
 
 
 def between_augmented(target_from_source: Tensor, target_bev: Tensor | None, source_bev: Tensor | None) -> Tensor:
-    """A transform of frames → the one between their augmented maps: A_target · transform · A_source⁻¹.
-
-    Args:
-        target_from_source: (…, 4, 4).
-        target_bev: (…, 4, 4) the BEV augmentation of the frame that the transform leads to; None is the identity.
-        source_bev: (…, 4, 4) that of the frame it comes from.
-    """
+    """A transform of frames → the one between their augmented maps (…, 4, 4): A_target · transform · A_source⁻¹."""
     if target_bev is not None:
         target_from_source = _product(target_bev, target_from_source)
     if source_bev is not None:
@@ -62,16 +56,11 @@ def between_augmented(target_from_source: Tensor, target_bev: Tensor | None, sou
 
 
 def present_from_past(egomotion: Tensor, *, chain: Chain = "exact", bev_transform: Tensor | None = None) -> Tensor:
-    """Transforms of the past frames to the present.
+    """Transforms of the past frames to the present, (N, P − 1, 4, 4), the oldest first, as are the egomotion's rows.
 
-    Args:
-        egomotion: (N, P − 1, 6) rows `next_from_this` of the past frames, the oldest first.
-        chain: the order of the product. `exact`: E_{P−2} … E_t. `released`: E_t … E_{P−2}, which is wrong from the
-            second frame before the present on.
-        bev_transform: (N, 4, 4) the BEV augmentation A of all frames; the product becomes A · product · A⁻¹.
-
-    Returns:
-        (N, P − 1, 4, 4), the oldest first.
+    The rows are `next_from_this`, (N, P − 1, 6). Their product is E_{P−2} … E_t (`exact`), or in the `released` chain
+    E_t … E_{P−2}, which is wrong from the second frame before the present on. With a BEV augmentation A (N, 4, 4) it
+    becomes A · product · A⁻¹.
     """
     steps = matrices_from_six(egomotion).unbind(1)
     products = list(steps[-1:])
@@ -103,21 +92,12 @@ def warp_features(
     warp: WarpRule = "exact",
     mode: WarpMode = "bilinear",
 ) -> Tensor:
-    """Feature maps as the target's frame sees them; zero outside the source's grid.
+    """Feature maps (N, C, H, W) as the target's frame sees them; zero outside the source's grid.
 
     `exact` samples at the centres of the target's cells. `stretched` is the released FeatureWarper's rule, which
     blurs by up to half a cell even without motion (`motion.warping`). Points lie on the plane z = 0; of the
-    inverse transform only rows x, y and columns x, y and translation count.
-
-    Args:
-        features: (N, C, H, W) maps in the source's frame.
-        target_from_source: (N, 4, 4) metres, invertible.
-        grid: the cells of both maps.
-        warp: where to sample.
-        mode: how to sample.
-
-    Returns:
-        (N, C, H, W) of the features' dtype; sampled in float32 at least.
+    inverse transform (N, 4, 4), metres, only rows x, y and columns x, y and translation count. The result has the
+    features' dtype; it is sampled in float32 at least.
     """
     points = _sample_points(target_from_source, grid, warp)
     working = features if features.dtype == torch.float64 else features.float()
@@ -128,13 +108,7 @@ def warp_features(
 
 
 def inside_mask(target_from_source: Tensor, grid: BevGrid, *, warp: WarpRule = "exact") -> Tensor:
-    """(N, H, W) bool: the target's cells that the source's grid covers, by nearest sampling.
-
-    Args:
-        target_from_source: (N, 4, 4) metres, invertible.
-        grid: the cells of both maps.
-        warp: where to sample.
-    """
+    """(N, H, W) bool: the cells that the source's grid covers, by nearest sampling, of transforms (N, 4, 4), metres."""
     ones = target_from_source.new_ones(len(target_from_source), 1, *grid.shape)
     return warp_features(ones, target_from_source, grid, warp=warp, mode="nearest")[:, 0] > 0.5
 
@@ -159,11 +133,7 @@ def agents_to_ego(features: Tensor, ego_from_agent: Tensor, grid: BevGrid, *, wa
 def agents_mask(agent_valid: Tensor, ego_from_agent: Tensor, grid: BevGrid, *, warp: WarpRule = "exact") -> Tensor:
     """(B, A, H, W) bool: where each agent has something to say in the ego's frame; the ego, slot 0, everywhere.
 
-    Args:
-        agent_valid: (B, A) bool, whether the agent is there.
-        ego_from_agent: (B, A, 4, 4) metres; the identity where an agent is missing.
-        grid: the cells of all maps.
-        warp: where to sample.
+    Transforms (B, A, 4, 4), metres, are the identity where an agent is missing.
     """
     inside = inside_mask(ego_from_agent.flatten(0, 1), grid, warp=warp).unflatten(0, agent_valid.shape)
     mask = inside & agent_valid[..., None, None]

@@ -4,13 +4,12 @@ from typing import TYPE_CHECKING
 
 from deepaccident_devkit.render.accident import render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
-from deepaccident_devkit.render.axes import LAYERS, Layer, detached_figure
 from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.boxes import draw_box
 from deepaccident_devkit.render.camera import render_pointcloud_in_image, render_sample_data
+from deepaccident_devkit.render.figures import LAYERS, Layer, detached_figure
 from deepaccident_devkit.render.ground import render_town_map
 from deepaccident_devkit.render.link import render_link
-from deepaccident_devkit.render.moments import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.motion import (
     draw_motion_labels,
     draw_motion_map,
@@ -20,6 +19,7 @@ from deepaccident_devkit.render.motion import (
 )
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome, render_evaluation
 from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.samples import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.styles import style
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix

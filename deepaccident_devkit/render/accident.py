@@ -3,29 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.render.axes import Layer, figure_or_new, layers_of, settled, with_light_grid
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, COLLIDER_COLOR, GRID_COLOR
-from deepaccident_devkit.render.pair import PAIR_LAYERS, Pair, draw_pair_from_above, draw_pair_in_camera, number_words
-from deepaccident_devkit.render.roles import in_drawing_order
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.render.boxes import (
+    actor_tags,
+    bounds_in_image,
+    camera_name,
+    draw_actors_from_above,
+    draw_boxes_in_image,
+    draw_trails,
+    in_drawing_order,
+    role_colors,
+)
+from deepaccident_devkit.render.camera import CAMERA_LAYERS, BestView, best_view, crop_about, draw_camera
+from deepaccident_devkit.render.captions import is_there, set_scene_title
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
+from deepaccident_devkit.render.figures import Layer, figure_or_new, layers_of, settled, with_light_grid
+from deepaccident_devkit.render.ground import draw_underlay
+from deepaccident_devkit.render.styles import AGENT_COLORS, CASING_COLOR, COLLIDER_COLOR, GRID_COLOR, in_own_settings
+from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, short_name
+from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, FRAME_PERIOD, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP
+from deepaccident_devkit.v2x.poses import camera_of
+from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+PAIR_LAYERS: Final[tuple[Layer, ...]] = (*CAMERA_LAYERS, "bev", "trajectories", "grid")
+_REMEMBERED: Final = 10
+"""Frames for which the last camera that saw the pair is kept."""
+_LEAST, _MOST = 9.0, 24.0
+"""Metres around the place of contact that are shown, at least and at most."""
+_MARGIN: Final = 2.5
+"""Metres around the pair."""
+_PAST: Final = 3.0
+"""Seconds of the paths that led to the contact."""
+_LEAST_CROP: Final = 0.4
+"""Share of an image's width that is shown at least: who looks must still see where it is."""
+_CROSS: Final = 9.0
+"""Points: the size of the cross at the place of contact."""
+_EDGE: Final = 0.01
+"""Share of a panel's width and height that the places of tags keep to its edges."""
+_FREE: Final = 22.0
+"""Points, about, at the top of an image in which tags may cover a car: it may fill the image."""
+_HIDDEN: Final = (0, (3, 2))
 COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
 """Seconds before the impact."""
 _SHOWN: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
@@ -111,20 +143,9 @@ def render_accident(
 def draw_countdown(
     dataset: Dataset, frame: str, *, agents: Sequence[str], layers: Collection[Layer] | None, fig: Figure
 ) -> None:
-    """Render a moment of an accident: five cameras, the place of contact from above, the speeds of the pair.
+    """Render a moment of an accident on an empty figure of about 16 to 9: five cameras, the contact, the pair's speeds.
 
-    Each agent's camera is chosen as in `render_accident`.
-
-    Args:
-        dataset: the release.
-        frame: token.
-        agents: whose cameras are shown.
-        layers: as in `render_accident`; None for its default.
-        fig: an empty figure to render on, about 16 to 9.
-
-    Raises:
-        NotAvailableError: nobody collides in the scenario, or it has no meta.
-        ChoiceError: no such layer.
+    Cameras are chosen and layers named as in `render_accident`. Raises NotAvailableError if nobody collides.
     """
     shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
     record = dataset.get("frame", frame)
@@ -165,6 +186,175 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
         f"{hitting} {verb} {hit}, {sides}\n{speeds} m/s, closing at {number_words(contact.closing_speed)} m/s, "
         f"{np.degrees(contact.impact_angle):.0f}° between their headings"
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pair:
+    """Two actors that collide in a scenario (a token), where all actors are, and the short names of the two by id."""
+
+    dataset: Dataset
+    scenario: str
+    contact: Contact
+    tracks: ScenarioTracks
+    tags: dict[int, str]
+
+    @classmethod
+    def of(cls, dataset: Dataset, contact: Contact) -> Pair:
+        """The pair of a contact."""
+        scenario = contact.frame.rsplit("/", 1)[0]
+        tracks = scenario_tracks(dataset, scenario)
+        return cls(
+            dataset=dataset, scenario=scenario, contact=contact, tracks=tracks, tags=actor_tags(dataset, contact)
+        )
+
+    def at(self, index: int, seen_by: str | None = None) -> Boxes:
+        """Their boxes in world in a frame (number from 1), as far as they exist; without the agent that sees them."""
+        there = self.tracks.at(index)
+        own = None if seen_by is None else self.dataset.agent.get(f"{self.scenario}/{seen_by}")["actor_id"]
+        ids = [actor for actor in self.contact.actor_ids if actor != own]
+        return there.select(np.isin(there.actor_id, ids))
+
+    def view(self, agent: str, index: int) -> tuple[str, BestView | None, int | None]:
+        """The camera of an agent that shows the pair best in a frame, its view, and when it last had the pair.
+
+        Cameras whose images are there come first. If none has the pair in its image, it is the last one that had, and
+        without such a one the front camera; then there is no view.
+        """
+        sample = sample_token(self.scenario, agent, index)
+        there = [channel for channel in CAMERAS if is_there(self.dataset, f"{sample}/{channel}")] or CAMERAS
+        for earlier in range(index, max(0, index - _REMEMBERED), -1):
+            then = sample_token(self.scenario, agent, earlier)
+            view = best_view(self.dataset, [then], self.at(earlier, agent), there)
+            if view is not None:
+                return view.camera.rsplit("/", 1)[1], view if earlier == index else None, earlier
+        return there[0], None, None
+
+
+def draw_pair_in_camera(pair: Pair, agent: str, index: int, layers: Collection[Layer], ax: Axes) -> str:
+    """Render the part of an agent's image that has the pair, with tags; dashed if no camera of the agent sees them.
+
+    The frame is a number from 1. Returns the camera's short name, and how long ago it saw the pair if it does not now.
+    """
+    dataset, sample = pair.dataset, sample_token(pair.scenario, agent, index)
+    channel, view, last = pair.view(agent, index)
+    name = camera_name(channel)
+    camera = dataset.get("sample_data", f"{sample}/{channel}")
+    draw_camera(dataset, camera, {*layers}.intersection(CAMERA_LAYERS), ax)
+    ax.set_title("")
+    if view is None:
+        return name if last is None else f"{name}:\nseen {(index - last) * FRAME_PERIOD:.1f} s ago"
+    lens = camera_of(dataset, camera)
+    left, top, right, bottom = crop_about(view.bounds, width=lens.width, height=lens.height, share=_LEAST_CROP)
+    ax.set(xlim=(left, right), ylim=(bottom, top))
+    if "boxes" not in layers:
+        return name
+    both = pair.at(index, agent).transform(dataset.world_from(sample, channel).inverse(), channel)
+    hidden = both.select(~np.isin(both.actor_id, dataset.boxes(sample, visible="camera").actor_id))
+    draw_boxes_in_image(hidden, lens, ax, [COLLIDER_COLOR] * len(hidden), linestyle=_HIDDEN)
+    _write_tags_in_image(pair, both.actor_id.tolist(), bounds_in_image(both, lens), ax)
+    return name
+
+
+def draw_pair_from_above(pair: Pair, index: int, layers: Collection[Layer], ax: Axes) -> None:
+    """Render a frame (number from 1) around the place of contact, in world, as near as the pair allows.
+
+    The layers are `bev` (the road), `boxes`, `velocities`, `ids`, `trajectories` (of the pair, up to the contact) and
+    `grid`; the title is the pair's speeds.
+    """
+    dataset, contact = pair.dataset, pair.contact
+    sample = dataset.get("sample", sample_token(pair.scenario, agents_of(dataset, pair.scenario)[0], index))
+    boxes, both = pair.tracks.at(index), pair.at(index)
+    place = contact.point[:2]
+    reach = _MARGIN + float(np.abs(both.bottom_corners()[..., :2] - place).max(initial=0.0))
+    reach = min(max(reach, _LEAST), _MOST)
+    x, y = place.tolist()
+    ax.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal")
+    if "bev" in layers:
+        _draw_road(pair, index, reach, ax)
+    if "trajectories" in layers:
+        seconds, red = (_PAST, sample["time_to_impact"] or 0.0), [COLLIDER_COLOR] * len(both)
+        draw_trails(dataset, sample, both, red, target_from_world=SE3.identity(), seconds=seconds, ax=ax)
+    _write_tags_from_above(pair, both, ax)  # before the ids, which have what room is left
+    draw_actors_from_above(boxes, ax, role_colors(dataset, sample, boxes), layers)
+    ax.plot(x, y, "x", color="black", markersize=_CROSS, markeredgewidth=1.8, zorder=5)
+    keep_free(ax, [[place]], margin=(-_CROSS / 2, -_CROSS / 2, _CROSS / 2, _CROSS / 2))
+    _draw_scale(reach, ax, grid="grid" in layers)
+    speeds = [
+        f"{pair.tags[actor]} {number_words(float(np.linalg.norm(velocity)))}"
+        for actor, velocity in zip(both.actor_id.tolist(), both.velocity, strict=True)
+    ]
+    ax.set_title(f"{', '.join(speeds)} m/s", fontsize=SMALLEST_TEXT)
+
+
+def number_words(value: float) -> str:
+    """A number with one digit, or `unknown`."""
+    return f"{value:.1f}" if np.isfinite(value) else "unknown"
+
+
+def _draw_road(pair: Pair, index: int, reach: float, ax: Axes) -> None:
+    """Render the ground from the BEV camera that is nearest to the contact; nothing if there is no file."""
+    dataset, place = pair.dataset, pair.contact.point[:2]
+    samples = [sample_token(pair.scenario, agent, index) for agent in agents_of(dataset, pair.scenario)]
+    there = [sample for sample in samples if is_there(dataset, f"{sample}/{BEV_CAMERA}")]
+    poses = [dataset.world_from(sample, "ego") for sample in there]
+    away = [float(np.abs(pose.translation[:2] - place).max()) for pose in poses]
+    if there:
+        best = int(np.argmin(away))
+        image = dataset.load_bev(there[best])
+        draw_underlay(image, ax, target_from_ego=poses[best], view_range=reach + away[best])
+
+
+def _draw_scale(reach: float, ax: Axes, *, grid: bool) -> None:
+    """Render a bar of 5 or 10 m, and cells of that size, in place of numbers at the axes."""
+    from matplotlib.ticker import MultipleLocator
+
+    metres = 5.0 if reach < 1.25 * _LEAST else 10.0
+    if grid:
+        ax.grid(color=GRID_COLOR, linewidth=0.4)
+        ax.set_axisbelow(True)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MultipleLocator(metres))
+    ax.tick_params(labelbottom=False, labelleft=False, length=0)
+    left, low = (each + 0.1 * reach for each in ax.viewLim.min)
+    ax.plot([left, left + metres], [low, low], color="black", linewidth=2)
+    paper = {"facecolor": CASING_COLOR, "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+    ax.text(left, low + 0.06 * reach, f"{metres:.0f} m", fontsize=SMALLEST_TEXT, va="bottom", zorder=6, bbox=paper)
+    keep_free(ax, [[(left, low), (left + metres, low)]], margin=(-2, -2, 2, 2 * SMALLEST_TEXT))
+
+
+def _write_tags_in_image(pair: Pair, actors: list[int], bounds: FloatArray, ax: Axes) -> None:
+    """Write tags above what the panel shows of boxes with bounds (N, 4), pixels; of two, at their outer sides."""
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    cars = bounds.reshape(-1, 2, 2).clip((left, top), (right, bottom))
+    shown = np.flatnonzero((cars[:, 1] > cars[:, 0]).all(axis=1))
+    shown = shown[np.argsort(cars[shown, :, 0].mean(axis=1))]
+    cars = cars[shown]
+    places = np.column_stack([cars[..., 0].mean(axis=1), cars[:, 0, 1]])
+    if len(cars) > 1:
+        places[:, 0] = cars[0, 0, 0], cars[1, 1, 0]
+    free = top + (bottom - top) * min(0.5, _FREE * ax.figure.dpi / 72 / ax.bbox.height)
+    places[places[:, 1] < free, 1] = top
+    cars[..., 1] = cars[..., 1].clip(free)
+    _write_tags([pair.tags[actors[row]] for row in shown.tolist()], places, ax)
+    keep_free(ax, cars)
+
+
+def _write_tags_from_above(pair: Pair, both: Boxes, ax: Axes) -> None:
+    """Write tags beside boxes of the pair, each at the end that is away from the other."""
+    middle = both.center[:, :2].mean(axis=0) if len(both) > 1 else pair.contact.point[:2]
+    away = both.center[:, :2] - middle
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    ends = both.bottom_corners()[..., :2] - both.center[:, None, :2]
+    places = both.center[:, :2] + away * (ends @ away[..., None]).max(axis=1)
+    _write_tags([pair.tags[actor] for actor in both.actor_id.tolist()], places, ax)
+
+
+def _write_tags(tags: list[str], places: FloatArray, ax: Axes) -> None:
+    """Write tags near places (N, 2) or, if these are not in the panel, at its edge."""
+    low, high = np.array(ax.viewLim.min), np.array(ax.viewLim.max)
+    edge = _EDGE * (high - low)
+    places = places.clip(low + edge, high - edge)
+    place_chips(ax, zip(tags, places, strict=True), colors=[COLLIDER_COLOR] * len(tags))
 
 
 def _cut_words(contact: Contact, frames: int) -> str:

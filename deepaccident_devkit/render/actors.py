@@ -11,17 +11,23 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import LAYERS, Layer, axis_words, figure_or_new, layers_of, with_light_grid
-from deepaccident_devkit.render.best_view import BestView, best_view, crop_about
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
-from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_boxes_in_image, draw_trail, write_beside
-from deepaccident_devkit.render.camera import draw_image
+from deepaccident_devkit.render.boxes import (
+    camera_name,
+    draw_boxes_from_above,
+    draw_boxes_in_image,
+    draw_trail,
+    in_drawing_order,
+    recorders_of,
+    role_colors,
+    write_beside,
+)
+from deepaccident_devkit.render.camera import BestView, best_view, crop_about, draw_image
+from deepaccident_devkit.render.captions import set_scene_title, set_title
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
+from deepaccident_devkit.render.figures import LAYERS, Layer, axis_words, figure_or_new, layers_of, with_light_grid
 from deepaccident_devkit.render.ground import draw_underlay
-from deepaccident_devkit.render.roles import camera_name, in_drawing_order, recorders_of, role_colors
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title, set_title
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, OWN_ACTOR_ID, frame_timestamp, short_name

@@ -11,30 +11,38 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import concatenate
-from deepaccident_devkit.render.axes import Layer, axes_or_new, axis_words, check_view_range, layers_of
-from deepaccident_devkit.render.boxes import draw_actors_from_above, draw_trails, write_beside
-from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.colors import (
-    AGENT_COLORS,
-    CASING_COLOR,
-    COLLIDER_COLOR,
-    GRID_COLOR,
-    OWN_COLOR,
-    POINT_COLOR,
+from deepaccident_devkit.render.boxes import (
+    at_once,
+    collider_ids,
+    draw_actors_from_above,
+    draw_trails,
+    label_ids,
+    recorder_ids,
+    role_colors,
+    write_beside,
 )
-from deepaccident_devkit.render.ground import draw_town_map, draw_underlay, map_beneath
-from deepaccident_devkit.render.legends import (
+from deepaccident_devkit.render.captions import (
     absence_text,
     draw_legend,
     handles_from_above,
     has_cloud,
     is_there,
     missing_clouds_text,
+    set_scene_title,
     write_missing,
 )
-from deepaccident_devkit.render.roles import at_once, collider_ids, label_ids, recorder_ids, role_colors
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.chips import keep_free
+from deepaccident_devkit.render.figures import Layer, axes_or_new, axis_words, check_view_range, layers_of
+from deepaccident_devkit.render.ground import draw_town_map, draw_underlay, map_beneath
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    CASING_COLOR,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    OWN_COLOR,
+    POINT_COLOR,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame, short_name

@@ -1,21 +1,32 @@
-"""Rendering boxes, from above and in camera images, and the trails that they leave."""
+"""Rendering boxes, from above and in camera images, their trails, and the colours of their actors' roles."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, PinholeCamera
-from deepaccident_devkit.render.axes import Layer
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
-from deepaccident_devkit.render.colors import CASING_COLOR, CATEGORY_COLORS, CATEGORY_MARKERS, OWN_COLOR
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.figures import Layer
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    CASING_COLOR,
+    CATEGORY_COLORS,
+    CATEGORY_MARKERS,
+    COLLIDER_COLOR,
+    OWN_COLOR,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, OWN_ACTOR_ID, UNTRACKED_ID, AgentName, short_name
+from deepaccident_devkit.v2x import Contact
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
@@ -56,16 +67,10 @@ def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
 
 
 def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill: float = 0.25, **how: Any) -> None:
-    """Render boxes in their frame's x and y, metres, each with a line towards its front.
+    """Render boxes in x and y of their (level) frame, metres, each with a line towards its front, as opaque as `fill`.
 
-    Args:
-        boxes: in any frame that stands on the ground.
-        ax: axes to render on.
-        colors: one colour for each box.
-        fill: how opaque the inside is, from 0 to 1.
-        how: matplotlib's arguments for the outlines, such as `linestyle` or `linewidths`.
-
-    Pedestrians, cyclists and motorcycles also have their class's mark, which is not smaller in a large view.
+    Pedestrians, cyclists and motorcycles also have their class's mark, which is not smaller in a large view. `how` is
+    matplotlib's for the outlines, such as `linestyle`.
     """
     _draw_footprints(boxes.center[:, :2], boxes.bottom_corners()[..., :2], ax, colors, fill, how)
     _draw_small(boxes, ax, colors, filled=fill > 0)
@@ -103,19 +108,10 @@ def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers
 
 
 def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str], **how: Any) -> BoolArray:
-    """Render the edges of boxes given in the camera's optical frame, with a white casing, and fill their fronts.
+    """Render the edges of boxes (N) of the camera's optical frame, with a white casing, and fill their fronts.
 
-    What is not in front of the camera is cut off.
-
-    Args:
-        boxes: in the optical frame.
-        camera: whose image it is.
-        ax: axes to render on, in pixels.
-        colors: one colour for each box.
-        how: matplotlib's arguments for the edges, such as `linestyle`.
-
-    Returns:
-        Which boxes (N,) have a part in the image.
+    What is not in front of the camera is cut off. `how` is matplotlib's for the edges, such as `linestyle`. Returns
+    which boxes (N,) have a part in the image.
     """
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgba_array
@@ -191,10 +187,7 @@ def draw_velocities_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colo
 
 
 def segments_in_image(segments: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, BoolArray]:
-    """Line segments (S, 2, 3) of the optical frame as pixels (V, 2, 2), and which (S,) of them are in front of it.
-
-    Parts nearer than `NEAREST_DRAWN` are cut off.
-    """
+    """Segments (S, 2, 3) of the optical frame as pixels (V, 2, 2), cut off at `NEAREST_DRAWN`; which (S,) are left."""
     depth = segments[..., 2]
     drawn = np.asarray((depth >= NEAREST_DRAWN).any(axis=1))
     ends, depth = segments[drawn].copy(), depth[drawn]
@@ -253,14 +246,7 @@ def write_beside(ax: Axes, words: str, place: tuple[float, float], color: str) -
 
 
 def draw_trail(path: FloatArray, ax: Axes, color: str, **how: Any) -> LineCollection:
-    """Render a path (T, 2), metres, opaque at its first point and fading towards its last.
-
-    Args:
-        path: from the present on, or back.
-        ax: axes to render on.
-        color: of the line.
-        how: matplotlib's arguments for the line, such as `linewidths` or `linestyles`.
-    """
+    """Render a path (T, 2), metres, from the present on or back, opaque at first and fading towards its last point."""
     return _draw_trails([path], ax, [color], how)
 
 
@@ -274,16 +260,9 @@ def draw_trails(
     seconds: tuple[float, float],
     ax: Axes,
 ) -> None:
-    """Render where the actors of boxes were (thin) and will be (thick), by all agents' labels.
+    """Render where actors were (thin) and will be (thick) for seconds back and ahead, by all agents' labels.
 
-    Args:
-        dataset: the release.
-        sample: record of the present.
-        boxes: the actors; those without an id have no trail.
-        colors: one colour for each box.
-        target_from_world: transform into the frame of the axes.
-        seconds: how far back and how far ahead.
-        ax: axes to render on.
+    `sample` is the record of the present. Boxes without an id have no trail.
     """
     tracks = scenario_tracks(dataset, sample["scenario_token"])
     own = dataset.get("agent", sample["agent_token"])["actor_id"]
@@ -320,3 +299,79 @@ def _draw_trails(paths: Sequence[FloatArray], ax: Axes, colors: Sequence[str], h
     drawn = LineCollection(list(np.concatenate(lines)), colors=np.concatenate(shades), **style)
     ax.add_collection(drawn)
     return drawn
+
+
+def collider_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
+    """The label ids, in this sample, of the pair that meta says collided: −100 where the agent is one of them."""
+    record = dataset.get("sample", sample)
+    collision = dataset.get("scenario", record["scenario_token"])["collision"]
+    if collision is None:
+        return set()
+    agent_id = dataset.get("agent", record["agent_token"])["actor_id"]
+    return {OWN_ACTOR_ID if actor_id == agent_id else actor_id for actor_id in collision["ids"]}
+
+
+def recorder_ids(dataset: Dataset, sample: RowArgument) -> dict[int, AgentName]:
+    """The label ids, in this sample, of the recording vehicles → their agents: −100 is the sample's own."""
+    record = dataset.get("sample", sample)
+    recorders = recorders_of(dataset, record["scenario_token"])
+    return {OWN_ACTOR_ID if agent == record["agent"] else actor: agent for actor, agent in recorders.items()}
+
+
+def recorders_of(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
+    """The actor ids of a scenario's (a token's) recording vehicles, as far as meta names them → their agents."""
+    actors = {agent: dataset.agent.get(f"{scenario}/{agent}")["actor_id"] for agent in agents_of(dataset, scenario)}
+    return {actor: agent for agent, actor in actors.items() if actor is not None}
+
+
+def agent_letters(agent: str) -> str:
+    """An agent in one or two letters: E, EB, O, OB or I."""
+    return "".join(word[0] for word in short_name(agent).split()).upper()
+
+
+def actor_color(category: str, agent: str | None = None, *, collides: bool = False) -> str:
+    """The colour of an actor's box: red if it collides, else the hue of the agent that it is, else its category's."""
+    if collides:
+        return COLLIDER_COLOR
+    return CATEGORY_COLORS[category] if agent is None else AGENT_COLORS[agent]
+
+
+def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str]:
+    """The colours of boxes that are a sample's own (its agent has −100) or several agents' (it has CARLA's id)."""
+    record = dataset.get("sample", sample)
+    colliders, recorders = collider_ids(dataset, record), recorder_ids(dataset, record)
+    return [
+        actor_color(category, recorders.get(actor), collides=actor in colliders)
+        for actor, category in zip(label_ids(dataset, record, boxes), boxes.category_names, strict=True)
+    ]
+
+
+def label_ids(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[int]:
+    """The label ids, in this sample, of boxes that may have CARLA's: the agent itself is −100."""
+    own = dataset.get("agent", dataset.get("sample", sample)["agent_token"])["actor_id"]
+    return list(np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist())
+
+
+def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:
+    """Short names of the two that collide: the initials of agents, such as `E` and `OB`, else the category."""
+    agents = recorders_of(dataset, contact.frame.rsplit("/", 1)[0])
+    return {
+        actor: agent_letters(agents[actor]) if actor in agents else dataset.instance.get(instance)["category"]
+        for actor, instance in zip(contact.actor_ids, contact.instances, strict=True)
+    }
+
+
+def camera_name(channel: str) -> str:
+    """A camera's short name for pictures: `front`, `back left`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", channel.removeprefix("Camera_")).lower()
+
+
+def in_drawing_order(agents: Collection[str]) -> list[str]:
+    """Agents in the order of `taxonomy.AGENTS`, as in panels and legends."""
+    return sorted(agents, key=AGENTS.index)
+
+
+def at_once(sample: Mapping[str, Any], agent: str) -> str:
+    """The token of an agent's sample at the moment of another agent's sample, given by its record."""
+    scenario, _, number = sample["token"].rsplit("/", 2)
+    return sample_token(scenario, agent, int(number))

@@ -1,24 +1,27 @@
-"""A camera's image with boxes and LiDAR points; of other sensors, the matching view from above."""
+"""A camera's image with boxes and points, or another sensor's view from above; and which camera shows boxes best."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import MissingFileError
-from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import Layer, axes_or_new, layers_of
+from deepaccident_devkit.geometry import Boxes, PinholeCamera
+from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
+from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import (
+    bounds_in_image,
     draw_boxes_in_image,
     draw_ids_in_image,
     draw_velocities_in_image,
+    role_colors,
 )
-from deepaccident_devkit.render.colors import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP
-from deepaccident_devkit.render.legends import (
+from deepaccident_devkit.render.captions import (
     agent_handles,
     box_handles,
     draw_legend,
@@ -26,14 +29,15 @@ from deepaccident_devkit.render.legends import (
     has_cloud,
     is_there,
     missing_clouds_text,
+    moment_words,
+    set_scene_title,
     write_missing,
 )
-from deepaccident_devkit.render.roles import role_colors
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import moment_words, set_scene_title
-from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.render.figures import Layer, axes_or_new, layers_of
+from deepaccident_devkit.render.styles import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP, in_own_settings
+from deepaccident_devkit.support.arrays import FloatArray, as_floats
 from deepaccident_devkit.support.text import choice
-from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
 from deepaccident_devkit.v2x.poses import ImagePoints, camera_of
 
@@ -43,6 +47,9 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import SampleRecord
 
+_STEPS: Final = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 1, 3)
+_LATTICE: Final = ((1 + CORNER_SIGNS * _STEPS) / 2).prod(axis=2)
+"""(125, 8) weights of a box's corners, of points spread evenly over it."""
 CAMERA_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids", "velocities")
 CAMERA_DEFAULT: Final[tuple[Layer, ...]] = ("image", "boxes")
 ColorBy = Literal["depth", "height", "agent"]
@@ -101,10 +108,7 @@ def render_sample_data(
 
 
 def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Axes) -> frozenset[str]:
-    """Render a camera's panel of `render_sample_data`, and return the colours of the boxes in its image.
-
-    What is not there is named in its place.
-    """
+    """Render a camera's panel of `render_sample_data`; returns the colours of the boxes in its image."""
     sample = record["sample_token"]
     draw_image(dataset, record, ax, image="image" in layers)
     if "points" in layers and has_cloud(dataset, sample):
@@ -120,12 +124,6 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
     """Render a camera's image, or an empty place for it, in pixels of its calib, without ticks.
 
     If the image was not downloaded, its place is grey and says so. Every camera image of a picture is rendered here.
-
-    Args:
-        dataset: the release.
-        camera: record of its sensor file.
-        ax: axes to render on.
-        image: whether to render it.
     """
     lens = camera_of(dataset, camera)
     if image and not is_there(dataset, camera["token"]):
@@ -138,28 +136,14 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
 
 
 def draw_points_in_image(pixels: FloatArray, ax: Axes, *, size: float = 2.0, **colors: Any) -> PathCollection:
-    """Render points at pixels (P, 2) of an image.
-
-    Args:
-        pixels: as (u, v), only those in the image.
-        ax: axes to render on, in pixels.
-        size: of a point, in points².
-        colors: `color`, one for all; or `c`, a number for each point, with `cmap`, `vmin` and `vmax`.
-
-    Returns:
-        The rendered points, for a colour bar.
-    """
+    """Render points at pixels (P, 2), (u, v), of a size in points²: of one `color`, or by numbers `c` and a `cmap`."""
     return ax.scatter(pixels[:, 0], pixels[:, 1], s=size, linewidths=0, rasterized=True, **colors)
 
 
 def draw_camera_boxes(
     dataset: Dataset, camera: Any, boxes: Boxes, layers: Collection[Layer], ax: Axes
 ) -> frozenset[str]:
-    """Render the layers of boxes, given in the optical frame of a camera (a record), in its image.
-
-    Returns:
-        The colours of the rendered boxes that are in the image.
-    """
+    """Render layers of boxes of a camera's (a record's) optical frame; returns the colours of those in the image."""
     lens = camera_of(dataset, camera)
     boxes = boxes.select(np.argsort(-boxes.center[:, 2]))  # the nearest are on top
     colors = role_colors(dataset, camera["sample_token"], boxes)
@@ -258,3 +242,74 @@ def _draw_numbers(
     shown = shown[np.argsort(-points.depth[shown])]
     low, high = limits
     return draw_points_in_image(points.pixels[shown], ax, c=values[shown], cmap=colormap, vmin=low, vmax=high)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BestView:
+    """The image in which some boxes are largest, even if other things hide them.
+
+    Attributes:
+        camera: token of the image (sample data).
+        shown: sum of the shares of the boxes that are in the image, rounded to hundredths.
+        area: pixels² of the image that their bounds cover.
+        bounds: left, top, right and bottom of what is in the image of those boxes, pixels.
+    """
+
+    camera: str
+    shown: float
+    area: float
+    bounds: tuple[float, float, float, float]
+
+
+def best_view(
+    dataset: Dataset, samples: Iterable[str], boxes: Boxes, channels: Sequence[str] = CAMERAS
+) -> BestView | None:
+    """The view of boxes (any number, in world) that shows most of them, and of equal ones shows them largest.
+
+    The samples, by token, are those of the boxes' moment. A view whose image was not downloaded only counts if there
+    is no other. None if no camera has any part of a box in its image.
+    """
+    views = [_view(dataset, f"{sample}/{channel}", boxes) for sample in samples for channel in channels]
+    there = [view for view in views if view is not None]
+    return max(there, key=lambda view: (is_there(dataset, view.camera), view.shown, view.area), default=None)
+
+
+def _view(dataset: Dataset, camera: str, boxes: Boxes) -> BestView | None:
+    sample, channel = camera.rsplit("/", 1)
+    lens = camera_of(dataset, camera)
+    optical = boxes.transform(dataset.world_from(sample, channel).inverse(), channel)
+    shown = _shares_in_image(optical, lens)
+    seen = shown > 0
+    if not seen.any():
+        return None
+    bounds = bounds_in_image(optical.select(seen), lens)
+    (left, top), (right, bottom) = bounds[:, :2].min(axis=0).tolist(), bounds[:, 2:].max(axis=0).tolist()
+    return BestView(
+        camera=camera,
+        shown=round(float(shown.sum()), 2),
+        area=float((bounds[:, 2:] - bounds[:, :2]).prod(axis=1).sum()),
+        bounds=(left, top, right, bottom),
+    )
+
+
+def _shares_in_image(optical: Boxes, lens: PinholeCamera) -> FloatArray:
+    """Which share (N,) of the volume of each box of the camera's frame is in its image."""
+    points = _LATTICE @ optical.corners()
+    pixels, depth = lens.project(points.reshape(-1, 3))
+    inside = lens.in_image(pixels, depth, min_depth=IN_FRONT_DEPTH)
+    return as_floats(inside.reshape(points.shape[:2]).mean(axis=1))
+
+
+def crop_about(
+    bounds: tuple[float, float, float, float], *, width: int, height: int, share: float = 0.25
+) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of the part of an image, of the image's shape, that has the bounds in its middle.
+
+    If possible it is twice as wide and high as the bounds (pixels), and at least a `share` of the image.
+    """
+    left, top, right, bottom = bounds
+    scale = min(1.0, max(share, 2 * (right - left) / width, 2 * (bottom - top) / height))
+    half = scale * width / 2, scale * height / 2
+    u = min(max((left + right) / 2, half[0]), width - half[0])
+    v = min(max((top + bottom) / 2, half[1]), height - half[1])
+    return u - half[0], v - half[1], u + half[0], v + half[1]

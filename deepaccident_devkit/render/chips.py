@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.render.colors import CASING_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
+from deepaccident_devkit.render.styles import CASING_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -37,17 +37,12 @@ def place_chips(
     colors: Sequence[str] | None = None,
     avoid: ArrayLike | None = None,
 ) -> None:
-    """Write words near places, dark on white chips, where nothing of importance is covered.
+    """Write words near places (x, y) in data coordinates, dark on white chips, where nothing of importance is covered.
 
     The chips find their places when the figure is rendered, so they fit its final size; a thin line leads to a chip
     that is farther away. A chip whose place is not shown, or that finds no room, is left out: give the important ones
-    first. Several calls on the same axes know of each other.
-
-    Args:
-        ax: axes to write on.
-        chips: words and their places (x, y) in data coordinates.
-        colors: of the chips' edges, one for each; grey by default.
-        avoid: as in `keep_free`.
+    first. Several calls on the same axes know of each other. `colors` are those of the edges, grey by default; shapes
+    to `avoid` are as in `keep_free`.
     """
     placer = _placer(ax)
     if avoid is not None:
@@ -79,12 +74,9 @@ def place_chips(
 
 
 def keep_free(ax: Axes, shapes: ArrayLike, *, margin: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)) -> None:
-    """Let no chip cover shapes.
+    """Let no chip cover shapes (N, corners, 2) in data coordinates, and a margin around them.
 
-    Args:
-        ax: axes of the chips.
-        shapes: (N, corners, 2) in data coordinates.
-        margin: points to add to a shape's left, low, right and high side: to the left and down they are negative.
+    The margin is points added to a shape's left, low, right and high side: to the left and down they are negative.
     """
     corners = np.asarray(shapes, dtype=np.float64)
     if corners.size:

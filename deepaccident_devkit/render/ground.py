@@ -13,9 +13,8 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps import GROUND_CLASSES, TownMap, kept_town_map, town_map
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
-from deepaccident_devkit.render.axes import axes_or_new, axis_words
-from deepaccident_devkit.render.colors import BEV_COLORS
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.figures import axes_or_new, axis_words
+from deepaccident_devkit.render.styles import BEV_COLORS, in_own_settings
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 
 if TYPE_CHECKING:

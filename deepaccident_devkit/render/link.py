@@ -11,14 +11,19 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import Layer, check_view_range, figure_or_new, layers_of, settled, with_light_grid
 from deepaccident_devkit.render.bev import BevView, draw_bev, link_words
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above
+from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.colors import AGENT_COLORS, MUTED_COLOR, OWN_COLOR, TRUE_PLACE_COLOR
-from deepaccident_devkit.render.legends import draw_legend
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.figures import (
+    Layer,
+    check_view_range,
+    figure_or_new,
+    layers_of,
+    settled,
+    with_light_grid,
+)
+from deepaccident_devkit.render.styles import AGENT_COLORS, MUTED_COLOR, OWN_COLOR, TRUE_PLACE_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import UNTRACKED_ID, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes

@@ -9,7 +9,9 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, PostProcessing, motion_labels
-from deepaccident_devkit.render.axes import Layer, axes_or_new, figure_or_new, layers_of, settled
+from deepaccident_devkit.render.boxes import collider_ids, recorder_ids
+from deepaccident_devkit.render.captions import set_scene_title
+from deepaccident_devkit.render.figures import Layer, axes_or_new, figure_or_new, layers_of, settled
 from deepaccident_devkit.render.motion_maps import (
     MAPS,
     DrawnMap,
@@ -20,9 +22,7 @@ from deepaccident_devkit.render.motion_maps import (
     maps_of_labels,
     maps_of_output,
 )
-from deepaccident_devkit.render.roles import collider_ids, recorder_ids
 from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.support.text import choice
 
 if TYPE_CHECKING:

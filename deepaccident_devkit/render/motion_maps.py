@@ -14,9 +14,9 @@ from deepaccident_devkit.evaluation.trajectories import instance_paths
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import to_orientation
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionHeads, MotionLabels, PostProcessing, predict_instances
-from deepaccident_devkit.render.axes import Layer, with_light_grid
 from deepaccident_devkit.render.chips import place_chips
-from deepaccident_devkit.render.colors import (
+from deepaccident_devkit.render.figures import Layer, with_light_grid
+from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     BEYOND_COLOR,
     CENTERNESS_COLORMAP,
@@ -129,18 +129,7 @@ def maps_of_output(
     marked: Collection[int] = (),
     post_processing: PostProcessing | str = "motion",
 ) -> MotionMaps:
-    """One prediction as it is rendered.
-
-    Args:
-        output: a model's output.
-        number: which of its predictions; the last is the mean, in the released order.
-        step: seconds from frame to frame.
-        marked: ids of instances that are red.
-        post_processing: how instances are found in heads.
-
-    Raises:
-        ChoiceError: no such prediction, or no such post-processing.
-    """
+    """One prediction of an output, by default the last, with `step` seconds from frame to frame. Raises ChoiceError."""
     if number not in range(-len(output), len(output)):
         raise ChoiceError(f"prediction: expected a number from 0 to {len(output) - 1}, or from the end, found {number}")
     grid, heads = output.grid.with_orientation("devkit"), None if output.heads is None else output.heads[number]

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Final
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.axes import axis_words, detached_figure, with_light_grid
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
-from deepaccident_devkit.render.colors import CATEGORY_COLORS, HEIGHT_COLORMAP
+from deepaccident_devkit.render.figures import axis_words, detached_figure, with_light_grid
 from deepaccident_devkit.render.motion import draw_motion_trail
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.styles import CATEGORY_COLORS, HEIGHT_COLORMAP, in_own_settings
 from deepaccident_devkit.taxonomy import CAMERAS
 
 if TYPE_CHECKING:
@@ -30,11 +29,7 @@ _LEVEL_FROM_OPTICAL: Final = SE3.from_rotation([[0, 0, 1], [-1, 0, 0], [0, -1, 0
 
 @in_own_settings
 def png_of(thing: object) -> bytes:
-    """A small picture as PNG.
-
-    Raises:
-        ChoiceError: `thing` is something else, or empty.
-    """
+    """A small picture as PNG; raises ChoiceError for other things, and for what is empty."""
     figure = detached_figure(_INCHES)
     ax = figure.add_subplot()
     _draw(thing, ax)

@@ -10,18 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.axes import detached_figure, figure_or_new, with_light_grid
+from deepaccident_devkit.render.captions import draw_legend
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import (
+from deepaccident_devkit.render.figures import detached_figure, figure_or_new, with_light_grid, write_figure
+from deepaccident_devkit.render.styles import (
     CATEGORY_COLORS,
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
     GRID_COLOR,
     SPLIT_COLORS,
+    in_own_settings,
 )
-from deepaccident_devkit.render.legends import draw_legend
-from deepaccident_devkit.render.pictures import write_figure
-from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.statistics import (
     GROUPS,
     PROBABILITIES,
@@ -48,15 +47,7 @@ _WIDTH: Final = 10.7
 
 
 def draw_counts(table: CountTable, ax: Axes) -> Axes:
-    """Render a table of counts as horizontal bars, the splits one after the other, each with its sum and share.
-
-    Args:
-        table: of `DatasetStatistics.counts`.
-        ax: axes to render on.
-
-    Returns:
-        The axes.
-    """
+    """Render a table of counts as horizontal bars, the splits one after the other, each with its sum and share."""
     values, whole = list(table.counts), table.total()
     starts = [0] * len(values)
     for group in GROUPS[1:]:
@@ -77,15 +68,7 @@ def draw_counts(table: CountTable, ax: Axes) -> Axes:
 
 
 def draw_histogram(histogram: Histogram, ax: Axes) -> Axes:
-    """Render a histogram as bars, the splits on top of each other.
-
-    Args:
-        histogram: of `DatasetStatistics.histograms`.
-        ax: axes to render on.
-
-    Returns:
-        The axes; its title says how many values lie outside of the bins.
-    """
+    """Render a histogram as bars, the splits on top of each other; the title says how many values lie outside."""
     widths = [high - low for low, high in pairwise(histogram.edges)]
     _draw_stacked(histogram, ax, histogram.edges[:-1], widths, align="edge")
     unit = "" if histogram.unit == histogram.field else f" ({histogram.unit})"
@@ -97,16 +80,7 @@ def draw_histogram(histogram: Histogram, ax: Axes) -> Axes:
 
 
 def draw_quantiles(table: QuantileTable, field: str, ax: Axes) -> Axes:
-    """Render a number's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %.
-
-    Args:
-        table: of `DatasetStatistics.quantiles`.
-        field: which of its numbers.
-        ax: axes to render on.
-
-    Returns:
-        The axes.
-    """
+    """Render a field's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %."""
     rows = [row for row in table.quantiles if row.field == field and row.group == GROUPS[0] and row.values]
     draw_quantile_boxes({row.category: row for row in rows}, ax)
     ax.set(ylabel=f"{field} ({table.unit})", title=f"{field.capitalize()} by category", ylim=(0, None))
@@ -115,18 +89,7 @@ def draw_quantiles(table: QuantileTable, field: str, ax: Axes) -> Axes:
 
 
 def draw_angles(histogram: Histogram, ax: Axes) -> Axes:
-    """Render a histogram of angles around a circle: 0° up, counter-clockwise.
-
-    Args:
-        histogram: in degrees.
-        ax: polar axes to render on.
-
-    Returns:
-        The axes.
-
-    Raises:
-        ChoiceError: the axes are not polar.
-    """
+    """Render a histogram of degrees around a circle: 0° up, counter-clockwise. Raises ChoiceError: not polar."""
     from matplotlib.projections.polar import PolarAxes
 
     if not isinstance(ax, PolarAxes):
@@ -150,15 +113,7 @@ def draw_angles(histogram: Histogram, ax: Axes) -> Axes:
 
 
 def draw_relative_positions(pairs: Sequence[CollisionPair], ax: Axes) -> Axes:
-    """Render where the other actor of each colliding pair was at the last frame, seen from the first, forward up.
-
-    Args:
-        pairs: `DatasetStatistics.collisions`.
-        ax: axes to render on.
-
-    Returns:
-        The axes, in metres from the centre of the first: its forward up, its left to the left.
-    """
+    """Render where the other actor of each colliding pair was at the end, seen from the first, forward up (m)."""
     from matplotlib.patches import Rectangle
 
     for category in CATEGORIES:
@@ -304,19 +259,7 @@ STATISTICS_FIGURES: Final[Mapping[str, tuple[float, float]]] = {group: size for 
 
 @in_own_settings
 def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure | None = None) -> Figure:
-    """Render one group of statistics, coloured by split.
-
-    Args:
-        statistics: of `dataset_statistics`.
-        group: one of `STATISTICS_FIGURES`.
-        fig: an empty figure to render on; a new one if None.
-
-    Returns:
-        The figure.
-
-    Raises:
-        ChoiceError: no such group.
-    """
+    """Render one group of `STATISTICS_FIGURES`, coloured by split. Raises ChoiceError: no such group."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     size, draw = _FIGURES[choice("group", group, _FIGURES)]
@@ -336,17 +279,9 @@ def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure 
 
 
 def save_statistics(statistics: DatasetStatistics, folder: str | os.PathLike[str]) -> list[Path]:
-    """Render each group of statistics into `<group>.png` and `<group>.pdf`, atomically; earlier files are replaced.
+    """Render each group into `<group>.png` and `<group>.pdf`, atomically; returns the paths; older files are replaced.
 
-    Args:
-        statistics: of `dataset_statistics`.
-        folder: where; it is made if it is not there.
-
-    Returns:
-        The files' paths.
-
-    Raises:
-        ConfigError: `folder` cannot be written to, or is a file.
+    The folder is made if it is not there. Raises ConfigError: it cannot be written to, or is a file.
     """
     folder, paths = writable_folder(folder), []
     for group, (size, _) in _FIGURES.items():

@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
-from deepaccident_devkit.render.colors import MUTED_COLOR, OWN_COLOR, PREDICTED_COLOR
-from deepaccident_devkit.render.pictures import write_figure
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.figures import (
+    axes_or_new,
+    detached_figure,
+    figure_or_new,
+    with_light_grid,
+    write_figure,
+)
+from deepaccident_devkit.render.styles import MUTED_COLOR, OWN_COLOR, PREDICTED_COLOR, in_own_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,17 +30,7 @@ _MEANS: Final = 60
 
 @in_own_settings
 def render_curve(steps: Sequence[int], values: Sequence[float], title: str, *, ax: Axes | None = None) -> Axes:
-    """Render one number by step: each value as a dot, and means of groups of steps as a line.
-
-    Args:
-        steps: of the optimizer, ascending.
-        values: one a step.
-        title: what the number is.
-        ax: axes to render on; new ones if None.
-
-    Returns:
-        The axes.
-    """
+    """Render one number by the optimizer's step: each value as a dot, and means of groups of steps as a line."""
     ax = axes_or_new(ax, _PANEL)
     crowded = len(values) > _MEANS
     ax.plot(steps, values, ".", color=MUTED_COLOR if crowded else PREDICTED_COLOR, markersize=2 if crowded else 6)
@@ -49,16 +43,7 @@ def render_curve(steps: Sequence[int], values: Sequence[float], title: str, *, a
 
 @in_own_settings
 def render_training(rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figure | None = None) -> Figure:
-    """Render the curves of a run.
-
-    Args:
-        rows: of its log, each with a `step` and numbers by name, or for a validation `validation`, numbers by name.
-        title: of the figure.
-        fig: an empty figure to render on; a new one if None.
-
-    Returns:
-        The figure.
-    """
+    """Render the curves of a run by the rows of its log: a `step`, and numbers by name, also below `validation`."""
     curves = _curves(rows)
     fig = figure_or_new(fig, _size(len(curves)))
     axes = fig.subplots(_lines(len(curves)), _COLUMNS, squeeze=False).ravel()

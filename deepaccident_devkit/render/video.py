@@ -16,20 +16,18 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
 from deepaccident_devkit.parallel import Engine, Places, in_order, run_unordered
-from deepaccident_devkit.render.accident import draw_countdown
-from deepaccident_devkit.render.axes import LAYERS, Layer, layers_of
+from deepaccident_devkit.render.accident import PAIR_LAYERS, draw_countdown
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
-from deepaccident_devkit.render.moments import (
+from deepaccident_devkit.render.figures import LAYERS, Layer, figure_of_pixels, layers_of
+from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
+from deepaccident_devkit.render.samples import (
     CALIBRATION_LAYERS,
     MOMENT_LAYERS,
     draw_shared_moment,
     render_calibration,
     render_sample,
 )
-from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
-from deepaccident_devkit.render.pair import PAIR_LAYERS
-from deepaccident_devkit.render.pictures import figure_of_pixels
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
 from deepaccident_devkit.support.arrays import ByteArray
@@ -86,12 +84,9 @@ def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
 
 
 def write_video(path: Path, pictures: Iterable[ByteArray], *, fps: float) -> None:
-    """Write pictures, one after the other, as the video that the path's suffix says, atomically.
+    """Write pictures, (H, W, 3) uint8 RGB of one size, as the video that the path's suffix says, atomically.
 
-    Args:
-        path: of one of `SUFFIXES`; a file that is there is replaced.
-        pictures: (H, W, 3) uint8, RGB, all of one size, H and W even for MP4; at least one.
-        fps: pictures a second.
+    H and W are even for MP4; there is at least one picture.
     """
     with replacing(path) as temporary:
         SUFFIXES[path.suffix.lower()](temporary, pictures, fps)

@@ -10,7 +10,24 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import (
+from deepaccident_devkit.render.bev import draw_points_from_above
+from deepaccident_devkit.render.boxes import (
+    draw_boxes_from_above,
+    draw_ids_from_above,
+    draw_velocities_from_above,
+    in_drawing_order,
+    role_colors,
+)
+from deepaccident_devkit.render.captions import (
+    agent_handles,
+    draw_legend,
+    has_cloud,
+    missing_clouds_text,
+    set_scene_title,
+    write_missing,
+)
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
+from deepaccident_devkit.render.figures import (
     Layer,
     axes_or_new,
     axis_words,
@@ -19,14 +36,14 @@ from deepaccident_devkit.render.axes import (
     settled,
     with_light_grid,
 )
-from deepaccident_devkit.render.bev import draw_points_from_above
-from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, draw_velocities_from_above
-from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
-from deepaccident_devkit.render.legends import agent_handles, draw_legend, has_cloud, missing_clouds_text, write_missing
-from deepaccident_devkit.render.roles import in_drawing_order, role_colors
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    MUTED_COLOR,
+    OWN_COLOR,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import sample_token
@@ -61,7 +78,7 @@ _BRIGHT: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sights(FrozenArrays):
+class Visibility(FrozenArrays):
     """N tracked actors of a moment and the A agents that may see them; arrays are read-only.
 
     Attributes:
@@ -117,19 +134,11 @@ class Sights(FrozenArrays):
         return np.asarray((self.collides | self.records) & ~self.seen[:, column] & ~self.own[:, column])
 
 
-def sights(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: str = "ego") -> Sights:
-    """Which of some agents see which of the actors that any agent annotated.
+def visibility_of(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: str = "ego") -> Visibility:
+    """Which of some agents see which of the actors that any agent annotated, in a coordinate frame of the sample.
 
-    Args:
-        dataset: the release.
-        moment: token or record of a sample, or of a frame: then its first agent's sample is taken.
-        agents: the agents that look, as `visible_instances` takes them; None for all that are there.
-        frame: coordinate frame of the result, of the sample.
-
-    Raises:
-        TokenError: no such sample or frame.
-        ChoiceError: no such agent, configuration or frame.
-        NotAvailableError: an agent is not in this (partial) release.
+    The moment is a sample, or a frame: then its first agent's sample is taken. Agents are as `visible_instances` takes
+    them; its errors are raised.
     """
     sample = sample_at(dataset, moment)
     scenario, _, number = sample.rsplit("/", 2)
@@ -150,7 +159,7 @@ def sights(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: 
         place[column] = (frame_from_world @ dataset.world_from(own, "ego")).translation[:2]
     collision = dataset.get("scenario", scenario)["collision"]
     actors = (dataset.agent.get(f"{scenario}/{agent}")["actor_id"] for agent in looking)
-    return Sights(
+    return Visibility(
         sample=sample,
         agents=tuple(looking),
         boxes=boxes,
@@ -210,7 +219,7 @@ def render_visibility(
     frame = choice("frame", frame, get_args(Frame))
     if view_range is not None:
         check_view_range(view_range)
-    known = sights(dataset, moment, agents, frame)
+    known = visibility_of(dataset, moment, agents, frame)
     own_figure, ax = ax is None, axes_or_new(ax, (6, 6.9))
     low, high = _view(known, view_range)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
@@ -267,7 +276,7 @@ def render_visibility_matrix(
         ChoiceError: no such agent or configuration.
         NotAvailableError: an agent is not in this (partial) release.
     """
-    known = sights(dataset, moment, agents)
+    known = visibility_of(dataset, moment, agents)
     rows = np.lexsort((known.boxes.actor_id, -known.seen.sum(axis=1), ~known.records, ~known.collides))
     shown = rows[:_MOST_ROWS]
     columns = in_drawing_order(known.agents)
@@ -293,7 +302,7 @@ def render_visibility_matrix(
     return ax
 
 
-def _view(known: Sights, view_range: float | None) -> tuple[FloatArray, FloatArray]:
+def _view(known: Visibility, view_range: float | None) -> tuple[FloatArray, FloatArray]:
     """The lower left and the upper right corner, (2,) each, of the square that is shown."""
     if view_range is not None:
         column = known.agents.index(known.ego) if known.ego in known.agents else 0
@@ -313,7 +322,7 @@ def _square_about(places: FloatArray, margin: float) -> tuple[FloatArray, float]
     return (low + high) / 2, max(_LEAST, float((high - low).max()) / 2 + margin)
 
 
-def _draw_points(dataset: Dataset, known: Sights, frame: str, ax: Axes) -> None:
+def _draw_points(dataset: Dataset, known: Visibility, frame: str, ax: Axes) -> None:
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
     middle, half = np.array([left + right, low + high]) / 2, (right - left) / 2
     scenario, _, number = known.sample.rsplit("/", 2)
@@ -326,7 +335,7 @@ def _draw_points(dataset: Dataset, known: Sights, frame: str, ax: Axes) -> None:
         draw_points_from_above(cloud.xyz, ax, center=middle, view_range=half, color=AGENT_COLORS[agent])
 
 
-def _draw_sight_lines(known: Sights, ax: Axes) -> None:
+def _draw_sight_lines(known: Visibility, ax: Axes) -> None:
     from matplotlib.collections import LineCollection
 
     row, column = np.nonzero(known.seen & known.collides[:, None])
@@ -338,7 +347,7 @@ def _draw_sight_lines(known: Sights, ax: Axes) -> None:
     ax.add_collection(LineCollection(list(lines), colors=colors, linewidths=1.2, alpha=0.8, zorder=2))
 
 
-def _draw_dots(known: Sights, ax: Axes) -> None:
+def _draw_dots(known: Visibility, ax: Axes) -> None:
     from matplotlib.transforms import ScaledTranslation
 
     order = in_drawing_order(known.agents)
@@ -362,7 +371,7 @@ def _draw_dots(known: Sights, ax: Axes) -> None:
         )
 
 
-def _write_hidden(known: Sights, hidden: BoolArray, ax: Axes) -> None:
+def _write_hidden(known: Visibility, hidden: BoolArray, ax: Axes) -> None:
     chips = [
         (f"{short_name(known.ego)} cannot see", known.boxes.center[row, :2].tolist())
         for row in np.flatnonzero(hidden & known.collides).tolist()
@@ -370,7 +379,7 @@ def _write_hidden(known: Sights, hidden: BoolArray, ax: Axes) -> None:
     place_chips(ax, chips, colors=[COLLIDER_COLOR] * len(chips))
 
 
-def _draw_agents(known: Sights, ax: Axes) -> None:
+def _draw_agents(known: Visibility, ax: Axes) -> None:
     for agent, (x, y) in zip(known.agents, known.place.tolist(), strict=True):
         ax.plot(x, y, "*", color=AGENT_COLORS[agent], markeredgecolor="white", markersize=10, zorder=5)
     if known.ego in known.agents:
@@ -378,7 +387,7 @@ def _draw_agents(known: Sights, ax: Axes) -> None:
         ax.plot(x, y, "o", markersize=15, fillstyle="none", color=AGENT_COLORS[known.ego], zorder=5)
 
 
-def _draw_legend(known: Sights, hidden: BoolArray, shown: Collection[Layer], ax: Axes) -> None:
+def _draw_legend(known: Visibility, hidden: BoolArray, shown: Collection[Layer], ax: Axes) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -397,7 +406,7 @@ def _draw_legend(known: Sights, hidden: BoolArray, shown: Collection[Layer], ax:
     draw_legend(ax, handles, columns=4, title="dots above an actor: who sees it", title_fontsize=SMALLEST_TEXT, **place)
 
 
-def _draw_column(known: Sights, rows: IntArray, agent: str, column: int, ax: Axes) -> None:
+def _draw_column(known: Visibility, rows: IntArray, agent: str, column: int, ax: Axes) -> None:
     from matplotlib.patches import Rectangle
 
     source = known.agents.index(agent)

@@ -105,16 +105,7 @@ def keyword_filter(name: str, value: FilterValue) -> Filter:
 
 
 def condition_of(wanted: Filter, field: Field, here: Iterable[Value]) -> Condition:
-    """Check a filter's values against its field.
-
-    Args:
-        wanted: the filter.
-        field: the field that it names.
-        here: the values that the field has in this release, which are always possible.
-
-    Raises:
-        ChoiceError: a value that the field cannot have.
-    """
+    """Check a filter against its field, whose values in this release are always possible; raises ChoiceError."""
     possible = list(dict.fromkeys([*field.known, *sorted({str(value) for value in here if value is not None})]))
     singles: set[Value] = set()
     ranges = []

@@ -17,19 +17,17 @@ from deepaccident_devkit.statistics.results import (
     CRITICAL,
     ENDS,
     GROUPS,
-    NO_ACCIDENT,
-    NO_DESIGN,
     PROBABILITIES,
     TOTAL,
     UNKNOWN,
-    WITH_OTHER,
-    WITH_PEDESTRIAN,
     CollisionPair,
     CountTable,
     Histogram,
     LeftOut,
     QuantileRow,
     QuantileTable,
+    scenario_end,
+    word_of,
 )
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, OWN_ACTOR_ID, STATIC_ACTOR_ID
@@ -38,7 +36,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from deepaccident_devkit.parallel import Engine
-    from deepaccident_devkit.tables.records import AgentRecord, CollisionRecord, ScenarioRecord
+    from deepaccident_devkit.tables.records import AgentRecord, ScenarioRecord
 
 Chosen = RowArgument | Iterable[RowArgument] | None
 """Tokens or records of scenarios, or a single one; None for all."""
@@ -240,7 +238,7 @@ def _scenario_counts(chosen: _Chosen) -> list[CountTable]:
     frames = np.array([scenario["num_frames"] for scenario in records], dtype=np.int64)
     for name, (title, field, known, counted) in _OF_SCENARIOS.items():
         words = [
-            (chosen.ends[scenario["token"]] if field == "end" else _word(scenario, field)) or UNKNOWN
+            (chosen.ends[scenario["token"]] if field == "end" else word_of(scenario, field)) or UNKNOWN
             for scenario in records
         ]
         others = sorted(set(words) - {*known, UNKNOWN})
@@ -422,10 +420,7 @@ def _interactions(chosen: _Chosen, **how: Unpack[Engine]) -> list[Histogram]:
 
 
 def _collisions(chosen: _Chosen) -> tuple[tuple[CollisionPair, ...], list[Histogram]]:
-    """The pairs at the last recorded frame by the merged tracks, and how they meet; those without tracks are left out.
-
-    Meta may name one actor twice: that is no pair.
-    """
+    """The labelled pairs at the last frame and how they meet; one actor that meta names twice is no pair."""
     tracks, pairs, without = _tracks_at_the_end(chosen), [], []
     for row, scenario in chosen.scenarios.items():
         if scenario["collision"] is None:
@@ -500,45 +495,3 @@ def _in_agents_order(ids: Sequence[int], names: Mapping[int | None, str]) -> lis
     """A pair's actor ids, agents first and in the order of `AGENTS`, else as they are."""
     ranks: dict[str | None, int] = {name: rank for rank, name in enumerate(AGENTS)}
     return sorted(ids, key=lambda actor: ranks.get(names.get(actor), len(AGENTS)))
-
-
-def scenario_end(scenario: ScenarioRecord, agents: Sequence[AgentRecord]) -> str | None:
-    """How a scenario ended, one of `ENDS`; None without meta, or where meta is silent on agents or roads.
-
-    Args:
-        scenario: the record.
-        agents: the records of its agents that are in this release.
-    """
-    collision = scenario["collision"]
-    if scenario["weather"] is None:  # there is no meta
-        return None
-    if collision is None:
-        return NO_ACCIDENT
-    if "pedestrian" in collision["classes"]:
-        return WITH_PEDESTRIAN
-    if scenario["accident_type"] is not None:
-        return f"design {scenario['accident_type']}"
-    return _undesigned_end(scenario, collision, agents)
-
-
-def _undesigned_end(scenario: ScenarioRecord, collision: CollisionRecord, agents: Sequence[AgentRecord]) -> str | None:
-    """Of a collision that realises no design: whether its pair are agents; None where meta is silent."""
-    here = {agent["name"]: agent["actor_id"] for agent in agents if not agent["is_infrastructure"]}
-    names = collision["agents"] or (None, None)
-    missing = set(taxonomy.VEHICLE_AGENTS) - set(here)  # of a partial download: meta's names stand for their ids
-    if None in here.values() or (missing and collision["agents"] is None):
-        return None
-    known = [actor in here.values() or name in missing for actor, name in zip(collision["ids"], names, strict=True)]
-    if not all(known):
-        return WITH_OTHER
-    story = ("road_type", "spawn_side", "ego_direction", "other_direction")
-    return None if None in [scenario[word] for word in story] else NO_DESIGN  # type: ignore[literal-required]
-
-
-def _word(scenario: ScenarioRecord, field: str) -> str | None:
-    """What a scenario counts as in tables of a field of its record."""
-    if field != "collision":
-        return scenario[field]  # type: ignore[literal-required,no-any-return]
-    if scenario["weather"] is None:  # there is no meta
-        return None
-    return "yes" if scenario["collision"] else "no"

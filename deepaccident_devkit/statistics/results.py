@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.taxonomy import SPLITS
+from deepaccident_devkit.taxonomy import SPLITS, VEHICLE_AGENTS
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.tables.records import AgentRecord, CollisionRecord, ScenarioRecord
 
 TOTAL: Final = "total"
 UNKNOWN: Final = "unknown"
@@ -222,3 +225,40 @@ def collision_rows(pairs: tuple[CollisionPair, ...]) -> list[Row]:
 
 
 Table = CountTable | Histogram | QuantileTable
+
+
+def scenario_end(scenario: ScenarioRecord, agents: Sequence[AgentRecord]) -> str | None:
+    """How a scenario ended, one of `ENDS`, by it and its agents here; None without meta, or where meta is silent."""
+    collision = scenario["collision"]
+    if scenario["weather"] is None:  # there is no meta
+        return None
+    if collision is None:
+        return NO_ACCIDENT
+    if "pedestrian" in collision["classes"]:
+        return WITH_PEDESTRIAN
+    if scenario["accident_type"] is not None:
+        return f"design {scenario['accident_type']}"
+    return _undesigned_end(scenario, collision, agents)
+
+
+def _undesigned_end(scenario: ScenarioRecord, collision: CollisionRecord, agents: Sequence[AgentRecord]) -> str | None:
+    """Of a collision that realises no design: whether its pair are agents; None where meta is silent."""
+    here = {agent["name"]: agent["actor_id"] for agent in agents if not agent["is_infrastructure"]}
+    names = collision["agents"] or (None, None)
+    missing = set(VEHICLE_AGENTS) - set(here)  # of a partial download: meta's names stand for their ids
+    if None in here.values() or (missing and collision["agents"] is None):
+        return None
+    known = [actor in here.values() or name in missing for actor, name in zip(collision["ids"], names, strict=True)]
+    if not all(known):
+        return WITH_OTHER
+    story = ("road_type", "spawn_side", "ego_direction", "other_direction")
+    return None if None in [scenario[word] for word in story] else NO_DESIGN  # type: ignore[literal-required]
+
+
+def word_of(scenario: ScenarioRecord, field: str) -> str | None:
+    """What a scenario counts as in tables of a field of its record."""
+    if field != "collision":
+        return scenario[field]  # type: ignore[literal-required,no-any-return]
+    if scenario["weather"] is None:  # there is no meta
+        return None
+    return "yes" if scenario["collision"] else "no"

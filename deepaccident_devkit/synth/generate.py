@@ -22,9 +22,8 @@ from deepaccident_devkit.support.files import is_writable_folder, place_in, remo
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import path_of
-from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios, plan_splits
-from deepaccident_devkit.synth.recording import RecordingJob, forget_scenario, parts_of, record_scenario
+from deepaccident_devkit.synth.plan import ScenarioPlan, SynthConfig, plan_scenarios, plan_splits
+from deepaccident_devkit.synth.scenario import RecordingJob, forget_scenario, parts_of, record_scenario
 from deepaccident_devkit.synth.sensors.caster import require_embree
 
 if TYPE_CHECKING:
@@ -95,16 +94,9 @@ class Unfinished:
 def unfinished_release(unfinished: Unfinished, config: SynthConfig) -> Iterator[Callable[[], bool]]:
     """Work on a release in the block; if nothing of it is made at the end, nothing is left.
 
-    Args:
-        unfinished: its folder.
-        config: its settings.
-
-    Yields:
-        A function that waits until this process has the folder alone; whether no other one has completed the release.
-
-    Raises:
-        ConfigError: its place is taken, the unfinished release is of another configuration or version, or something
-            cannot be written.
+    Yields a function that waits until this process has the folder alone; whether no other one has completed the
+    release. Raises ConfigError: its place is taken, the unfinished release is of another configuration or version, or
+    something cannot be written.
     """
     store, settings = unfinished.store, unfinished.folder / _CONFIG_FILE
 

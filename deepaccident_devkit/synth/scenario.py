@@ -1,22 +1,41 @@
-"""All that one scenario holds, made so that it happens as its plan says."""
+"""A scenario: made so that it happens as its plan says, and recorded frame by frame as files of a release.
 
+It is recorded in parts; each part takes every nth frame, so that several processes can share a scenario.
+"""
+
+import multiprocessing
+import threading
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.release import Collision, Meta
+from deepaccident_devkit.release import (
+    Collision,
+    Meta,
+    ScenarioFolder,
+    write_bev,
+    write_calib,
+    write_image,
+    write_label,
+    write_lidar,
+    write_meta,
+)
+from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.synth.actors import Actor, Actors, Body, Motion
-from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.plan import ScenarioPlan
-from deepaccident_devkit.synth.roads import Junction
+from deepaccident_devkit.synth.plan import ScenarioPlan, Sensors, SynthConfig
+from deepaccident_devkit.synth.roads import Arm, Junction
+from deepaccident_devkit.synth.sensors.agents import Agent
+from deepaccident_devkit.synth.sensors.lidar import Scan, intensity
+from deepaccident_devkit.synth.sensors.rig import Rig, make_rig
+from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.spec import ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role
-from deepaccident_devkit.synth.stage import World, random_world
-from deepaccident_devkit.synth.traffic.casting import unplanned
-from deepaccident_devkit.synth.traffic.drama import (
+from deepaccident_devkit.synth.traffic.accidents import (
     Performance,
     Recorded,
     Stage,
@@ -29,8 +48,19 @@ from deepaccident_devkit.synth.traffic.drama import (
     usual_duration,
 )
 from deepaccident_devkit.synth.traffic.driving import PERIOD
+from deepaccident_devkit.synth.traffic.placement import unplanned
 from deepaccident_devkit.synth.traffic.rights import SignalPlan
-from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID, VEHICLE_AGENTS, WARM_UP_FRAMES, AgentName
+from deepaccident_devkit.synth.world import World, random_world
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    BEV_CAMERA,
+    LIDAR,
+    STATIC_ACTOR_ID,
+    VEHICLE_AGENTS,
+    WARM_UP_FRAMES,
+    AgentName,
+    frame_timestamp,
+)
 
 AGENT_OF_ROLE: Mapping[Role, AgentName] = {
     "ego": "ego_vehicle",
@@ -40,6 +70,8 @@ AGENT_OF_ROLE: Mapping[Role, AgentName] = {
 }
 MAX_DRAWS = 40
 """After this many draws without a collision a scenario is given up."""
+_PARTS = 8
+"""Parts of a scenario with sensors. Without sensors it has one: simulating it takes longer than writing a frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,14 +104,8 @@ class Scenario:
 def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     """Make a scenario; the same seed and pair give the same scene, for the accident and for its twin.
 
-    If two actors are timed to meet, the scene is drawn again until they touch.
-
-    Args:
-        config: the settings of the release.
-        plan: which scenario it is.
-
-    Raises:
-        ConfigError: they do not touch in `MAX_DRAWS` draws; the message says how near they came, and what to change.
+    If two actors are timed to meet, the scene is drawn again until they touch. Raises ConfigError if they do not in
+    `MAX_DRAWS` draws; the message says how near they came, and what to change.
     """
     # a stream for each part of the scene, so that a change to one part leaves the others
     streams = np.random.SeedSequence([config.seed, plan.pair]).spawn(3)
@@ -228,3 +254,134 @@ def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
     """The agents of the two who are timed to meet; None for a road user that is no agent, or if nobody is timed."""
     first, second = (stage.users[row] for row in stage.cast.pair) if stage.cast.pair else (None, None)
     return AGENT_OF_ROLE.get(first.role) if first else None, AGENT_OF_ROLE.get(second.role) if second else None
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingJob:
+    """A scenario to make, or a part of one.
+
+    Attributes:
+        root: the release to write it into.
+        config: the settings of the release.
+        plan: which scenario it is.
+        first: the first frame, counted from 1.
+        step: from each frame to the next one.
+    """
+
+    root: Path
+    config: SynthConfig
+    plan: ScenarioPlan
+    first: int = 1
+    step: int = 1
+
+    @property
+    def folder(self) -> ScenarioFolder:
+        """Where the scenario's files lie."""
+        folder = self.plan.split if self.config.layout == "B" else ""
+        return ScenarioFolder(self.root, folder, self.plan.scenario_type, self.plan.name, AGENTS)
+
+
+def parts_of(config: SynthConfig) -> int:
+    """The number of parts in which each scenario is recorded."""
+    return 1 if config.sensors == "none" else min(_PARTS, config.frames or _PARTS)
+
+
+def record_scenario(job: RecordingJob) -> None:
+    """Make a scenario and write all its files, or those of a part of it."""
+    _share_cores()
+    scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan))
+    labelled = job.plan.split != "test" or not job.config.unlabelled_test
+    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled)
+    if labelled and job.first == 1:
+        write_meta(real_path(job.folder.meta_path), scenario.meta)
+    for frame in range(job.first, scenario.frames + 1, job.step):
+        recorder.record(frame)
+
+
+def forget_scenario() -> None:
+    """Free the memory of the scenario that this thread keeps for its next part."""
+    _KEPT.made_ready.cache_clear()
+
+
+def _share_cores() -> None:
+    """Give OpenCV one thread in a worker process: each worker has one core, and OpenCV would start threads for all."""
+    import cv2
+
+    if multiprocessing.parent_process() is not None:
+        cv2.setNumThreads(1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Which scenario to make."""
+
+    config: SynthConfig
+    plan: ScenarioPlan = field(hash=False)
+
+
+def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
+    """A scenario and its sensors."""
+    config, plan = task.config, task.plan
+    scenario = build_scenario(config, plan)
+    rig = make_rig(
+        scenario.world,
+        scenario.actors,
+        scenario.agents,
+        sky=(scenario.spec.weather, scenario.spec.time_of_day),
+        image_size=config.pixels,
+        seed=(config.seed, plan.pair, int(plan.accident)),
+        sensors=cast(Sensors, config.sensors),  # never True or False once the configuration is made
+        exact=config.exact,
+    )
+    return scenario, rig
+
+
+class _Kept(threading.local):
+    """Keeps a thread's last scenario for the next part of it. Threads share none: a rig remembers what it casts."""
+
+    def __init__(self) -> None:
+        self.made_ready = lru_cache(maxsize=1)(_made_ready)
+
+
+_KEPT = _Kept()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Recorder:
+    """Writes the files of one scenario: those that need no sensor, and what the rig makes of the others."""
+
+    folder: ScenarioFolder
+    scenario: Scenario
+    rig: Rig
+    labelled: bool
+
+    def record(self, frame: int) -> None:
+        """Write the files of all agents at one frame, counted from 1."""
+        time, rig = frame_timestamp(frame), self.rig
+        scene = rig.scene(time)
+        around = rig.surroundings(scene, self._signals(time))
+        for agent in rig.agents:
+            sighting = rig.sighting(scene, agent, frame)
+            write_calib(real_path(self.folder.calib_path(agent.name, frame)), sighting.calib)
+            if self.labelled:
+                write_label(real_path(self.folder.label_path(agent.name, frame)), sighting.labels)
+            if rig.clouds:
+                self._record_arrays(scene, sighting.points, agent, frame)
+            if around:
+                for channel, image in rig.images(scene, around, agent, frame):
+                    write_image(real_path(self.folder.channel_path(agent.name, channel, frame)), image)
+
+    def _record_arrays(self, scene: Scene, points: Scan, agent: Agent, frame: int) -> None:
+        """Write the point cloud, and if there are labels also the BEV array, whose instances are labels too."""
+        place = real_path(self.folder.channel_path(agent.name, LIDAR, frame))
+        write_lidar(place, points.xyz, intensity(points, self.rig.air))
+        if self.labelled:
+            bev = self.rig.bev(scene, agent)
+            write_bev(real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)), bev.semantic, bev.instance)
+
+    def _signals(self, time: float) -> Mapping[Arm, int]:
+        """Arm → the state of its traffic light."""
+        signals = self.scenario.signals
+        if signals is None:
+            return {}
+        return {head.arm: int(signals.state(head.arm, time)) for head in self.scenario.world.signals}

@@ -409,14 +409,9 @@ MODELS: dict[str, tuple[Callable[[Frame], list[Block]], ...]] = {
 
 
 def shape_of(category: str, size: tuple[float, float, float], color: Color, accent: Color, model: int = 0) -> Solids:
-    """The solids of a road user.
+    """The solids of a road user with a label box of length, width and height, metres, and two colours.
 
-    Args:
-        category: one of `taxonomy.CATEGORIES`.
-        size: length, width, height of its label box, metres.
-        color: the colour of paint or clothes.
-        accent: the colour of a second part.
-        model: which of the category's `MODELS`; after the last one, the first follows.
+    The model is one of the category's `MODELS`; after the last one, the first follows.
     """
     length, width, height = size
     frame = Frame(length / 2 - INSET, width / 2 - INSET, BOX_CLEARANCE + height - INSET, color, accent)

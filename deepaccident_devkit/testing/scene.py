@@ -181,12 +181,7 @@ _MIDDLE = (BEV_SHAPE[0] - 1) / 2
 
 
 def cloud_of(boxes: Boxes, lidar_height: float) -> FloatArray:
-    """Points (N, 3) in the LiDAR frame, metres, in the boxes and on the ground, rounded to the file's float32.
-
-    Args:
-        boxes: boxes in the LiDAR frame.
-        lidar_height: height of the LiDAR above the ground, metres.
-    """
+    """Points (N, 3) in the LiDAR frame, metres, in its boxes and on the ground, rounded to the file's float32."""
     parts = [_ground(lidar_height)]
     distance = np.linalg.norm(boxes.center[:, :2], axis=1)
     counts = np.clip(_POINT_METRES / np.maximum(distance, 1.0), 1, _MOST_POINTS).astype(int) * (distance < _LIDAR_RANGE)
@@ -200,13 +195,9 @@ def cloud_of(boxes: Boxes, lidar_height: float) -> FloatArray:
 def picture_of(
     boxes: Boxes, camera: PinholeCamera, *, sky: tuple[int, int, int], road: tuple[int, int, int]
 ) -> ByteArray:
-    """A picture (H, W, 3), RGB: sky, road, and each box's outline filled with its class's colour, far ones first.
+    """A picture (H, W, 3), RGB: sky, road, and the outlines of optical boxes in their classes' colours, far ones first.
 
-    Args:
-        boxes: boxes in the camera's optical frame.
-        camera: its optics.
-        sky: RGB; sky and road should differ between all pictures, so that no two files are equal.
-        road: RGB.
+    Sky and road should differ between all pictures, so that no two files are equal.
     """
     import cv2
 
@@ -223,12 +214,7 @@ def picture_of(
 
 
 def top_view_of(boxes: Boxes, object_ids: NDArray[np.uint16]) -> tuple[ByteArray, NDArray[np.uint16]]:
-    """Tags (1200, 1200) uint8 and object ids (1200, 1200) uint16 around an agent: up is forward, left is left.
-
-    Args:
-        boxes: boxes in the ego or LiDAR frame.
-        object_ids: (N,) the simulator's ids of the boxes.
-    """
+    """Tags (1200, 1200) uint8 and the simulator's ids (1200, 1200) uint16 around an agent: forward is up, left left."""
     import cv2
 
     semantic = np.full(BEV_SHAPE, TAGS["road"], dtype=np.uint8)
@@ -262,15 +248,7 @@ _BEV_COMPRESSION = 6
 
 
 class Recorder:
-    """Writes what one agent recorded at one frame, file by file.
-
-    Args:
-        folder: the scenario's folder.
-        scene: what happens in the scenario.
-        agent: the agent that records.
-        frame: number of the frame, counted from 1.
-        image_size: width and height, pixels.
-    """
+    """Writes what an agent recorded at a frame (counted from 1), file by file; images have width and height, pixels."""
 
     def __init__(
         self, folder: ScenarioFolder, scene: SmallScene, agent: AgentName, frame: int, image_size: tuple[int, int]

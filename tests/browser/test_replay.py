@@ -16,9 +16,9 @@ from selenium.webdriver.common.keys import Keys
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, box_truth
 from deepaccident_devkit.render.boxes import EDGES, NEAREST_DRAWN, segments_in_image
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.replay import render_replay, sensors
-from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.entries import recording_of
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 

@@ -10,7 +10,7 @@ import numpy as np
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, VEHICLE_AGENTS
-from deepaccident_devkit.testing.editing import ENDINGS, FIELD, Rows, ScenarioEditor
+from deepaccident_devkit.testing.breakages.breakage import ENDINGS, FIELD, Rows, ScenarioEditor
 
 Candidate = TypeVar("Candidate")
 Sightings = Mapping[str, Mapping[int, Mapping[int, np.ndarray]]]

@@ -38,7 +38,6 @@ from deepaccident_devkit.model.detection import (
     suppress,
 )
 from deepaccident_devkit.model.detection.targets import peak_radius
-from deepaccident_devkit.model.entry import ModelInputs
 from deepaccident_devkit.model.fusion import (
     Agent3D,
     Agent3DConfig,
@@ -48,8 +47,9 @@ from deepaccident_devkit.model.fusion import (
     V2XViTConfig,
     fusion,
 )
-from deepaccident_devkit.model.fusion.v2xvit import sinusoid
+from deepaccident_devkit.model.fusion.transformers import sinusoid
 from deepaccident_devkit.model.images import Swin, SwinConfig, from_official, image_encoder
+from deepaccident_devkit.model.inputs import ModelInputs
 from deepaccident_devkit.model.lift import CameraGeometry, LiftConfig, LiftSplat
 from deepaccident_devkit.model.motion import (
     LatentDistribution,
@@ -61,11 +61,11 @@ from deepaccident_devkit.model.motion import (
     motion_losses,
 )
 from deepaccident_devkit.model.motion.decoders import FlowGru, SpatialDistribution, warp_with_flow
-from deepaccident_devkit.model.motion.losses import center_loss, latent_loss, segmentation_loss, vector_loss
+from deepaccident_devkit.model.motion.head import center_loss, latent_loss, segmentation_loss, vector_loss
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.presets import released
 from deepaccident_devkit.model.temporal import TemporalConfig, temporal_model
-from deepaccident_devkit.model.training.step import Targets, TrainingStep
+from deepaccident_devkit.model.training_step import Targets, TrainingStep
 from deepaccident_devkit.model.warps import matrices_from_six
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, MotionLabels
 

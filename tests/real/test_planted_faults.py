@@ -12,7 +12,7 @@ from fault_injection.run import Job, mutate, places
 
 from deepaccident_devkit.release import read_lidar, write_lidar
 from deepaccident_devkit.taxonomy import LIDAR
-from deepaccident_devkit.testing.editing import FIELD
+from deepaccident_devkit.testing.breakages.breakage import FIELD
 from deepaccident_devkit.validation import validate_release
 from real.conftest import TOKEN
 

@@ -21,7 +21,7 @@ from deepaccident_devkit.export.mcap import McapConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabelConfig, agents_to_ego, config_from_names
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.render.axes import layers_of
+from deepaccident_devkit.render.figures import layers_of
 from deepaccident_devkit.support.text import choice, meant_text
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.testing import SmallRelease

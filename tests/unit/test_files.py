@@ -16,7 +16,7 @@ from PIL import Image
 from processes import wait_for
 
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.figures import write_figure
 from deepaccident_devkit.support.files import (
     plain_names,
     remove_leftovers,

@@ -1,29 +1,48 @@
-"""A scenario: its replay, below it its story, pairs, lead times, twin and findings; a moment's boxes and labels."""
+"""A scenario: its replay, story, pairs, lead times, twin and findings; a moment's boxes; its pictures and points."""
 
 from __future__ import annotations
 
+import io
 import math
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError, TokenError
 from deepaccident_devkit.explore.explorer import Explorer
-from deepaccident_devkit.explore.pages.answers import explorer_of, page, rendered, root_of, with_slash
-from deepaccident_devkit.explore.pages.pictures import SCENARIO, sample_of, token_of
+from deepaccident_devkit.explore.pages.responses import KEPT, explorer_of, page, picture, rendered, root_of, with_slash
 from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.render.replay import script_json
-from deepaccident_devkit.render.roles import recorders_of
+from deepaccident_devkit.render import detached_figure, render_motion_labels, render_sample
+from deepaccident_devkit.render.boxes import recorders_of
+from deepaccident_devkit.render.replay import cloud_text, script_json
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, describe, lead_times, twin_diff, twin_of
-from deepaccident_devkit.taxonomy import short_name
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
 from deepaccident_devkit.validation import findings
 
+SCENARIO: Final = "/scenario/{type}/{name}"
+_WIDTHS: Final = (160, 320, 640, 960, 1600)
+"""Pixels that an image may be asked for: few, so that they are kept."""
+_QUALITY: Final = 80
+_VIEWS: Final[Mapping[str, tuple[Callable[..., Any], tuple[float, float]]]] = {
+    "sample": (render_sample, (15.5, 5.4)),
+    "labels": (render_motion_labels, (12.5, 9.4)),
+}
+"""What is rendered of a moment → by what, and how large in inches."""
 _MOST_PAIRS: Final = 30
+PARTS: Final[Mapping[str, str]] = {
+    "story": "What happens",
+    "pairs": "Who comes near whom",
+    "ledger": "Who sees the danger, and when",
+    "twins": "Beside its twin",
+    "findings": "Findings of validate",
+}
+"""Part → its heading."""
 
 
 def routes() -> list[Route]:
@@ -35,7 +54,24 @@ def routes() -> list[Route]:
         Route(f"{SCENARIO}/twin", _twin),
         Route(f"{SCENARIO}/parts/{{part}}", _part),
         Route(f"{SCENARIO}/moment/{{agent}}/{{frame:int}}", _moment),
+        Route("/thumbnail/{type}/{name}.jpg", _thumbnail),
+        Route(f"{SCENARIO}/images/{{agent}}/{{channel}}/{{frame:int}}", _image),
+        Route(f"{SCENARIO}/points/{{agent}}/{{frame:int}}", _points),
+        Route(f"{SCENARIO}/moment/{{agent}}/{{frame:int}}/{{view}}.png", _view),
     ]
+
+
+def token_of(request: Request) -> str:
+    """The scenario that an address names."""
+    return "{type}/{name}".format(**request.path_params)
+
+
+def sample_of(request: Request) -> str:
+    """The sample that an address names; raises HTTPException for an agent that cannot be."""
+    agent, frame = request.path_params["agent"], request.path_params["frame"]
+    if agent not in AGENTS or not 0 < frame < 1000:
+        raise HTTPException(404)
+    return f"{token_of(request)}/{agent}/{frame:03d}"
 
 
 def _scenario(request: Request) -> Response:
@@ -54,13 +90,7 @@ def _left_out(request: Request, explorer: Explorer, token: str) -> Response:
 
 
 def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[str, Any]:
-    """What a scenario's page shows.
-
-    Args:
-        explorer: of the release.
-        token: the scenario.
-        model: name of a model, whose predictions the replay shows; None for none.
-    """
+    """What a scenario's page shows, with the predictions of a model (a name) in its replay; None for none."""
     row, rows = explorer.scenarios.row_of[token], explorer.scenarios
     telling = [name for name, each in explorer.models.items() if each.results and token in each.scenarios]
     shown = model if model in telling and explorer.models[model].setup.task != "detection" else None
@@ -176,14 +206,6 @@ def _twins(dataset: Dataset, token: str) -> dict[str, Any]:
     return {"told": told, "actors": actors, "is_accident": told["accident"] == token}
 
 
-PARTS: Final[Mapping[str, str]] = {
-    "story": "What happens",
-    "pairs": "Who comes near whom",
-    "ledger": "Who sees the danger, and when",
-    "twins": "Beside its twin",
-    "findings": "Findings of validate",
-}
-"""Part → its heading."""
 _CONTEXTS: Final[Mapping[str, Callable[[Dataset, str], dict[str, Any]]]] = {
     "story": lambda dataset, token: {"text": describe(dataset, token).text},
     "pairs": _pairs,
@@ -215,3 +237,53 @@ def _moment(request: Request) -> Response:
         labelled=record["labelled"],
         boxes=boxes,
     )
+
+
+def _thumbnail(request: Request) -> Response:
+    return picture(explorer_of(request).thumbnail(token_of(request)), "jpeg")
+
+
+def _image(request: Request) -> Response:
+    """A camera's image; smaller ones in memory for the next reader."""
+    sample, channel = sample_of(request), request.path_params["channel"]
+    if channel not in CAMERAS:
+        raise HTTPException(404)
+    explorer = explorer_of(request)
+    width = _width(request.query_params.get("width", ""))
+    made = explorer.pictures.get((sample, channel, width), lambda: _jpeg(explorer, sample, channel, width))
+    return picture(made, "jpeg")
+
+
+def _width(asked: str) -> int:
+    if not re.fullmatch(r"\d{1,4}", asked):
+        return _WIDTHS[-1]
+    return next((width for width in _WIDTHS if width >= int(asked)), _WIDTHS[-1])
+
+
+def _jpeg(explorer: Explorer, sample: str, channel: str, width: int) -> bytes:
+    from PIL import Image
+
+    lens = explorer.dataset.camera(sample, channel)
+    size = min(width, lens.width), max(1, round(lens.height * min(width, lens.width) / lens.width))
+    image = explorer.dataset.load_image(sample, channel, least=size[::-1], size=size[::-1])
+    written = io.BytesIO()
+    Image.fromarray(image).save(written, "JPEG", quality=_QUALITY)
+    return written.getvalue()
+
+
+def _points(request: Request) -> Response:
+    sample, explorer = sample_of(request), explorer_of(request)
+    recording = explorer.recording(token_of(request))
+    coded = cloud_text(recording, request.path_params["agent"], request.path_params["frame"])
+    if coded is None:
+        raise HTTPException(404, f"{sample}: no LiDAR file")
+    return PlainTextResponse(coded, headers={"Cache-Control": KEPT})
+
+
+def _view(request: Request) -> Response:
+    explorer, sample, name = explorer_of(request), sample_of(request), request.path_params["view"]
+    if name not in _VIEWS:
+        raise HTTPException(404)
+    draw, size = _VIEWS[name]
+    made = explorer.drawn((name, sample), lambda: draw(explorer.dataset, sample, fig=detached_figure(size)))
+    return picture(made, "png")

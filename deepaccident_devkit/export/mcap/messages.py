@@ -36,8 +36,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.mcap import EPOCH
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
-from deepaccident_devkit.render.boxes import EDGES
-from deepaccident_devkit.render.roles import recorders_of
+from deepaccident_devkit.render.boxes import EDGES, recorders_of
 from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR

@@ -37,7 +37,7 @@ from deepaccident_devkit.export.mcap.messages import (
 )
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels, predict_instances
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, PREDICTED_COLOR
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, PREDICTED_COLOR
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray
 from deepaccident_devkit.taxonomy import CATEGORIES
 

@@ -50,8 +50,8 @@ from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashe
 from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.render.colors import AGENT_COLORS
-from deepaccident_devkit.render.roles import role_colors
+from deepaccident_devkit.render.boxes import role_colors
+from deepaccident_devkit.render.styles import AGENT_COLORS
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.tables.tokens import frame_token

@@ -17,14 +17,10 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 
 
 def peak_radius(length: Tensor, width: Tensor, min_overlap: float) -> Tensor:
-    """Radius of a box's peak in the heatmap, cells, before rounding and the least radius; the released formula.
+    """Radius (N,) of boxes' peaks in the heatmap, cells, before rounding and the least radius; the released formula.
 
-    It is the smallest of three roots, in each of which the release divides by 2 where 2a would be right.
-
-    Args:
-        length: (N,) cells.
-        width: (N,) cells.
-        min_overlap: between 0 and 1.
+    It is the smallest of three roots, in each of which the release divides by 2 where 2a would be right. Lengths and
+    widths are (N,) cells.
     """
     total, area = length + width, length * width
     quadratics = (
@@ -39,11 +35,8 @@ def peak_radius(length: Tensor, width: Tensor, min_overlap: float) -> Tensor:
 def draw_peaks(heatmap: Tensor, layer: Tensor, cell: Tensor, radius: Tensor) -> None:
     """Draw Gaussians with σ = (2r + 1)/6 in squares of 2r + 1 cells; where they meet, the larger value stays.
 
-    Args:
-        heatmap: (L, H, W), changed in place.
-        layer: (N,) int64, where each is drawn.
-        cell: (N, 2) int64, column and row of each peak, inside the map.
-        radius: (N,) int64, r in cells.
+    The heatmap (L, H, W) is changed in place; each peak has a layer (N,), a cell (N, 2), column and row inside the map,
+    and a radius r (N,), cells; all int64.
     """
     if not len(layer):
         return
@@ -258,12 +251,7 @@ def detection_losses(
 
 
 def heatmap_loss(logits: Tensor, heatmap: Tensor) -> Tensor:
-    """Gaussian focal loss (CornerNet, α = 2, γ = 4), summed, over the number of peaks or 1.
-
-    Args:
-        logits: (B, slots, H, W).
-        heatmap: the same shape, in [0, 1].
-    """
+    """Gaussian focal loss (CornerNet, α = 2, γ = 4) of (B, slots, H, W), summed, over the number of peaks or 1."""
     found = precise(logits).sigmoid().clamp(_CLIP, 1 - _CLIP)
     peak = heatmap == 1
     missed = -((1 - found) ** 2) * found.log()
@@ -272,12 +260,7 @@ def heatmap_loss(logits: Tensor, heatmap: Tensor) -> Tensor:
 
 
 def box_loss(code: Tensor, target: TaskTargets) -> Tensor:
-    """L1 distances of the box codes, summed, over the number of boxes.
-
-    Args:
-        code: (B, 10, H, W) predicted.
-        target: its boxes; velocities that are not known do not count.
-    """
+    """L1 distances of box codes (B, 10, H, W), summed, over the number of boxes; unknown velocities do not count."""
     found = gather_cells(precise(code), target.place)
     counts = target.mask[:, :, None].repeat(1, 1, found.shape[-1])
     counts[:, :, -CODE_CHANNELS["vel"] :] &= target.velocity_known[:, :, None]

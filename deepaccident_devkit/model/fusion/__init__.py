@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeAlias
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.fusion.cobevt import CobevtConfig, CobevtFusion
 from deepaccident_devkit.model.fusion.simple import (
     RELEASED_EGO_CHANNELS,
     Agent3D,
@@ -21,7 +20,7 @@ from deepaccident_devkit.model.fusion.simple import (
     ReleasedFusion,
     ReleasedFusionConfig,
 )
-from deepaccident_devkit.model.fusion.v2xvit import V2XViTConfig, V2XViTFusion
+from deepaccident_devkit.model.fusion.transformers import CobevtConfig, CobevtFusion, V2XViTConfig, V2XViTFusion
 
 FusionConfig: TypeAlias = PoolFusionConfig | ReleasedFusionConfig | DiscoNetConfig | CobevtConfig | V2XViTConfig
 _MODULES: Final[Mapping[type, Callable[[Any], Fusion]]] = {

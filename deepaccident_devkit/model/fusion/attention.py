@@ -40,12 +40,7 @@ class Windows:
         return parts.reshape(batch * down * along, agents * size * size, channels)
 
     def join(self, tokens: Tensor, shape: torch.Size) -> Tensor:
-        """Tokens → the maps (B, A, H, W, C) that `split` had, without the added cells.
-
-        Args:
-            tokens: (B · windows, A · size², C).
-            shape: B, A, H, W of the maps.
-        """
+        """Tokens (B · windows, A · size², C) → maps (B, A, H, W, C) of the shape that `split` had."""
         batch, agents, height, width = shape
         size = self.size
         down, along = -(-height // size), -(-width // size)
@@ -91,16 +86,10 @@ class FeedForward(nn.Module):
 
 
 def attention(qkv: Tensor, heads: int, bias: Tensor, keys: Tensor | None) -> Tensor:
-    """Self-attention within sets of tokens.
+    """Self-attention within M sets of L tokens, (M, L, 3 · C) → (M, L, C).
 
-    Args:
-        qkv: (M, L, 3 · C) queries, keys and values of M sets, each with the heads' channels one after the other.
-        heads: how many.
-        bias: (heads or 1, L, L) added to the scaled products, [query, key].
-        keys: (M, L) bool, the tokens that can be attended to, at least one a set; None for all.
-
-    Returns:
-        (M, L, C).
+    Queries, keys and values have the heads' channels one after the other. The bias (heads or 1, L, L), [query, key], is
+    added to the scaled products; `keys` (M, L) bool can be attended to, at least one a set; None for all.
     """
     query, key, value = qkv.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4)
     score = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)

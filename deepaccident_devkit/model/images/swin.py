@@ -30,15 +30,7 @@ class WindowAttention(nn.Module):
         self.proj = nn.Linear(channels, channels)
 
     def forward(self, tokens: Tensor, together: Tensor | None = None) -> Tensor:
-        """Attend.
-
-        Args:
-            tokens: (N, K, L, C): K windows of each image, L tokens each.
-            together: (K, L, L) bool, which tokens may see each other; None for all.
-
-        Returns:
-            (N, K, L, C).
-        """
+        """Attend in K windows of L tokens, (N, K, L, C); `together` (K, L, L) bool tells which may see each other."""
         channels = tokens.shape[-1]
         # (N, K, L, 3C) → query, key and value, each (N, K, heads, L, C / heads)
         parts = self.qkv(tokens).unflatten(-1, (3, self.heads, channels // self.heads))

@@ -44,14 +44,7 @@ class SpatialDistribution(nn.Module):
     """Features → `LatentDistribution`: two bottlenecks of stride 2, and a 1 × 1 convolution."""
 
     def __init__(self, inputs: int, hidden: int, latent: int, log_sigma: tuple[float, float]) -> None:
-        """Make the layers.
-
-        Args:
-            inputs: channels of the features.
-            hidden: channels between the bottlenecks and after them.
-            latent: channels of the latent.
-            log_sigma: the smallest and the largest value of `LatentDistribution.log_sigma`.
-        """
+        """Make the layers, with `hidden` channels between them, and the range of `LatentDistribution.log_sigma`."""
         super().__init__()
         self._log_sigma = log_sigma
         self.encoder = nn.Sequential(
@@ -63,14 +56,7 @@ class SpatialDistribution(nn.Module):
         self.last_conv = nn.Sequential(last)
 
     def forward(self, features: Tensor) -> LatentDistribution:
-        """Predict the distribution.
-
-        Args:
-            features: (N, inputs, H, W).
-
-        Returns:
-            Means and log standard deviations, each (N, latent, H / 4, W / 4), rounded up.
-        """
+        """Features (N, inputs, H, W) → means and log deviations, each (N, latent, H / 4, W / 4), rounded up."""
         mu, log_sigma = self.last_conv(self.encoder(features)).chunk(2, dim=1)
         return LatentDistribution(mu, log_sigma.clamp(*self._log_sigma))
 
@@ -116,14 +102,9 @@ _FLOW_DEVIATION: Final = 0.02
 
 
 def warp_with_flow(features: Tensor, flow: Tensor) -> Tensor:
-    """Features at each cell plus its flow, by bilinear sampling; zero outside (the released `warp_with_flow`).
+    """Features (N, C, H, W) at each cell plus its flow, by bilinear sampling; zero outside (the released function).
 
-    Args:
-        features: (N, C, H, W).
-        flow: (N, 2, H, W), cells: along the columns (channel 0) and down the rows (channel 1) to the source.
-
-    Returns:
-        (N, C, H, W).
+    The flow is (N, 2, H, W), cells: along the columns (channel 0) and down the rows (channel 1) to the source.
     """
     rows, columns = features.shape[-2:]
     # half precision cannot tell neighbouring cells of a large grid apart
@@ -138,15 +119,10 @@ class FlowGru(nn.Module):
     """Latent and present state → the states of the future frames (the released `ResFuturePrediction`)."""
 
     def __init__(self, channels: int, latent: int, frames: int, *, hidden_warp: HiddenWarp, detach: bool) -> None:
-        """Make the layers.
+        """Make the layers for so many future frames.
 
-        Args:
-            channels: of the states.
-            latent: channels of the latent.
-            frames: future frames.
-            hidden_warp: which state the GRU updates: the last one in its old place (`none`, as released), or moved
-                along the flow as its input is (`warped`).
-            detach: whether gradients stop between a frame and the next, as released.
+        The GRU updates the last state in its old place (`none`, as released), or moved along the flow as its input is
+        (`warped`). With `detach`, gradients stop between a frame and the next, as released.
         """
         super().__init__()
         self._frames, self._hidden_warp, self._detach = frames, hidden_warp, detach
@@ -159,15 +135,7 @@ class FlowGru(nn.Module):
         self.spatial_conv = _ConvNorm(channels, channels)
 
     def forward(self, latent: Tensor, state: Tensor) -> Tensor:
-        """Predict the states of the future frames.
-
-        Args:
-            latent: (N, L, H, W).
-            state: (N, C, H, W) of the present.
-
-        Returns:
-            (N, frames, C, H, W).
-        """
+        """A latent (N, L, H, W) and the present (N, C, H, W) → the future states (N, frames, C, H, W)."""
         states = []
         for _ in range(self._frames):
             flow = self.offset_pred(self.offset_conv(torch.cat([latent, state], dim=1)))
@@ -251,13 +219,7 @@ class SharedDecoder(nn.Module):
     """Our small decoder: all maps from the same few channels, brought to a finer grid."""
 
     def __init__(self, channels: int, hidden: int, upsample: int) -> None:
-        """Make the layers.
-
-        Args:
-            channels: of the states.
-            hidden: channels after the 3 × 3 convolution.
-            upsample: how many cells of the maps lie along a cell of the states.
-        """
+        """Make the layers: `hidden` channels after the 3 × 3 convolution, `upsample` cells of maps to one of states."""
         super().__init__()
         self._upsample = upsample
         self.layers = _decoder(channels, hidden, sum(_CHANNELS.values()), rare=_CHANNELS["segmentation"])

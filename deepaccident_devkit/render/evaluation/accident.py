@@ -12,13 +12,12 @@ from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.scoring import DISTANCES, ERRORS_AT, Alarm, hit_of
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
-from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.boxes import write_beside
+from deepaccident_devkit.render.captions import set_title
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_title
+from deepaccident_devkit.render.figures import axes_or_new, with_light_grid
+from deepaccident_devkit.render.styles import ESTIMATE_COLOR, GRID_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:

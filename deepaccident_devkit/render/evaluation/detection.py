@@ -10,12 +10,11 @@ import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.detection import DetectionResult
-from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.captions import set_title
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import SERIES_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_title
+from deepaccident_devkit.render.figures import axes_or_new, with_light_grid
+from deepaccident_devkit.render.styles import SERIES_COLORS, in_own_settings
 from deepaccident_devkit.support.text import choice
 
 if TYPE_CHECKING:

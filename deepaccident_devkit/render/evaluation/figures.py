@@ -26,15 +26,12 @@ from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.axes import axes_or_new, detached_figure, titled_from_above
-from deepaccident_devkit.render.colors import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR
+from deepaccident_devkit.render.captions import draw_legend_of_fills, set_scene_title, set_title
 from deepaccident_devkit.render.evaluation import accident, detection, motion, warning
 from deepaccident_devkit.render.evaluation.panels import PANEL, UNKNOWN, render_breakdown
-from deepaccident_devkit.render.legends import draw_legend_of_fills
+from deepaccident_devkit.render.figures import axes_or_new, detached_figure, titled_from_above, write_figure
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
-from deepaccident_devkit.render.pictures import write_figure
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title, set_title
+from deepaccident_devkit.render.styles import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 

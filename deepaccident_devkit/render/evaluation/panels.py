@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, Final
 from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.numbers import LIMITS, Headline, headlines
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
-from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, with_light_grid
+from deepaccident_devkit.render.captions import set_title
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import AGENT_COLORS, ESTIMATE_COLOR, MUTED_COLOR, WARNING_COLOR
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_title
+from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, with_light_grid
+from deepaccident_devkit.render.styles import AGENT_COLORS, ESTIMATE_COLOR, MUTED_COLOR, WARNING_COLOR, in_own_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

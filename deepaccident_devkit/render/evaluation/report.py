@@ -20,9 +20,9 @@ from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.evaluation.runs.prevention import prevention_tables
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
 from deepaccident_devkit.evaluation.runs.text import reading_notes
-from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, sample_figures, save_figure
 from deepaccident_devkit.render.evaluation.panels import UNKNOWN
+from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.files import place_in, writable_folder, write_bytes
 from deepaccident_devkit.support.pages import document, result_text, scalar
 from deepaccident_devkit.support.reading import read_bytes

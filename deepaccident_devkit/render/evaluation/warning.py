@@ -10,13 +10,11 @@ import numpy as np
 from deepaccident_devkit.evaluation.warning import AnticipationResult, PreventedResult
 from deepaccident_devkit.evaluation.warning.prevention import BUDGET, NOMINAL, SETTINGS
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
-from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.captions import draw_legend, set_title
 from deepaccident_devkit.render.chips import place_chips
-from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, MUTED_COLOR, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
-from deepaccident_devkit.render.legends import draw_legend
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_title
+from deepaccident_devkit.render.figures import axes_or_new, with_light_grid
+from deepaccident_devkit.render.styles import ESTIMATE_COLOR, GRID_COLOR, MUTED_COLOR, TRUE_PLACE_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:

@@ -29,13 +29,12 @@ from deepaccident_devkit.evaluation.predictions import (
 )
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import POST_PROCESSING, MotionLabels
-from deepaccident_devkit.render.axes import Layer, axes_or_new, layers_of, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, draw_trail, write_beside
+from deepaccident_devkit.render.captions import INSIDE, draw_legend, draw_legend_of_fills
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.colors import BEYOND_COLOR, COLLIDER_COLOR, OUTCOME_COLORS
-from deepaccident_devkit.render.legends import INSIDE, draw_legend, draw_legend_of_fills
+from deepaccident_devkit.render.figures import Layer, axes_or_new, layers_of, titled_from_above
 from deepaccident_devkit.render.motion_maps import MotionMaps, draw_trail_of, maps_of_labels, maps_of_output
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.styles import BEYOND_COLOR, COLLIDER_COLOR, OUTCOME_COLORS, in_own_settings
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray, ShortRepr
 
 if TYPE_CHECKING:
@@ -304,25 +303,14 @@ class MotionOutcome(ShortRepr):
         return result
 
     def judged(self, side: Side, frame: int) -> dict[str, IntArray]:
-        """Ids of a frame's instances by `right` and `false`, or of true ones by `right` and `missed`; not those beyond.
-
-        The keys are those of `OUTCOME_COLORS`.
-        """
+        """A frame's ids by the kinds of `OUTCOME_COLORS`: `right`, and `false` or (true ones) `missed`; none beyond."""
         maps, kinds = (self.true if side == "true" else self.predicted).instance[frame], self.outcomes(side)[frame]
         named = {"right": _RIGHT, "missed" if side == "true" else "false": _WRONG}
         return {name: np.unique(maps[kinds == kind]).astype(np.int64) for name, kind in named.items()}
 
 
 def motion_outcome(prediction: MotionOutput, label: MotionLabels) -> MotionOutcome:
-    """Which instances match by VPQ, in its widest range.
-
-    Args:
-        prediction: a model's output; of several predictions the last one is taken.
-        label: the truth on the same grid; frames in their own ego frames are warped to the present.
-
-    Raises:
-        EvaluationError: the present is not recorded.
-    """
+    """Which instances of the last prediction match by VPQ in its widest range. Raises EvaluationError: no present."""
     frames = frames_there(label)
     true = _cut(maps_of_labels(labels_at_present(label)), frames)
     predicted = maps_of_output(prediction, step=true.step, post_processing=POST_PROCESSING["motion"])
@@ -339,17 +327,8 @@ def draw_motion_side(
 ) -> Axes:
     """Render `true` instances as found or missed, or `predicted` ones as right or false; later frames are paler.
 
-    Args:
-        outcome: from `motion_outcome`.
-        side: which.
-        layers: `labels` (the cells), `trajectories` and `grid` are the default; also `ids`.
-        ax: axes to render on; new ones if None.
-
-    Returns:
-        The axes, in metres of the present ego frame; the title counts instances over all frames.
-
-    Raises:
-        ChoiceError: no such layer.
+    The layers are `labels` (the cells), `trajectories` and `grid`, and if asked for `ids`. The axes are metres of the
+    present ego frame; their title counts instances over all frames.
     """
     shown = layers_but_ids(layers, MOTION_LAYERS)
     ax = axes_or_new(ax, (6, 6.4))

@@ -15,13 +15,11 @@ from deepaccident_devkit.evaluation.predictions import Prediction
 from deepaccident_devkit.geometry import SE3, Boxes, PinholeCamera
 from deepaccident_devkit.maps.polygons import outlines
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, settled
 from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image, write_beside
 from deepaccident_devkit.render.camera import draw_image
+from deepaccident_devkit.render.captions import draw_legend, is_there, set_scene_title
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.colors import CASING_COLOR, COLLIDER_COLOR, OUTCOME_COLORS
-from deepaccident_devkit.render.legends import draw_legend, is_there
-from deepaccident_devkit.render.moments import CAMERA_GRID
+from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, settled
 from deepaccident_devkit.render.motion_maps import MotionMaps
 from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR, alarm_words
 from deepaccident_devkit.render.outcomes.evaluation import (
@@ -31,8 +29,8 @@ from deepaccident_devkit.render.outcomes.evaluation import (
     Verdict,
     sample_verdict,
 )
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.samples import CAMERA_GRID
+from deepaccident_devkit.render.styles import CASING_COLOR, COLLIDER_COLOR, OUTCOME_COLORS, in_own_settings
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, OWN_ACTOR_ID, POLE_HEIGHT
@@ -162,24 +160,8 @@ def render_outcome_in_cameras(
     The ground is taken to be flat: the plane z = 0 of a vehicle's ego frame, and for the infrastructure 4 m below its
     LiDAR. Occlusion is ignored: boxes and places are rendered even if other things hide them.
 
-    Args:
-        dataset: the release.
-        sample: token or record.
-        prediction: as in `render_evaluation`.
-        task: as in `render_evaluation`.
-        protocol: as in `render_evaluation`.
-        label: as in `render_evaluation`.
-        frame: of motion: 0 or None for the present; later frames show where instances will be, in the image of now.
-        fig: an empty figure to render on; a new one if None.
-
-    Returns:
-        The figure, three panels in a row, the verdict above. An image that was not downloaded is a grey panel.
-
-    Raises:
-        TokenError: no such sample.
-        NotAvailableError: the sample has no label, or its scenario no meta that an accident needs.
-        ChoiceError: no such task, protocol or frame, or the prediction is not of this task.
-        EvaluationError: the protocol cannot evaluate such a prediction.
+    Arguments and errors are those of `render_evaluation`. The `frame` is one of motion (None: the present): later ones
+    show where instances will be, in the image of now.
     """
     verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
     number = _checked_frame(verdict, frame)
@@ -198,21 +180,7 @@ def render_outcome_in_cameras(
 def draw_outcome_in_camera(
     dataset: Dataset, verdict: Verdict, camera: str, *, frame: int | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Render one panel of `render_outcome_in_cameras`.
-
-    Args:
-        dataset: the release.
-        verdict: on the prediction, from `sample_verdict`.
-        camera: channel of the sample's agent.
-        frame: as in `render_outcome_in_cameras`.
-        ax: axes to render on; new ones if None.
-
-    Returns:
-        The axes, in pixels; their title is the channel.
-
-    Raises:
-        ChoiceError: no such camera or frame.
-    """
+    """Render one panel (a channel) of `render_outcome_in_cameras`, in pixels. Raises ChoiceError."""
     channel, number = choice("camera", camera, CAMERAS), _checked_frame(verdict, frame)
     ax = axes_or_new(ax, (8, 5))
     view = view_of(dataset, verdict.sample, channel, ax)

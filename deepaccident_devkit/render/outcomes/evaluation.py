@@ -35,10 +35,10 @@ from deepaccident_devkit.evaluation.predictions import (
 )
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels
-from deepaccident_devkit.render.axes import Layer, figure_or_new, settled, titled_from_above
-from deepaccident_devkit.render.boxes import draw_boxes_from_above
+from deepaccident_devkit.render.boxes import collider_ids, draw_boxes_from_above
+from deepaccident_devkit.render.captions import set_scene_title
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import COLLIDER_COLOR
+from deepaccident_devkit.render.figures import Layer, figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.motion_maps import draw_edge, maps_of_labels
 from deepaccident_devkit.render.outcomes.above import (
     ACCIDENT_LAYERS,
@@ -55,9 +55,7 @@ from deepaccident_devkit.render.outcomes.above import (
     motion_outcome,
     verdict_words,
 )
-from deepaccident_devkit.render.roles import collider_ids
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.styles import COLLIDER_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
@@ -136,15 +134,9 @@ Verdict: TypeAlias = MotionVerdict | AccidentVerdict | DetectionVerdict
 
 
 def judged_as(prediction: object, task: str | None) -> tuple[Judged, str]:
-    """A prediction, explicit accidents as a list, and the task that it is judged in.
+    """A prediction, explicit accidents as a list, and the task that it is judged in: the one given, or its own.
 
-    Args:
-        prediction: of a model.
-        task: `motion`, `accident` or `detection`; None for the prediction's own.
-
-    Raises:
-        ChoiceError: there is no such task, or the prediction is not of this task.
-        EvaluationError: it is no prediction.
+    Raises ChoiceError if the prediction is not of the task, EvaluationError if it is no prediction.
     """
     given = prediction if isinstance(prediction, DetectedBoxes) else checked_prediction(prediction)
     possible: tuple[str, ...] = ("accident",)

@@ -1,7 +1,7 @@
 """A scenario as one HTML file that plays in a browser without a network; its parts serve other pages too."""
 
-from deepaccident_devkit.render.replay.recording import recording_of
-from deepaccident_devkit.render.replay.replay import (
+from deepaccident_devkit.render.replay.entries import recording_of
+from deepaccident_devkit.render.replay.page import (
     render_replay,
     replay_script,
     replay_style,

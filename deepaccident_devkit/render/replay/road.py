@@ -13,10 +13,10 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps import GROUND_CLASSES, TownMap
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
-from deepaccident_devkit.render.colors import BEV_COLORS
+from deepaccident_devkit.render.captions import is_there
 from deepaccident_devkit.render.ground import map_beneath
-from deepaccident_devkit.render.legends import is_there
-from deepaccident_devkit.render.replay.recording import Recording
+from deepaccident_devkit.render.replay.entries import Recording
+from deepaccident_devkit.render.styles import BEV_COLORS
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE
 

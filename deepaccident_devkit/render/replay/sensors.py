@@ -17,7 +17,7 @@ from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.parallel import own_threads, run_batch
 from deepaccident_devkit.release import read_image
 from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.render.replay.recording import Recording
+from deepaccident_devkit.render.replay.entries import Recording
 from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray, as_floats
 from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -72,10 +72,8 @@ def follow_pair(
 ) -> Followed:
     """Choose cameras so that most of the pair is in the picture, large and not hidden, and changes are few.
 
-    Args:
-        recording: the scenario and the agents.
-        seen: actor id → for each frame a bit mask over the recording's agents: who sees it.
-        there: agent and camera → for each frame whether there is a picture.
+    `seen` has for an actor id and a frame a bit mask over the recording's agents, `there` for an agent, a camera and a
+    frame whether there is a picture.
     """
     scores = {agent: _scores(recording, bit, seen, there) for bit, agent in enumerate(recording.agents)}
     chosen = {agent: _steady(each) for agent, each in scores.items()}
@@ -183,17 +181,10 @@ def camera_pictures(
     *,
     progress: bool = False,
 ) -> tuple[PictureSettings | None, Jpegs]:
-    """The pictures of the agents' cameras, and how they are written; None if there is no picture.
+    """The largest pictures of the agents' cameras within a limit of bytes, and how they are written; None if none is.
 
-    Args:
-        files: of all cameras.
-        followed: the cameras that follow the pair: while they do, their pictures are as large as the front cameras'.
-        limit: the most bytes of all pictures together: the largest pictures within it are taken. If the smallest ones
-            do not fit, there are fewer pictures.
-        progress: whether to show a bar.
-
-    Raises:
-        SensorFileError: a file cannot be read.
+    If the smallest ones do not fit, there are fewer. While cameras follow the pair, their pictures are as large as the
+    front cameras'. Raises SensorFileError.
     """
     images: _Images = {
         (agent, channel): [
@@ -287,13 +278,9 @@ def _jpeg(image: ByteArray, settings: PictureSettings, *, large: bool) -> bytes:
 
 
 def lidar_points(recording: Recording, agent: str) -> list[str | None] | None:
-    """One cloud for each frame: int16 x, y, x, y, …, little-endian, in decimetres from the origin, as base64.
+    """A cloud for each frame: int16 x, y, x, y, …, little-endian, in decimetres from the origin, as base64.
 
-    Returns:
-        The clouds, with None for a missing file; None in place of the list if all files are missing.
-
-    Raises:
-        SensorFileError: a file cannot be read.
+    None stands for a missing file; if all are missing there is no list. Raises SensorFileError.
     """
     clouds = [cloud_text(recording, agent, frame) for frame in recording.frames]
     return clouds if any(cloud is not None for cloud in clouds) else None

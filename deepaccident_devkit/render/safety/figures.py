@@ -8,10 +8,16 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.render.axes import figure_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, MUTED_COLOR, OWN_COLOR, SERIES_COLORS
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.figures import figure_or_new, with_light_grid
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    CASING_COLOR,
+    MUTED_COLOR,
+    OWN_COLOR,
+    SERIES_COLORS,
+    in_own_settings,
+)
 from deepaccident_devkit.safety import (
     COALITIONS,
     OUTCOMES,

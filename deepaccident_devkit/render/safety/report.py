@@ -14,9 +14,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.parallel import Engine, Places, run_batch
-from deepaccident_devkit.render.axes import detached_figure
-from deepaccident_devkit.render.colors import page_style
-from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.figures import detached_figure, write_figure
 from deepaccident_devkit.render.replay import tried_replay
 from deepaccident_devkit.render.safety.figures import (
     AVOIDABILITY_SIZE,
@@ -24,6 +22,7 @@ from deepaccident_devkit.render.safety.figures import (
     render_avoidability,
     render_lead_times,
 )
+from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.safety import COALITIONS, OUTCOMES, PARTNERS, AccidentRow, OutcomeShares, SafetyReport
 from deepaccident_devkit.safety.avoidability import GROUPS
 from deepaccident_devkit.safety.lead_times import CAVEAT

@@ -1,6 +1,6 @@
 """Roads: junctions with lanes, smooth paths, sidewalks, and a raster of the ground with its height."""
 
-from deepaccident_devkit.synth.roads.ground import (
+from deepaccident_devkit.synth.roads.junction import (
     FIRST_BUILDING,
     GRASS,
     MAP_CELLS,
@@ -12,12 +12,15 @@ from deepaccident_devkit.synth.roads.ground import (
     SIDEWALK,
     TERRAIN,
     TREE,
+    TURNS,
     WHITE,
     YELLOW,
     GroundMap,
+    Junction,
+    Route,
+    Turn,
     tag_of_code,
 )
-from deepaccident_devkit.synth.roads.junction import TURNS, Junction, Route, Turn
 from deepaccident_devkit.synth.roads.layout import ARMS, LANE_WIDTH, Arm, Hump, RoadKind, RoadSpec, Terrain
 from deepaccident_devkit.synth.roads.paths import Meeting, Path, crossing, lane_change, straight
 

@@ -64,7 +64,7 @@ class Path(FrozenArrays):
         return float(self.s[-1])
 
     def at(self, s: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """x, y (metres), yaw (radians) and curvature (1/m) at distances along the path, each of the shape of `s`.
+        """x, y (metres), yaw (radians), curvature (1/m) at distances along the path, each of the shape of `s`.
 
         Before its start and beyond its end the path goes straight on.
         """
@@ -154,14 +154,7 @@ def bent(start: tuple[float, float], yaw: float, pieces: list[tuple[float, float
 
 
 def lane_change(path: Path, start: float, length: float, offset: float) -> Path:
-    """The path shifted sideways by `offset` (metres, positive to the left) from `start + length` on.
-
-    Args:
-        path: the path without the change.
-        start: metres along it where the change begins.
-        length: metres that it takes; position, direction and curvature have no jumps.
-        offset: to the left, metres.
-    """
+    """The path shifted sideways by `offset` (metres, positive to the left) from `start + length` on, without jumps."""
     share = np.clip((path.s - start) / length, 0.0, 1.0)
     shift = offset * share**3 * (10 - 15 * share + 6 * share**2)
     left = np.column_stack([-np.sin(path.yaw), np.cos(path.yaw)])
@@ -232,12 +225,7 @@ Piece = tuple[float, float, float]
 
 
 def quarter_turn(tangent: float, *, left: bool) -> list[Piece]:
-    """Pieces that turn by a right angle between two lines.
-
-    Args:
-        tangent: metres from the turn's start to where the lines cross, and from there to its end.
-        left: whether it turns to the left.
-    """
+    """Pieces that turn by a right angle, over `tangent` metres before and after where the two lines cross."""
     radius = tangent / _shape()[0]
     return _pieces(radius, 1.0 if left else -1.0)
 

@@ -12,7 +12,7 @@ from deepaccident_devkit.release import Calib
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.actors import Actor, Actors
 from deepaccident_devkit.synth.sensors.scene import Scene
-from deepaccident_devkit.synth.stage import World
+from deepaccident_devkit.synth.world import World
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, VEHICLE_AGENTS, AgentName
 
 ABOVE_ROOF = 0.5
@@ -90,14 +90,7 @@ class Agent:
 def make_agents(
     world: World, actors: Actors, ids: Mapping[AgentName, int], image_size: tuple[int, int]
 ) -> tuple[Agent, ...]:
-    """The five agents of a scenario, in the order of `taxonomy.AGENTS`.
-
-    Args:
-        world: where the pole stands.
-        actors: the road users.
-        ids: actor ids of the four vehicle agents.
-        image_size: width and height, pixels.
-    """
+    """The five agents, in the order of `taxonomy.AGENTS`; `ids` are the actors of the four that are vehicles."""
     rows = {name: actors.row_of(ids[name]) for name in VEHICLE_AGENTS}
     vehicles = [_vehicle(name, row, actors.all[row], image_size) for name, row in rows.items()]
     pole = Agent(

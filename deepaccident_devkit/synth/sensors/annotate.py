@@ -29,14 +29,10 @@ _SPARE = 1.0
 
 
 def rectangles(corners: FloatArray, slope: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Least and greatest column and row, (A, 2) each, not rounded, of boxes (A, 8, 3) in the optical frame.
+    """Least and greatest column and row, (A, 2) each, not rounded, of boxes (A, 8, 3), metres, in the optical frame.
 
     Of a box that is partly behind the camera, only the part ahead counts; if all of it is behind, the two are equal.
-
-    Args:
-        corners: metres; x right, y down, z ahead.
-        slope: (2,) or (A, 2), slope of one pixel, across and down.
-        size: width and height of the picture, pixels.
+    `slope` is that of a pixel, across and down, (2,) or (A, 2); `size` the picture's width and height.
     """
     low, high = _spans(corners[..., :2] / np.maximum(corners[..., 2:], CLOSE), corners[..., 2] >= CLOSE)
     partly = np.flatnonzero((corners[..., 2].min(axis=1) < CLOSE) & (corners[..., 2].max(axis=1) > CLOSE))
@@ -70,10 +66,9 @@ def _cut_edges(corners: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 
 def nearest_movers(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Float32Array:
-    """How near (metres ahead) a moving road user may be in each pixel; infinite if there is none.
+    """How near (metres ahead) a moving road user may be in each pixel, (H + 2, W + 2); infinite if there is none.
 
-    Returns:
-        (H + 2, W + 2): two pixels more at the bottom and at the right than the picture has.
+    There are two pixels more at the bottom and at the right than the picture has.
     """
     corners = scene.box_corners[scene.setting.moving]
     optics = camera.optics
@@ -121,14 +116,7 @@ class _Windows:
 
 
 class Views:
-    """What cameras might see of some road users at a moment.
-
-    Args:
-        scene: the moment.
-        cameras: C of them.
-        poses: their poses, `ground_from_camera`.
-        rows: rows of the road users, (K,).
-    """
+    """What C cameras at poses `ground_from_camera` might see of road users, rows (K,), at a moment."""
 
     def __init__(self, scene: Scene, cameras: Sequence[Camera], poses: Sequence[SE3], rows: IntArray) -> None:
         matrices = np.stack([pose.matrix for pose in poses])
@@ -139,14 +127,9 @@ class Views:
         self._windows = _windows(corners, self._slopes)
 
     def pixels(self, wanted: BoolArray | None = None, *, rays_across: int = _RAYS_ACROSS) -> IntArray:
-        """How many pixels of a `WIDTH` × `HEIGHT` picture the road users have; large numbers are approximate.
+        """How many pixels (C, K) int64 of a `WIDTH` × `HEIGHT` picture road users have; large numbers are approximate.
 
-        Args:
-            wanted: (K,) for which of them; None for all. The others have 0.
-            rays_across: the most rays that are cast to each, across and also down.
-
-        Returns:
-            (C, K) int64.
+        Those that are not `wanted` (K,) have 0. At most so many rays are cast to each, across and also down.
         """
         windows = self._windows if wanted is None else self._windows.select(wanted[self._windows.actor])
         pixel, window, step = _pixels(windows, rays_across)
@@ -218,12 +201,8 @@ _PEDESTRIAN = CATEGORIES.index("pedestrian")
 def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, exact: bool) -> Labels:
     """The labels of one agent at one moment: parked vehicles, other vehicles, pedestrians.
 
-    Args:
-        scene: the moment.
-        agent: whose labels.
-        world_from_ground: the place in its town.
-        scan: the point cloud; `num_lidar_pts` counts all its stored points in each box.
-        exact: whether points are counted in the annotated boxes, and not in those of `COUNTED_LATER`.
+    `num_lidar_pts` counts all stored points of the scan in each box; if `exact` in the annotated boxes, and not in
+    those of `COUNTED_LATER`.
     """
     ground_from_lidar = agent.ground_from_lidar(scene)
     center, yaw, velocity = _kinematics(scene)

@@ -33,16 +33,11 @@ class Caster(Protocol):
     def cast(
         self, origin: FloatArray, directions: AnyArray, reach: AnyArray | None = None
     ) -> tuple[AnyArray, AnyArray]:
-        """The first face that each of many rays hits.
+        """The first face that each of N rays hits, from an origin (3,), metres, or (N, 3), up to their `reach`.
 
-        Args:
-            origin: (3,) metres, or (N, 3), one for each ray.
-            directions: (N, 3) of any length.
-            reach: (N,) float32: how far each ray is followed, in lengths of its direction; None for no limit.
-
-        Returns:
-            (N,) distances in lengths of the direction, in single precision, infinite where nothing is hit; and (N,)
-            the faces, six for each solid in the order of `solids.FACES`, or `GROUND` or `NOTHING`.
+        Returns (N,) distances in lengths of the direction (of any length, as `reach`), in single precision, infinite
+        where nothing is hit; and (N,) the faces, six for each solid in the order of `solids.FACES`, or `GROUND` or
+        `NOTHING`.
         """
         ...
 

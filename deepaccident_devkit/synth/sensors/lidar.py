@@ -203,16 +203,10 @@ def make_lidar(setting: Setting, agent: Agent) -> Lidar:
 def scan(
     scene: Scene, lidar: Lidar, ground_from_lidar: SE3, air: Air, rng: np.random.Generator, *, boxed: bool = False
 ) -> Scan:
-    """What a LiDAR at this pose measures.
+    """What a LiDAR at this pose measures; the number of random draws does not depend on what the rays meet.
 
-    Args:
-        scene: the moment.
-        lidar: the LiDAR of an agent.
-        ground_from_lidar: its pose.
-        air: the effects of the weather.
-        rng: random numbers for the noise; the number of draws does not depend on what the rays meet.
-        boxed: whether to follow only rays that may pass through a label box. Then all points in boxes are there, equal
-            to the bit, but only few points outside the boxes.
+    If `boxed`, only rays are followed that may pass through a label box. Then all points in boxes are there, equal to
+    the bit, but only few points outside the boxes.
     """
     cast = _cast_boxed if boxed else _cast_all
     rows, distance, face = cast(scene, lidar, ground_from_lidar)

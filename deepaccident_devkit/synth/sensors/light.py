@@ -9,7 +9,7 @@ from deepaccident_devkit.support.arrays import AnyArray, ByteArray, Float32Array
 from deepaccident_devkit.synth.roads import MAP_EXTENT, Arm
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.solids import Color
-from deepaccident_devkit.synth.stage import LAMP_COLORS, LANTERN_COLOR, World
+from deepaccident_devkit.synth.world import LAMP_COLORS, LANTERN_COLOR, World
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 
@@ -296,9 +296,7 @@ def _around(x: float, y: float, reach: float) -> tuple[slice, slice, AnyArray, A
 def lit_lamps(world: World, signals: Mapping[Arm, int]) -> dict[int, Color]:
     """Rows of the lamps among `World.props` that shine, and their colours.
 
-    Args:
-        world: where the lights stand.
-        signals: arm → 0 red, 1 amber, 2 green, as in `traffic.rights`; the lights of other arms are dark.
+    `signals` are 0 red, 1 amber and 2 green by arm, as in `traffic.rights`; the lights of other arms are dark.
     """
     states = {head: signals[head.arm] for head in world.signals if head.arm in signals}
     return {head.rows[state]: LAMP_COLORS[state] for head, state in states.items()}

@@ -13,7 +13,7 @@ from deepaccident_devkit.synth.sensors.light import Light
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting, Surfaces
 from deepaccident_devkit.synth.shapes import LAMP, TAIL
 from deepaccident_devkit.synth.solids import FACES_A_SOLID, GLASS, Color
-from deepaccident_devkit.synth.stage import LANTERN_COLOR, STOREY
+from deepaccident_devkit.synth.world import LANTERN_COLOR, STOREY
 
 _MIRRORED = 0.5
 """Share of the sky's light that glass mirrors."""
@@ -197,14 +197,7 @@ def facades_of(surfaces: Surfaces) -> Facades:
 def on_facades(
     shown: BoolArray, face: IntArray, xyz: tuple[Float32Array, Float32Array, Float32Array], facades: Facades
 ) -> OnFacades:
-    """The façade of each pixel, and its place on the façade.
-
-    Args:
-        shown: (R, C) whether pixels show a façade.
-        face: (R, C) the faces that they show.
-        xyz: x, y and z of the points that they show, (R, C) metres each.
-        facades: where façades begin.
-    """
+    """The façade of each pixel (R, C) that shows one, and its place on it; `xyz` are metres of the points shown."""
     x, y, z = xyz
     pixel = np.flatnonzero(shown)
     met = face.reshape(-1)[pixel]
@@ -213,15 +206,7 @@ def on_facades(
 
 
 def windows_on(picture: ByteArray, places: OnFacades, facades: Facades, colors: Colors, *, lit: bool) -> None:
-    """Paint windows on façades, in place.
-
-    Args:
-        picture: (R, C, 3).
-        places: the pixels that show façades.
-        facades: where façades begin.
-        colors: the colours of the faces.
-        lit: whether two of five windows shine.
-    """
+    """Paint windows on façades into a picture (R, C, 3), in place; if `lit`, two of five shine."""
     if not len(places.pixel):
         return
     length = facades.length

@@ -404,8 +404,7 @@ def _with_reflections(
 def _below_level_ground(eye: FloatArray, rays: Float32Array) -> tuple[FloatArray, Float32Array, AnyArray]:
     """The mirrored rays of level ground: those of the camera's mirror image below it.
 
-    Returns:
-        where mirrored rays begin (3,), their directions (R, C, 3), and how much the rays fall to the ground (R, C).
+    Returns where they begin (3,), their directions (R, C, 3), and how much they fall to the ground (R, C).
     """
     mirror = np.array([1, 1, -1], dtype=np.float32)
     return eye * mirror, rays * mirror, -rays[..., 2]

@@ -11,14 +11,14 @@ from deepaccident_devkit.release import BevImage, Calib, Labels
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.synth.actors import Actors
-from deepaccident_devkit.synth.config import Sensors
+from deepaccident_devkit.synth.plan import Sensors
 from deepaccident_devkit.synth.roads import MAP_EXTENT, MAP_RESOLUTION, TERRAIN, Arm, GroundMap, tag_of_code
 from deepaccident_devkit.synth.sensors.agents import Agent, make_agents, with_single_precision
 from deepaccident_devkit.synth.sensors.annotate import annotate
 from deepaccident_devkit.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, make_lidar, scan
 from deepaccident_devkit.synth.sensors.render import Studio, Surroundings, render
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting, make_scene
-from deepaccident_devkit.synth.stage import World
+from deepaccident_devkit.synth.world import World
 from deepaccident_devkit.taxonomy import AGENTS, BEV_RESOLUTION, BEV_SHAPE, CATEGORIES, AgentName
 
 _MIDDLE = (BEV_SHAPE[0] - 1) / 2
@@ -178,17 +178,10 @@ def make_rig(
     sensors: Sensors = "all",
     exact: bool = False,
 ) -> Rig:
-    """The sensors of a scenario.
+    """The sensors of a scenario; `ids` are the actors of the four agents that are vehicles.
 
-    Args:
-        world: what stands still.
-        actors: road users.
-        ids: actor ids of the four vehicle agents.
-        sky: weather and time of day, as in the taxonomy.
-        image_size: width and height of the images, pixels.
-        seed: seed of noise, clouds and the ground's grain.
-        sensors: as in `SynthConfig`; labels do not depend on it, points do, as in `Sighting`.
-        exact: as in `Rig`.
+    `sky` is weather and time of day, as in the taxonomy; `image_size` width and height, pixels; `seed` that of noise,
+    clouds and the ground's grain. Labels do not depend on `sensors` (`SynthConfig`), points do, as in `Sighting`.
     """
     weather, time_of_day = sky
     setting = Setting(world, actors)

@@ -13,7 +13,7 @@ from deepaccident_devkit.synth.roads import Terrain
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, Caster, make_caster, plane_distance
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.synth.solids import FACES_A_SOLID, Solids, concatenate, face_corners, face_planes
-from deepaccident_devkit.synth.stage import World
+from deepaccident_devkit.synth.world import World
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 _AXLES, _WHEELS = 0.3, 0.4
@@ -23,11 +23,8 @@ _AXLES, _WHEELS = 0.3, 0.4
 def placed_on(terrain: Terrain, poses: FloatArray, size: FloatArray, upright: BoolArray) -> FloatArray:
     """The frames of bodies on the ground, (A, 4, 4): origin on the ground below the box's centre, x forward, z up.
 
-    Args:
-        terrain: the ground.
-        poses: (A, 3) x, y (metres), yaw (radians) of the boxes' centres.
-        size: (A, 3) length, width, height, metres.
-        upright: (A,) whether a body stays upright on a slope.
+    Poses are (A, 3) x, y (metres), yaw (radians) of the boxes' centres, sizes (A, 3) length, width, height, metres;
+    those that are `upright` (A,) stay so on a slope.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     zero = np.zeros(len(poses))
@@ -170,17 +167,10 @@ class Setting:
         return placed_on(self.terrain, poses, self.actors.size, self.actors.category == _UPRIGHT)
 
     def cast_columns(self, origin: FloatArray, rays: AnyArray, limit: float = np.inf) -> tuple[AnyArray, AnyArray]:
-        """Does the same as `caster.cast` for columns of rays, but skips rays that meet the ground before any thing.
+        """What `caster.cast` does for columns of rays (R, C, 3), (R · C,), but skips rays that meet the ground first.
 
-        It knows them on flat ground, where all rays of a column go over the same line.
-
-        Args:
-            origin: (3,) metres.
-            rays: (R, C, 3) float32; if those of a column do not go over the same line, all are cast.
-            limit: up to where results must be correct, in lengths of the ray.
-
-        Returns:
-            (R · C,) distances and faces.
+        It knows them on flat ground, where all rays of a column go over the same line; if they do not, all are cast.
+        Results must be correct up to a limit, in lengths of the ray.
         """
         flat = rays.reshape(-1, 3)
         if not self.terrain.is_flat or not _in_columns(rays):
@@ -263,16 +253,10 @@ class Scene:
     def cast(
         self, origin: FloatArray, directions: AnyArray, *, near: IntArray | None = None
     ) -> tuple[AnyArray, AnyArray]:
-        """Where rays first meet a surface or the ground.
+        """Where N rays from above the ground first meet a surface or the ground; arguments as for `Caster.cast`.
 
-        Args:
-            origin: (3,) metres, above the ground; or (N, 3), one for each ray.
-            directions: (N, 3), of any length.
-            near: rows of the rays that can meet a moving road user; None for all.
-
-        Returns:
-            (N,) distances in lengths of the direction, infinite if a ray meets nothing; and (N,) the faces met,
-            or `caster.GROUND` or `caster.NOTHING`.
+        `near` are rows of the rays that can meet a moving road user; None for all. Returns (N,) distances in lengths of
+        the direction, infinite if a ray meets nothing; and (N,) the faces met, or `caster.GROUND` or `caster.NOTHING`.
         """
         rows = np.arange(len(directions)) if near is None else near
         reached, met = self._cast_at_movers(origin, directions, rows)

@@ -14,16 +14,10 @@ from deepaccident_devkit.synth.sensors.scene import Scene, Setting, moved
 
 
 def add_shadows(picture: ByteArray, corners: FloatArray, to_sun: FloatArray, brightness: float) -> IntArray:
-    """Paint the shadows of solids into a picture of the ground, in place.
+    """Paint the shadows of solids into a picture of the ground, (3000, 3000, 3) cells of `roads.GroundMap`, in place.
 
-    Args:
-        picture: (3000, 3000, 3) uint8, cells as in `roads.GroundMap`.
-        corners: (P, 8, 3) corners of convex solids, metres, ground frame, z above the ground below them.
-        to_sun: (3,) direction to the sun.
-        brightness: brightness of the ground in the shadow, as a share of that in the sun.
-
-    Returns:
-        the cells in the shadow (K,), as rows of 3000 · 3000; those in two shadows are there twice.
+    Corners are (P, 8, 3), metres, ground frame, z above the ground below them; `brightness` is the share of that in the
+    sun. Returns the cells in the shadow (K,), as rows of 3000 · 3000; those in two shadows are there twice.
     """
     cells = _shadowed(_outlines(corners, to_sun))
     dimmed, flat = (np.arange(256) * brightness).astype(np.uint8), picture.reshape(-1, 3)
@@ -125,14 +119,7 @@ def _sun_on(setting: Setting, light: Light, faces: IntArray, counts: IntArray) -
 
 
 def shadows_on(picture: ByteArray, places: OnFacades, shadows: WallShadows, colors: Colors) -> None:
-    """Darken the façades that pixels show where the sun does not reach them, in place.
-
-    Args:
-        picture: (R, C, 3).
-        places: the pixels that show façades.
-        shadows: the shadows on façades.
-        colors: the colours of the faces.
-    """
+    """Darken façades that a picture (R, C, 3) shows where the sun does not reach them, in place."""
     import cv2
 
     if shadows.lit.size == 1:

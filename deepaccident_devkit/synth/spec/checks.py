@@ -30,11 +30,7 @@ _FORBIDDEN: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def check_scenario(root: Part) -> None:
-    """Check what the fields' types alone cannot show.
-
-    Raises:
-        ConfigError: at least one of its draws is impossible; the message names line and field.
-    """
+    """Check what the fields' types alone cannot show; raises ConfigError, with line and field, if a draw cannot be."""
     actors = _actors(root)
     _check_roles(root, actors)
     _check_roads(root)

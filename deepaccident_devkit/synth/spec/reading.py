@@ -40,15 +40,10 @@ class Node:
 
 
 def parse_yaml(text: str, source: str) -> Node:
-    """The tree of a YAML text.
+    """The tree of a YAML text: one document, without tags, anchors or aliases; `source` is its name in messages.
 
-    Args:
-        text: one document, without tags, anchors or aliases.
-        source: its name in messages, such as the file's path.
-
-    Raises:
-        ConfigError: it is empty or no YAML, or has a repeated key, a key that is no word, an alias, a tag, or a number
-            that is not decimal; line, path and remedy are in the message.
+    Raises ConfigError, with line, path and remedy: it is empty or no YAML, or has a repeated key, a key that is no
+    word, an alias, a tag, or a number that is not decimal.
     """
     import yaml
 
@@ -173,8 +168,7 @@ def required_fields(kind: type[Any]) -> tuple[str, ...]:
 def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
     """A part of a scenario, from a mapping.
 
-    Raises:
-        ConfigError: it is no mapping, has an unknown key, lacks a required one, or a value does not fit its field.
+    Raises ConfigError: it is no mapping, has an unknown key, lacks a required one, or a value does not fit its field.
     """
     entries = node.value
     if not isinstance(entries, Mapping):

@@ -10,8 +10,8 @@ from deepaccident_devkit.synth.actors import Body, random_body
 from deepaccident_devkit.synth.roads import Junction, Path, Route
 from deepaccident_devkit.synth.roads.layout import OUTWARD
 from deepaccident_devkit.synth.spec import ActorSpec, ScenarioSpec
+from deepaccident_devkit.synth.traffic.driving import MANNERS, RoadUser, lane_span, lane_way, shifted
 from deepaccident_devkit.synth.traffic.rights import RED, SignalPlan
-from deepaccident_devkit.synth.traffic.users import MANNERS, RoadUser, lane_span, lane_way, shifted
 
 _DRIVERS = ("car", "car", "car", "car", "van", "truck")
 _RIDERS = ("motorcycle", "cyclist")
@@ -37,15 +37,9 @@ def background_users(
     signals: SignalPlan | None,
     begin: float,
 ) -> list[RoadUser]:
-    """The moving background at the beginning; those for whom there is no room are left out.
+    """The moving background as the simulation begins (seconds); those for whom there is no room are left out.
 
-    Args:
-        rng: random numbers.
-        spec: says how many there are.
-        junction: its roads.
-        named: the named road users; the lanes in front of them stay free up to the junction.
-        signals: the traffic lights.
-        begin: seconds, when the simulation starts.
+    The lanes in front of the named road users stay free up to the junction.
     """
     placed = _Lanes(named)
     users: list[RoadUser] = []
@@ -223,11 +217,7 @@ def parked_vehicles(
 ) -> list[ParkedVehicle]:
     """The named parked vehicles, each on the slot nearest to its place, then as many others as there is room for.
 
-    Args:
-        rng: random numbers.
-        spec: what the file says.
-        junction: its roads.
-        walking: the pedestrians who cross a road; parked vehicles keep some distance from their paths.
+    They keep some distance from the paths of pedestrians who cross a road.
     """
     places = junction.parking_places()
     free = [row for row, place in enumerate(places) if not any(_in_the_way(place, user) for user in walking)]

@@ -1,15 +1,20 @@
-"""How wheels move a body along its path, and how fast to drive: the bicycle model and the intelligent driver model.
+"""Road users: their paths, how fast they drive (intelligent driver model), and how wheels move them (bicycle model).
 
 The paths of all road users are in one table, so that one look-up serves all of them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
-from deepaccident_devkit.synth.roads.paths import Path
+from deepaccident_devkit.synth.actors import Body
+from deepaccident_devkit.synth.roads import Arm, Junction, Route, Turn, straight
+from deepaccident_devkit.synth.roads.layout import OUTWARD, RoadSpec
+from deepaccident_devkit.synth.roads.paths import Path, through
+from deepaccident_devkit.synth.spec.model import Role, Rule, Side
 
 PERIOD = 0.02
 """Length of a simulated step, seconds."""
@@ -25,6 +30,27 @@ HARDEST_BRAKING = 8.0
 """The hardest braking on dry asphalt, m/s²."""
 _LOOK_AHEAD = (2.5, 0.25)
 """How far ahead the steering aims to be on the path again: metres, and seconds of driving that are added to them."""
+SPACING = 0.25
+"""Metres between the table's points."""
+_BEYOND = 80.0
+"""Metres that the table goes straight on after a path's end."""
+_BEND_BRAKING = 1.8
+"""m/s² with which drivers brake before a bend."""
+_STIFFNESS = 2.5
+"""1/s: the braking for each m/s above the allowed speed."""
+_SLOWING = 4.0
+"""m/s²: the hardest braking to the speed that a bend allows."""
+_GENTLE_STOP = (3.0, 1.0)
+"""The hardest braking near standstill, m/s², and how much harder it can be for each m/s of speed."""
+_NO_GAP = 0.1
+"""Metres: a smaller gap counts as this."""
+_SPAN = (4.0, 10.0)
+"""Metres before the stop line, and metres past the junction, between which paths can cross."""
+_CYCLIST_OFFSET = 1.1
+"""Metres from the lane's middle to the right, where cyclists ride."""
+_KERB_ROOM = 0.7
+"""Metres from the kerb to where a pedestrian waits to step onto the road."""
+WALKER = "pedestrian"
 
 
 @dataclass(slots=True, eq=False)
@@ -51,11 +77,8 @@ class Wheels:
 def step(wheels: Wheels, acceleration: FloatArray, on_path: FloatArray, wheelbase: FloatArray) -> None:
     """Move all road users by one period, in place; for those without wheels only `speed` and `along` are valid.
 
-    Args:
-        wheels: the state.
-        acceleration: (A,) m/s².
-        on_path: (4, A) x, y, yaw, curvature of the paths at `wheels.along`.
-        wheelbase: (A,) metres; infinite for those without wheels.
+    The acceleration is (A,) m/s², `on_path` (4, A) x, y, yaw, curvature of the paths at `wheels.along`, the wheelbase
+    (A,) metres, infinite for those without wheels.
     """
     distance = np.maximum(wheels.speed + acceleration * (PERIOD / 2), 0.0) * PERIOD
     wheels.speed = np.maximum(wheels.speed + acceleration * PERIOD, 0.0)
@@ -92,21 +115,11 @@ def _wanted_steer(
     return steer
 
 
-SPACING = 0.25
-"""Metres between the table's points."""
-_BEYOND = 80.0
-"""Metres that the table goes straight on after a path's end."""
-_BEND_BRAKING = 1.8
-"""m/s² with which drivers brake before a bend."""
-
-
 class Tracks:
     """Points along each path, and the speed that its bends allow; one row for each road user.
 
-    Args:
-        paths: the paths of the road users.
-        lateral: (A,) m/s², the most sideways acceleration that each accepts in a bend.
-        stops: (A,) bool, whether it stops at its path's end; if not, it goes straight on.
+    `lateral` is (A,) m/s², the most sideways acceleration that each accepts in a bend. Those with `stops` (A,) stop at
+    the path's end; others go straight on.
     """
 
     def __init__(self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray) -> None:
@@ -132,10 +145,9 @@ class Tracks:
         return np.asarray(before + share * (self._flat[:, flat + 1] - before))
 
     def near(self, rows: IntArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The table's points nearest to `along` (P, K) metres on the paths of `rows` (P,).
+        """x, y, yaw, curvature (P, K, 4) of the table's points nearest to `along` (P, K) on the paths of `rows` (P,).
 
-        Returns:
-            x, y, yaw, curvature (P, K, 4), and how far along they are (P, K), metres.
+        Second, how far along they are (P, K), metres.
         """
         cells = np.rint(along / SPACING).astype(np.int64).clip(0, self._last)
         return np.asarray(self._points[self._distinct[rows, None], cells]), cells * SPACING
@@ -160,16 +172,6 @@ def _allowed_speed(along: FloatArray, curvature: FloatArray, lateral: FloatArray
     return np.sqrt(np.maximum(least - 2 * _BEND_BRAKING * along, 0.0))
 
 
-_STIFFNESS = 2.5
-"""1/s: the braking for each m/s above the allowed speed."""
-_SLOWING = 4.0
-"""m/s²: the hardest braking to the speed that a bend allows."""
-_GENTLE_STOP = (3.0, 1.0)
-"""The hardest braking near standstill, m/s², and how much harder it can be for each m/s of speed."""
-_NO_GAP = 0.1
-"""Metres: a smaller gap counts as this."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Temper:
     """How road users drive, one row each (Treiber, Hennecke and Helbing 2000 name the parameters).
@@ -190,13 +192,7 @@ class Temper:
 
 
 def free_acceleration(temper: Temper, speed: FloatArray, allowed: FloatArray) -> FloatArray:
-    """The acceleration (A,) m/s² if nobody is in the way.
-
-    Args:
-        temper: how they drive.
-        speed: (A,) m/s.
-        allowed: (A,) m/s, the speed that the bends ahead allow.
-    """
+    """The acceleration (A,) m/s² at a speed if nobody is in the way and the bends ahead allow so much, (A,) m/s."""
     own = temper.acceleration * (1.0 - (speed / temper.max_speed) ** 4)
     bend = np.maximum(_STIFFNESS * (allowed - speed), -_SLOWING)
     return np.asarray(np.clip(np.minimum(own, bend), -HARDEST_BRAKING, None))
@@ -210,11 +206,7 @@ def hardest_braking(speed: FloatArray) -> FloatArray:
 def interaction(temper: Temper, speed: FloatArray, gap: FloatArray, leader_speed: FloatArray) -> FloatArray:
     """The acceleration (A,) m/s², 0 or less, that each adds because of the road user ahead.
 
-    Args:
-        temper: how they drive.
-        speed: (A,) m/s.
-        gap: (A,) metres to the road user ahead, infinite if there is none.
-        leader_speed: (A,) m/s, its speed along the same path.
+    The gap is (A,) metres, infinite without one; its speed is that along the same path, (A,) m/s.
     """
     return _interaction(temper, speed, gap, leader_speed, temper.min_gap, temper.time_gap)
 
@@ -240,3 +232,143 @@ def _interaction(
     closing = speed * (speed - leader_speed) / (2 * np.sqrt(temper.acceleration * temper.braking))
     wanted = min_gap + np.maximum(speed * time_gap + closing, 0.0)
     return np.asarray(-temper.acceleration * (wanted / np.maximum(gap, _NO_GAP)) ** 2)
+
+
+def lane_way(junction: Junction, route: Route, category: str) -> Path:
+    """The path of a driver or rider on a route."""
+    if category != "cyclist":
+        return route.path
+    return _cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
+
+
+def lane_span(route: Route) -> tuple[float, float]:
+    """Where the part of a route that may cross others begins and ends, metres along it."""
+    return route.stop_s - _SPAN[0], route.exit_s + _SPAN[1]
+
+
+def middle_of(route: Route) -> float:
+    """Metres along a route to the middle of the junction."""
+    return (route.enter_s + route.exit_s) / 2
+
+
+def road_crossing(spec: RoadSpec, arm: Arm, along: float, side: Side) -> Path:
+    """The straight path over an arm's road, from kerb to kerb, `along` metres from the junction's middle.
+
+    It begins on a side as a driver towards the junction sees it.
+    """
+    out_x, out_y = OUTWARD[arm]
+    beside = spec.road_edge + _KERB_ROOM
+    sign = 1.0 if side == "right" else -1.0  # the right of a driver inward is the left, seen outward
+    left = np.array([-out_y, out_x], dtype=np.float64)
+    start = along * np.array([out_x, out_y]) + sign * beside * left
+    yaw = float(np.arctan2(-sign * left[1], -sign * left[0]))
+    return straight((float(start[0]), float(start[1])), yaw, 2 * beside)
+
+
+def shifted(path: Path, offset: float) -> Path:
+    """The same path, `offset` metres further to the left."""
+    left = np.stack([-np.sin(path.yaw), np.cos(path.yaw)], axis=1)
+    return through(path.xy + offset * left)
+
+
+@lru_cache(maxsize=64)
+def _cyclist_path(spec: RoadSpec, from_arm: Arm, turn: Turn, lane: int) -> Path:
+    return shifted(Junction(spec).route(from_arm, turn, lane).path, -_CYCLIST_OFFSET)
+
+
+@dataclass(frozen=True, slots=True)
+class Manner:
+    """How the drivers of a category drive.
+
+    Attributes:
+        acceleration: acceleration from standstill, m/s².
+        braking: comfortable braking, m/s².
+        time_gap: seconds to the road user ahead.
+        min_gap: metres, bumper to bumper, when standing.
+        lateral: the most sideways acceleration in a bend, m/s².
+        max_speed: least and most speed on a free straight road, m/s.
+    """
+
+    acceleration: float
+    braking: float
+    time_gap: float
+    min_gap: float
+    lateral: float
+    max_speed: tuple[float, float]
+
+
+MANNERS = {
+    "car": Manner(2.2, 2.5, 0.9, 2.0, 2.8, (8.0, 12.5)),
+    "van": Manner(2.0, 2.4, 0.9, 2.0, 2.5, (7.5, 11.5)),
+    "truck": Manner(1.6, 2.0, 1.2, 2.5, 1.8, (7.0, 10.0)),
+    "motorcycle": Manner(2.8, 2.8, 1.0, 1.8, 3.0, (8.0, 12.5)),
+    "cyclist": Manner(1.0, 1.8, 1.0, 1.2, 2.0, (3.5, 6.0)),
+    "pedestrian": Manner(1.5, 2.0, 0.4, 0.5, 9.0, (0.9, 1.7)),
+}
+"""By category."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RoadUser:
+    """A road user that moves.
+
+    Attributes:
+        role: its role in the scenario.
+        body: its size and shape.
+        path: the path of its middle axis.
+        start: how far along its path its box's centre starts, metres.
+        start_speed: its speed at the start, m/s.
+        max_speed: the speed that it reaches on a free straight road, m/s.
+        delay: seconds that it stands before it starts to move.
+        route: its route over the junction; None for a pedestrian.
+        span: where the part of its path that may cross others begins and ends, metres; empty for a pedestrian who
+            stays on the sidewalk.
+        ignores: the rules that it breaks.
+        alert: seconds before a contact at which it notices the other one of the pair; 0 for never.
+    """
+
+    role: Role
+    body: Body
+    path: Path
+    start: float
+    start_speed: float
+    max_speed: float
+    delay: float = 0.0
+    route: Route | None = None
+    span: tuple[float, float] = (0.0, 0.0)
+    ignores: tuple[Rule, ...] = ()
+    alert: float = 0.0
+
+    @property
+    def walks(self) -> bool:
+        """Whether it has no wheels."""
+        return self.body.category == WALKER
+
+    @property
+    def manner(self) -> Manner:
+        """How it drives."""
+        return MANNERS[self.body.category]
+
+    @property
+    def wheelbase(self) -> float:
+        """Metres; 0 without wheels."""
+        return 0.0 if self.walks else WHEELBASE * self.body.size[0]
+
+    def obeying(self) -> "RoadUser":
+        """The same road user, which obeys all rules."""
+        return replace(self, ignores=())
+
+
+def temper_of(users: Sequence[RoadUser]) -> Temper:
+    """How they drive, as arrays."""
+    return Temper(
+        max_speed=_gather(users, lambda user: user.max_speed),
+        acceleration=_gather(users, lambda user: user.manner.acceleration),
+        braking=_gather(users, lambda user: user.manner.braking),
+        time_gap=_gather(users, lambda user: user.manner.time_gap),
+        min_gap=_gather(users, lambda user: user.manner.min_gap),
+    )
+
+
+def _gather(users: Sequence[RoadUser], value: Callable[[RoadUser], float]) -> FloatArray:
+    return np.array([value(user) for user in users], dtype=np.float64)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.synth.roads.layout import OUTWARD, Arm
 from deepaccident_devkit.synth.roads.paths import Path
-from deepaccident_devkit.synth.traffic.users import RoadUser
+from deepaccident_devkit.synth.traffic.driving import RoadUser
 
 RED, AMBER, GREEN = range(3)
 Axis = Literal["west-east", "south-north"]
@@ -53,14 +53,7 @@ class SignalPlan:
 
 
 def plan_with_green(axis: Axis, time: float, green: float, share: float) -> SignalPlan:
-    """A plan in which an axis has green at a time.
-
-    Args:
-        axis: the axis with green.
-        time: when it has green, seconds.
-        green: how long each axis has green, seconds.
-        share: the share of this green that is over at `time`, from 0 to 1.
-    """
+    """A plan in which an axis has green at a time (seconds), when a share, 0 to 1, of its green (seconds) is over."""
     return SignalPlan(first=axis, start=time - share * green, green=green)
 
 
@@ -89,13 +82,9 @@ def find_zones(
     widths: FloatArray,
     together: BoolArray,
 ) -> Zones:
-    """The zones of all pairs.
+    """The zones of all pairs but those `together` (A, A), which follow each other or do not react to each other.
 
-    Args:
-        paths: the paths of the road users.
-        spans: where the part of each path that can meet others begins and ends, metres.
-        widths: (A,) widths of their bodies, metres.
-        together: (A, A) bool, pairs without a zone: they follow each other, or do not react to each other.
+    Spans (metres) are the part of each path that can meet others; widths (A,) those of the bodies, metres.
     """
     count = len(paths)
     enter, leave = np.full((count, count), np.inf), np.full((count, count), np.inf)
@@ -158,13 +147,9 @@ def find_rights(
     minor: Sequence[Arm] = (),
     blind: tuple[int, int] | None = None,
 ) -> Rights:
-    """The rights of all pairs.
+    """The rights of all pairs; `minor` arms give way to the others (none at a junction with lights).
 
-    Args:
-        users: the road users.
-        minor: arms that give way to the others; none at a junction with lights.
-        blind: rows of a pair that see only the others on their own arm; all others let them go first, so that they
-            meet.
+    A `blind` pair (rows) sees only the others on their own arm; all others let them go first, so that they meet.
     """
     count = len(users)
     together, waits = np.zeros((count, count), dtype=bool), np.zeros((count, count), dtype=bool)
@@ -222,13 +207,8 @@ def waiting_gap(
 ) -> FloatArray:
     """Distance (A,) in metres to where each has to stop for others; infinite for those who may go.
 
-    Args:
-        rights: the rights of all pairs.
-        front: (A,) how far along its path the front of each is, metres.
-        rear: (A,) how far along its path the rear of each is, metres.
-        speed: (A,) m/s.
-        top_speed: (A,) m/s; nobody becomes faster than this.
-        held: (A,) bool, whether it stands or will stand before a red light.
+    Front and rear are (A,) metres along each path, speeds (A,) m/s; nobody becomes faster than the top speed. Those
+    `held` (A,) stand or will stand before a red light.
     """
     to_enter = rights.zones.enter - front[:, None]
     to_leave = rights.zones.leave - rear[:, None]

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
-from deepaccident_devkit.synth.collision import separation
 from deepaccident_devkit.synth.traffic.driving import (
     DECISION_STEPS,
     HARDEST_BRAKING,
     PERIOD,
+    RoadUser,
     Temper,
     Tracks,
     Wheels,
@@ -20,9 +21,9 @@ from deepaccident_devkit.synth.traffic.driving import (
     interaction,
     step,
     stopping,
+    temper_of,
 )
 from deepaccident_devkit.synth.traffic.rights import AMBER, GREEN, Rights, SignalPlan, waiting_gap
-from deepaccident_devkit.synth.traffic.users import RoadUser, temper_of
 
 _SPACING = 2.0
 _POINTS = np.arange(0.0, 44.0, _SPACING)
@@ -31,6 +32,10 @@ _MARGIN = 0.25
 """The free space at each side that drivers want, metres."""
 _BEHIND = 2.0
 """Metres: a road user that is farther back than this does not count as ahead."""
+_STEP = 0.05
+"""Seconds between the future moments that are checked for a contact."""
+_FIELD_OF_VIEW = np.deg2rad(80.0)
+"""How far to each side of straight ahead a driver looks, radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,11 +58,7 @@ class Bodies:
 def leaders(bodies: Bodies, tracks: Tracks, centers: FloatArray, sees: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Gap (A,) in metres to the nearest one ahead on each path, infinite if there is none, and that one's speed (A,).
 
-    Args:
-        bodies: where they are.
-        tracks: their paths.
-        centers: (A,) how far along its path the centre of each is, metres.
-        sees: (A, A) bool, whether the road user of the row reacts to that of the column.
+    Centres are (A,) metres along each path; `sees` (A, A) tells whether the row's road user reacts to the column's.
     """
     rows, others = _candidates(bodies, sees)
     gaps, speeds = np.full(len(centers), np.inf), np.zeros(len(centers))
@@ -102,19 +103,10 @@ def _in_path_frame(
     return ahead, cos * offset[:, 1] - sin * offset[:, 0], bodies.poses[others, 2] - yaw
 
 
-_STEP = 0.05
-"""Seconds between the future moments that are checked for a contact."""
-_FIELD_OF_VIEW = np.deg2rad(80.0)
-"""How far to each side of straight ahead a driver looks, radians."""
-
-
 class Alarm:
-    """Which of a pair has noticed its coming contact; from then on it brakes until the end.
+    """Which of a pair (rows, sizes (2, 2) metres) has noticed its coming contact; from then on it brakes until the end.
 
-    Args:
-        rows: (2,) rows of the pair.
-        size: (2, 2) length and width of the two, metres.
-        alert: (2,) seconds before the contact at which each notices it; 0 for never.
+    Each notices it `alert` (2,) seconds before; 0 for never.
     """
 
     def __init__(self, rows: IntArray, size: FloatArray, alert: FloatArray) -> None:
@@ -125,9 +117,7 @@ class Alarm:
     def rows(self, poses: FloatArray, velocities: FloatArray) -> IntArray:
         """Rows of those who brake, 0 to 2 of them; call it with one moment after the other.
 
-        Args:
-            poses: (A, 3) x, y (metres), yaw (radians) of all boxes' centres.
-            velocities: (A, 2) m/s; they are assumed to stay the same.
+        Poses are (A, 3) x, y (metres), yaw (radians) of the centres; velocities (A, 2) m/s are assumed to stay.
         """
         two, moving = poses[self._rows], velocities[self._rows]
         expected = np.repeat(two[:, None], len(self._ahead), axis=1)
@@ -177,15 +167,9 @@ def simulate(
     signals: SignalPlan | None = None,
     watched: tuple[int, int] | None = None,
 ) -> Simulation:
-    """Let road users drive and walk.
+    """Let road users drive and walk from `begin` to `end` (seconds), or until the watched pair (rows) touches.
 
-    Args:
-        users: who they are and how they start.
-        begin: time of the first step, seconds.
-        end: time of the last step, if the watched pair does not touch before.
-        rights: the rules between them; None if nobody reacts to anybody.
-        signals: the traffic lights; None if there are none.
-        watched: rows of two whose contact ends the simulation; they brake for each other at the last moment, or not.
+    The watched pair brakes for each other at the last moment, or not. Without rights nobody reacts to anybody.
     """
     run = _Run(users, rights, signals, watched)
     count = round((end - begin) / PERIOD) + 1
@@ -309,3 +293,44 @@ def _first_contact(states: FloatArray, size: FloatArray, pair: tuple[int, int], 
     apart = separation(states[low:high, first, :3], size[first], states[low:high, second, :3], size[second])
     touching: BoolArray = apart <= 0
     return low + int(touching.argmax()) if touching.any() else None
+
+
+def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:
+    """The widest gap (…) along any side's normal, metres: 0 where rectangles just touch, negative if they overlap.
+
+    Poses are (…, 3) x, y, yaw of the centres, sizes (…, 2) full length and width, metres; all broadcast.
+    """
+    turn = poses_b[..., 2] - poses_a[..., 2]
+    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    along_a = np.abs(_relative(poses_a, poses_b[..., :2]))
+    along_b = np.abs(_relative(poses_b, poses_a[..., :2]))
+    half_a, half_b = size_a / 2, size_b / 2
+    gaps = [
+        along_a[..., 0] - half_a[..., 0] - half_b[..., 0] * cos - half_b[..., 1] * sin,
+        along_a[..., 1] - half_a[..., 1] - half_b[..., 0] * sin - half_b[..., 1] * cos,
+        along_b[..., 0] - half_b[..., 0] - half_a[..., 0] * cos - half_a[..., 1] * sin,
+        along_b[..., 1] - half_b[..., 1] - half_a[..., 0] * sin - half_a[..., 1] * cos,
+    ]
+    result: FloatArray = np.max(np.stack(np.broadcast_arrays(*gaps)), axis=0)
+    return result
+
+
+def gap(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:
+    """The distance between rectangles (…), metres, 0 where they overlap; arguments as in `separation`.
+
+    Two disjoint rectangles are nearest at a corner of one of them.
+    """
+    return gaps_of_pairs(_footprints(poses_a, size_a), _footprints(poses_b, size_b))
+
+
+def _relative(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (…, 2) in the frames of poses (…, 3)."""
+    delta = points - poses[..., :2]
+    cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    return np.stack([cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]], axis=-1)
+
+
+def _footprints(poses: FloatArray, size: FloatArray) -> FloatArray:
+    """Rectangles (…, 5) as `geometry.footprints` has them: x, y, length, width, yaw."""
+    sizes = np.broadcast_to(size, (*poses.shape[:-1], 2))
+    return np.concatenate([poses[..., :2], sizes, poses[..., 2:]], axis=-1)

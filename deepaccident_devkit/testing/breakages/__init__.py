@@ -8,9 +8,8 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import ScenarioFolder, find_release
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
-from deepaccident_devkit.testing.breakages import files, folders, legal, sensors
-from deepaccident_devkit.testing.breakages.kinds import Breakage, BrokenRelease, Victim
-from deepaccident_devkit.testing.editing import ScenarioEditor
+from deepaccident_devkit.testing.breakages import files, folders
+from deepaccident_devkit.testing.breakages.breakage import Breakage, BrokenRelease, ScenarioEditor, Victim
 from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
 
 _GROUPS = (
@@ -20,13 +19,13 @@ _GROUPS = (
     files.CALIB_MEANING,
     files.META_FORM,
     files.META_MEANING,
-    sensors.FORM,
-    sensors.MISSING,
-    sensors.MEANING,
+    files.SENSOR_FORM,
+    files.SENSOR_MISSING,
+    files.SENSOR_MEANING,
     folders.BROKEN,
     folders.ODD,
     folders.SPLIT_FILES,
-    legal.GROUP,
+    folders.LEGAL,
 )
 BREAKAGES: Mapping[str, Breakage] = {breakage.name: breakage for group in _GROUPS for breakage in group.breakages}
 """Name → breakage."""

@@ -1,14 +1,23 @@
-"""Label, calib and meta files that cannot be read, must not be run, or say something wrong."""
+"""Files of labels, calib, meta and sensors that are missing, cannot be read, must not be run, or are wrong."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from deepaccident_devkit.errors import BrokenReleaseError, CalibError, LabelError, MetaError
+from deepaccident_devkit.errors import (
+    BrokenReleaseError,
+    CalibError,
+    LabelError,
+    MetaError,
+    MissingFileError,
+    SensorFileError,
+)
+from deepaccident_devkit.release import read_image, write_image
 from deepaccident_devkit.release.store import real_path
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
-from deepaccident_devkit.testing.breakages.kinds import Group, Victim
-from deepaccident_devkit.testing.editing import FIELD
+from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.testing.breakages.breakage import FIELD, Group, Victim
 
 LABEL_FORM = Group("label", opening=BrokenReleaseError, reading=LabelError)
 LABEL_MEANING = Group("label")
@@ -249,3 +258,94 @@ def meta_frames_wrong(victim: Victim) -> Path:
 def meta_pair_wrong(victim: Victim) -> Path:
     """Meta names a colliding actor that is in no label."""
     return _edit_first_line(victim, 1, "7777")
+
+
+SENSOR_FORM = Group("sensor", reading=SensorFileError, deep=True)
+SENSOR_MEANING = Group("sensor", deep=True)
+SENSOR_MISSING = Group("sensor", reading=MissingFileError)
+CAMERA = "Camera_Front"
+
+
+def _half(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
+def _rewritten(victim: Victim, channel: str, change: Callable[[AnyArray], AnyArray]) -> Path:
+    """The file of the victim's array, which is another one now."""
+    array = victim.editor.array(victim.agent, channel, victim.frame)
+    victim.editor.write_array(victim.agent, channel, victim.frame, change(array))
+    return victim.file(channel)
+
+
+@SENSOR_FORM.enter("sensor-unreadable", channel=CAMERA)
+def image_cut(victim: Victim) -> Path:
+    """An image file ends in the middle."""
+    return victim.replace(CAMERA, _half)
+
+
+@SENSOR_FORM.enter("sensor-empty", "sensor-unreadable", channel=CAMERA)
+def image_empty(victim: Victim) -> Path:
+    """An image file has no bytes."""
+    return victim.replace(CAMERA, lambda _: b"")
+
+
+@SENSOR_MISSING.enter("sensor-frames-missing", channel=CAMERA)
+def image_missing(victim: Victim) -> Path:
+    """An image file is missing."""
+    victim.editor.remove(victim.file(CAMERA))
+    return victim.file(CAMERA)
+
+
+@SENSOR_MEANING.enter("image-size", channel=CAMERA)
+def image_wrong_size(victim: Victim) -> Path:
+    """An image is twice as large as its K says."""
+    path = victim.file(CAMERA)
+    image = read_image(path)
+    victim.editor.changing(path)
+    write_image(path, np.ascontiguousarray(image.repeat(2, axis=0).repeat(2, axis=1)))
+    return path
+
+
+@SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
+def lidar_cut(victim: Victim) -> Path:
+    """An npz file of points ends in the middle."""
+    return victim.replace(LIDAR, _half)
+
+
+@SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
+def lidar_three_columns(victim: Victim) -> Path:
+    """A point cloud lacks the intensity."""
+    return _rewritten(victim, LIDAR, lambda points: points[:, :3])
+
+
+@SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
+def lidar_objects(victim: Victim) -> Path:
+    """A point cloud is an array of Python objects, which only a pickle can load."""
+    return _rewritten(victim, LIDAR, lambda points: points.astype(object))
+
+
+@SENSOR_MEANING.enter("points-differ", channel=LIDAR)
+def lidar_right_handed(victim: Victim) -> Path:
+    """A point cloud has the other handedness."""
+    return _rewritten(victim, LIDAR, lambda points: points * np.array([1, -1, 1, 1], dtype=np.float32))
+
+
+@SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
+def bev_cut(victim: Victim) -> Path:
+    """An npz file of the BEV camera ends in the middle."""
+    return victim.replace(BEV_CAMERA, _half)
+
+
+@SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
+def bev_half_size(victim: Victim) -> Path:
+    """A BEV array has 600 rows and columns."""
+    return _rewritten(victim, BEV_CAMERA, lambda picture: picture[::2, ::2])
+
+
+@SENSOR_MEANING.enter("bev-orientation", channel=BEV_CAMERA)
+def bev_mirrored(victim: Victim) -> Path:
+    """An agent's BEV arrays are mirrored, left to right."""
+    for frame in victim.editor.frames:
+        picture = victim.editor.array(victim.agent, BEV_CAMERA, frame)
+        victim.editor.write_array(victim.agent, BEV_CAMERA, frame, picture[:, ::-1])
+    return victim.editor.folder(victim.agent, BEV_CAMERA)

@@ -17,7 +17,7 @@ if importlib.util.find_spec("torch") is not None:
     torch.set_num_threads(1)  # several tests run side by side
 
     from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
-    from deepaccident_devkit.model.entry import Handedness, ModelInputs, model_inputs
+    from deepaccident_devkit.model.inputs import Handedness, ModelInputs, model_inputs
     from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 
 

@@ -14,11 +14,11 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.model import presets
+from deepaccident_devkit.model import training_loop as training
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
 from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
 from deepaccident_devkit.model.network import ModelConfig
-from deepaccident_devkit.model.training import train as training
-from deepaccident_devkit.model.training.config import TrainConfig
+from deepaccident_devkit.model.training_run import TrainConfig
 
 ALONG = (-50.0, 50.0, 2.5)
 """40 cells: 20 after the encoder, 5 of the latent."""

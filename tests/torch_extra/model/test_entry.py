@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.torch import AllEgosDataset, V2XConfig, V2XDataset, collate, collate_all_egos
 from deepaccident_devkit.geometry.conventions import flip_points, flip_pose, flip_six_vector, flip_vectors2, flip_yaw
-from deepaccident_devkit.model.entry import ModelInputs, mirrored_boxes, model_inputs
+from deepaccident_devkit.model.inputs import ModelInputs, mirrored_boxes, model_inputs
 from deepaccident_devkit.model.network import ModelConfig
 from deepaccident_devkit.model.warps import matrices_from_six
 from deepaccident_devkit.motion import Augmentation

@@ -20,7 +20,7 @@ from deepaccident_devkit.model.motion import (
     motion_losses,
 )
 from deepaccident_devkit.model.motion.decoders import FlowGru, SharedDecoder, warp_with_flow
-from deepaccident_devkit.model.motion.losses import center_loss, vector_loss
+from deepaccident_devkit.model.motion.head import center_loss, vector_loss
 
 # eight channels: a bottleneck of one channel of 3 × 3 cells can pass back a gradient of exactly 0
 SEPARATE = MotionHeadConfig(in_channels=8, latent=2, future_frames=2, samples=3)

@@ -25,7 +25,7 @@ from deepaccident_devkit.evaluation import (
 from deepaccident_devkit.evaluation.motion.evaluator import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
 from deepaccident_devkit.model.detection import TaskMaps, detection_targets
-from deepaccident_devkit.model.entry import mirrored_boxes
+from deepaccident_devkit.model.inputs import mirrored_boxes
 from deepaccident_devkit.model.motion import MotionMaps
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.results import (

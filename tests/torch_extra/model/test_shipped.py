@@ -14,7 +14,7 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError
 from deepaccident_devkit.model import PredictConfig, load_model, read_weights
 from deepaccident_devkit.model.checkpoint import SHIPPED, write_weights
-from deepaccident_devkit.model.training.data import validated
+from deepaccident_devkit.model.training_step import validated
 from deepaccident_devkit.motion import samples
 from deepaccident_devkit.release.layout import write_split_file
 from deepaccident_devkit.synth import SynthConfig, make_release

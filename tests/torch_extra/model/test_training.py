@@ -26,15 +26,22 @@ from torch_extra.model.small_model import RUN, small, small_released, trained
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
 from deepaccident_devkit.export.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
+from deepaccident_devkit.model import training_loop as training
 from deepaccident_devkit.model.checkpoint import BEST, FINAL, LAST, load_weights, read_weights, write_weights
-from deepaccident_devkit.model.entry import ModelInputs, mirrored_boxes, model_inputs
+from deepaccident_devkit.model.inputs import ModelInputs, mirrored_boxes, model_inputs
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
-from deepaccident_devkit.model.training import train as training
-from deepaccident_devkit.model.training.config import TrainConfig
-from deepaccident_devkit.model.training.data import Moments, batches
-from deepaccident_devkit.model.training.state import add_to_log, checked_device, cut_log, load_state, read_log
-from deepaccident_devkit.model.training.step import (
+from deepaccident_devkit.model.training_run import (
+    TrainConfig,
+    add_to_log,
+    checked_device,
+    cut_log,
+    load_state,
+    read_log,
+)
+from deepaccident_devkit.model.training_step import (
+    Moments,
     TrainingStep,
+    batches,
     freeze,
     generator_of,
     learning_rate,

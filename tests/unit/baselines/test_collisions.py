@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.baselines import Outlook, SeenActors
-from deepaccident_devkit.baselines.collisions import accidents_ahead
+from deepaccident_devkit.baselines.predict import accidents_ahead
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 

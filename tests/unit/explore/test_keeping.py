@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.explore import keeping
-from deepaccident_devkit.explore.keeping import Kept, KeptFiles
+from deepaccident_devkit.explore import explorer
+from deepaccident_devkit.explore.explorer import Kept, KeptFiles
 from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release.store import store
 
@@ -72,7 +72,7 @@ def test_files_lie_beside_the_index(da_b: DeepAccident) -> None:
 def test_where_the_index_cannot_be_written_the_users_cache_is_taken(
     da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(keeping, "is_writable_folder", lambda _: False)
+    monkeypatch.setattr(explorer, "is_writable_folder", lambda _: False)
     monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path / "cache" / "files"))
     files = KeptFiles(da_b)
     assert files.get("a", "thumbnail.jpg", lambda: b"1") == b"1"

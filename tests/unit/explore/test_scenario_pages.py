@@ -21,10 +21,10 @@ from replay_page import accident, data_of, normal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.explore import Explorer, make_app
-from deepaccident_devkit.explore.pages import scenarios
+from deepaccident_devkit.explore.pages import release
 from deepaccident_devkit.explore.pages.scenario import PARTS
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.entries import recording_of
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 
@@ -54,11 +54,9 @@ def image(answer: Answer) -> Image.Image:
 
 def test_no_page_is_made_in_the_servers_own_thread(app: Any, explorer: Explorer, monkeypatch: Any) -> None:
     """It answers all others meanwhile."""
-    found = scenarios.found_by
+    found = release.found_by
     threads = []
-    monkeypatch.setattr(
-        scenarios, "found_by", lambda *given: threads.append(threading.current_thread()) or found(*given)
-    )
+    monkeypatch.setattr(release, "found_by", lambda *given: threads.append(threading.current_thread()) or found(*given))
     query = "&".join(f"town=T{number}" for number in range(4000))
     whole = get(app, "/").text
     for address in (f"/?{query}", f"/?{query}&view=table", f"/selection.txt?{query}"):

@@ -10,7 +10,7 @@ from replay_page import accident, normal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.explore.explorer import SIZE, Explorer, thumbnail
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, MISSING_COLOR
+from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR
 
 
 def pixels(jpeg: bytes) -> np.ndarray:

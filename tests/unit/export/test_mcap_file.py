@@ -13,7 +13,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.export.mcap import EPOCH, export_mcap
 from deepaccident_devkit.motion import motion_labels
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR
 from deepaccident_devkit.v2x import cooperative_boxes, visible_instances
 

@@ -14,7 +14,7 @@ from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.scenario import build_scenario
-from deepaccident_devkit.synth.stage import World
+from deepaccident_devkit.synth.world import World
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
 
 

@@ -16,11 +16,10 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.accident import accident_words, draw_countdown, render_accident
-from deepaccident_devkit.render.best_view import best_view
-from deepaccident_devkit.render.colors import COLLIDER_COLOR
-from deepaccident_devkit.render.pair import Pair
-from deepaccident_devkit.render.roles import camera_name
+from deepaccident_devkit.render.accident import Pair, accident_words, draw_countdown, render_accident
+from deepaccident_devkit.render.boxes import camera_name
+from deepaccident_devkit.render.camera import best_view
+from deepaccident_devkit.render.styles import COLLIDER_COLOR
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
 from deepaccident_devkit.v2x import collision

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.best_view import best_view, crop_about
+from deepaccident_devkit.render.camera import best_view, crop_about
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from deepaccident_devkit.v2x.poses import camera_of
 

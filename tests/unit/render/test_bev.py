@@ -17,7 +17,9 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.bev import BevView, draw_bev, render_bev
-from deepaccident_devkit.render.colors import (
+from deepaccident_devkit.render.boxes import collider_ids
+from deepaccident_devkit.render.ground import draw_underlay
+from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     BEV_COLORS,
     CASING_COLOR,
@@ -25,8 +27,6 @@ from deepaccident_devkit.render.colors import (
     OWN_COLOR,
     POINT_COLOR,
 )
-from deepaccident_devkit.render.ground import draw_underlay
-from deepaccident_devkit.render.roles import collider_ids
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, short_name
 from deepaccident_devkit.v2x import Link, PoseNoise, cooperative_boxes

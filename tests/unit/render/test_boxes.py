@@ -23,7 +23,7 @@ from deepaccident_devkit.render.boxes import (
     draw_velocities_in_image,
     segments_in_image,
 )
-from deepaccident_devkit.render.colors import CATEGORY_COLORS
+from deepaccident_devkit.render.styles import CATEGORY_COLORS
 
 RED = "#e60026"
 CAMERA = PinholeCamera.from_field_of_view(400, 300, np.pi / 2)

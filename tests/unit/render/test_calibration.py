@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, render_calibration
-from deepaccident_devkit.render.colors import AGENT_COLORS
+from deepaccident_devkit.render.styles import AGENT_COLORS
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import map_pointcloud_to_image
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import render_pointcloud_in_image, render_sample_data
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, DEPTH_COLORMAP, HEIGHT_COLORMAP
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
 from deepaccident_devkit.v2x.poses import camera_of

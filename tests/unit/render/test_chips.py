@@ -8,7 +8,7 @@ from drawing import has_color, new_axes, on_canvas, rendered
 from matplotlib.axes import Axes
 
 from deepaccident_devkit.render.chips import keep_free, place_chips
-from deepaccident_devkit.render.colors import MUTED_COLOR
+from deepaccident_devkit.render.styles import MUTED_COLOR
 from deepaccident_devkit.support.arrays import FloatArray
 
 CAR = np.array([[2.3, 1.0], [2.3, -1.0], [-2.3, -1.0], [-2.3, 1.0]])

@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from scripts import loaded_script
 
 import deepaccident_devkit
-from deepaccident_devkit.render import colors
+from deepaccident_devkit.render import styles
 from deepaccident_devkit.render.motion_maps import direction_colors
 
 PACKAGE = Path(deepaccident_devkit.__file__).parent
@@ -53,13 +53,13 @@ def test_colours_that_stand_together_are_distinguished(script: ModuleType, group
 
 def test_saturation_is_the_agents_and_the_pairs_alone(script: ModuleType) -> None:
     vivid = script.GROUPS["agents and the pair"]
-    muted = [*colors.OUTCOME_COLORS.values(), colors.PREDICTED_COLOR, colors.ESTIMATE_COLOR]
+    muted = [*styles.OUTCOME_COLORS.values(), styles.PREDICTED_COLOR, styles.ESTIMATE_COLOR]
     shades = [
-        *colors.CATEGORY_COLORS.values(),
-        *colors.INSTANCE_COLORS,
-        *colors.SERIES_COLORS,
-        *colors.SPLIT_COLORS.values(),
-        *colors.BEV_COLORS.values(),
+        *styles.CATEGORY_COLORS.values(),
+        *styles.INSTANCE_COLORS,
+        *styles.SERIES_COLORS,
+        *styles.SPLIT_COLORS.values(),
+        *styles.BEV_COLORS.values(),
     ]
     assert script.chroma(vivid).min() > 36
     assert script.chroma(muted).max() < 40
@@ -68,34 +68,34 @@ def test_saturation_is_the_agents_and_the_pairs_alone(script: ModuleType) -> Non
 
 
 def test_nothing_but_the_pair_is_red(script: ModuleType) -> None:
-    maps = [colors.DEPTH_COLORMAP, colors.HEIGHT_COLORMAP, colors.CENTERNESS_COLORMAP]
+    maps = [styles.DEPTH_COLORMAP, styles.HEIGHT_COLORMAP, styles.CENTERNESS_COLORMAP]
     mapped = [to_hex(colormaps[name](share)) for name in maps for share in np.linspace(0, 1, 33)]
     turns = np.linspace(0, 2 * np.pi, 65)
     flow = [to_hex(each) for each in direction_colors(np.sin(turns), np.cos(turns), longest=1.0)]
     others = [
         each
-        for name, value in vars(colors).items()
-        if name.isupper() and name not in ("COLLIDER_COLOR", "CATEGORY_MARKERS")
+        for name, value in vars(styles).items()
+        if name.isupper() and name[0] != "_" and name not in ("COLLIDER_COLOR", "CATEGORY_MARKERS")
         for each in ([value] if isinstance(value, str) else value.values() if hasattr(value, "values") else value)
         if each.startswith("#")
     ]
     assert len(others) > 40
-    assert script.distances([*mapped, *flow, *others], [colors.COLLIDER_COLOR]).min() > 33
+    assert script.distances([*mapped, *flow, *others], [styles.COLLIDER_COLOR]).min() > 33
 
 
 def test_words_can_be_read_and_marks_be_seen(script: ModuleType) -> None:
-    words = [colors.COLLIDER_COLOR, colors.OWN_COLOR, colors.MUTED_COLOR, colors.WARNING_COLOR, colors.LINK_COLOR]
+    words = [styles.COLLIDER_COLOR, styles.OWN_COLOR, styles.MUTED_COLOR, styles.WARNING_COLOR, styles.LINK_COLOR]
     assert script.contrast(words, "#ffffff").min() >= 4.5  # WCAG's bound for words
-    assert script.contrast(colors.CATEGORY_COLORS.values(), "#ffffff").min() >= 2.5
+    assert script.contrast(styles.CATEGORY_COLORS.values(), "#ffffff").min() >= 2.5
     for ground, bound in (("white", 2.0), ("road", 1.6)):
-        assert script.contrast(colors.AGENT_COLORS.values(), script.GROUNDS[ground]).min() >= bound
+        assert script.contrast(styles.AGENT_COLORS.values(), script.GROUNDS[ground]).min() >= bound
 
 
 def sources(*suffixes: str) -> Iterator[tuple[str, str]]:
     """Names and texts of the package's files that may name colours."""
     for path in sorted(PACKAGE.rglob("*")):
         name = path.relative_to(PACKAGE)
-        if path.suffix in suffixes and name.parts[0] not in PAINTED and name.as_posix() != "render/colors.py":
+        if path.suffix in suffixes and name.parts[0] not in PAINTED and name.as_posix() != "render/styles.py":
             yield name.as_posix(), path.read_text(encoding="utf-8")
 
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, render_instance
 from deepaccident_devkit.render.actors import sightings
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS
 
 

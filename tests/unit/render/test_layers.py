@@ -3,7 +3,7 @@
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.axes import LAYERS, layers_of
+from deepaccident_devkit.render.figures import LAYERS, layers_of
 
 
 def test_none_is_the_default_and_nothing_is_nothing() -> None:

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.bev import link_words
-from deepaccident_devkit.render.colors import AGENT_COLORS, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.link import render_link, shared_boxes
+from deepaccident_devkit.render.styles import AGENT_COLORS, TRUE_PLACE_COLOR
 from deepaccident_devkit.v2x import Link, PoseNoise
 
 NOISE = Link(pose_noise=PoseNoise(mean=0.5, std=0.0))

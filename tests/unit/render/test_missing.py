@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import MissingFileError
-from deepaccident_devkit.render.best_view import best_view
-from deepaccident_devkit.render.colors import MISSING_COLOR
-from deepaccident_devkit.render.legends import missing_words
+from deepaccident_devkit.render.camera import best_view
+from deepaccident_devkit.render.captions import missing_words
+from deepaccident_devkit.render.styles import MISSING_COLOR
 
 FRONT = "ego_vehicle Camera_Front: not downloaded"
 POLE = "no LiDAR file of infrastructure"

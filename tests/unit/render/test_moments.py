@@ -11,8 +11,8 @@ from numpy.testing import assert_array_equal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, render_frame, render_sample
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.moments import draw_shared_moment
+from deepaccident_devkit.render.samples import draw_shared_moment
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
 
 pytestmark = pytest.mark.slow

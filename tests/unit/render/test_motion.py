@@ -32,9 +32,9 @@ from deepaccident_devkit.render import (
     draw_motion_output,
     draw_motion_trail,
 )
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, OWN_COLOR
+from deepaccident_devkit.render.boxes import collider_ids
 from deepaccident_devkit.render.motion_maps import PALEST
-from deepaccident_devkit.render.roles import collider_ids
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, OWN_COLOR
 
 CONFIG = MotionLabelConfig(
     grid=BevGrid(x=(-20, 30, 0.5), y=(-15, 15, 0.5)), receptive_field=1, future_frames=2, protocol="clean"

@@ -1,8 +1,8 @@
 """Who is red, who has an agent's hue, and who a category's shade."""
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.roles import recorder_ids, role_colors
+from deepaccident_devkit.render.boxes import recorder_ids, role_colors
+from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperative_boxes
 

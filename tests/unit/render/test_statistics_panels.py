@@ -7,7 +7,6 @@ from drawing import new_axes
 from matplotlib.markers import MarkerStyle
 
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.colors import CATEGORY_MARKERS
 from deepaccident_devkit.render.statistics import (
     draw_angles,
     draw_counts,
@@ -15,6 +14,7 @@ from deepaccident_devkit.render.statistics import (
     draw_quantiles,
     draw_relative_positions,
 )
+from deepaccident_devkit.render.styles import CATEGORY_MARKERS
 from deepaccident_devkit.statistics import DatasetStatistics
 from deepaccident_devkit.taxonomy import CATEGORIES
 

@@ -13,8 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, style
+from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.render.notebook import png_of
-from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.render.safety import render_lead_times
 from deepaccident_devkit.render.statistics import render_statistics
 from deepaccident_devkit.render.training import render_curve

@@ -8,8 +8,8 @@ from drawing import title_of, tokens_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import detached_figure, style
+from deepaccident_devkit.render.captions import moment_words, scene_words, set_scene_title, set_title
 from deepaccident_devkit.render.styles import current_style
-from deepaccident_devkit.render.titles import moment_words, scene_words, set_scene_title, set_title
 
 
 @pytest.mark.parametrize("fontsize", [None, "medium", 14])

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix, sights
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix, visibility_of
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -67,7 +67,7 @@ def test_a_dot_is_drawn_right_above_its_actor(hidden: DeepAccident) -> None:
 
 def test_the_hidden_collider_stands_out(hidden: DeepAccident) -> None:
     scenario = hidden.scenario[0]
-    known = sights(hidden, hidden.get_sample(scenario, "ego_vehicle", 2))
+    known = visibility_of(hidden, hidden.get_sample(scenario, "ego_vehicle", 2))
     other = known.boxes.actor_id == hidden.get("agent", f"{scenario['token']}/other_vehicle")["actor_id"]
     assert known.hidden_from("ego_vehicle")[other].all()
     ax = panel(hidden, known.sample)
@@ -92,17 +92,17 @@ def test_frames_agents_and_layers_are_the_callers(hidden: DeepAccident) -> None:
     token = f"{hidden.scenario[0]['token']}/010"
     ax = panel(hidden, hidden.get("frame", token), agents=["infrastructure", "ego_vehicle"], frame="world")
     assert [*dots(ax)] == ["ego_vehicle", "infrastructure"]
-    assert sights(hidden, token).sample.endswith("ego_vehicle/010")  # the first agent there
+    assert visibility_of(hidden, token).sample.endswith("ego_vehicle/010")  # the first agent there
     bare = panel(hidden, token, layers=["ids"])
     assert not dots(bare)
-    assert len(bare.texts) == len(sights(hidden, token).boxes)
+    assert len(bare.texts) == len(visibility_of(hidden, token).boxes)
     wide = panel(hidden, token, view_range=12.0)
     assert_allclose(np.diff([wide.get_xlim(), wide.get_ylim()]), 24.0)
 
 
 def test_the_matrix_has_a_cell_for_each_actor_and_agent(hidden: DeepAccident) -> None:
     sample = hidden.get_sample(hidden.scenario[0], "ego_vehicle", 10)
-    known = sights(hidden, sample)
+    known = visibility_of(hidden, sample)
     ax = detached_figure((5, 7)).add_subplot()
     assert render_visibility_matrix(hidden, sample, ax=ax) is ax
     rows = [label.get_text() for label in ax.get_yticklabels()]
@@ -125,7 +125,7 @@ def test_a_normal_scenario_hides_nothing(da_motion: DeepAccident) -> None:
     normal = next(scenario for scenario in da_motion.scenario if not scenario["collision"])
     ax = panel(da_motion, da_motion.get_sample(normal, "ego_vehicle", 5))
     assert words(ax) == []
-    assert not sights(da_motion, f"{normal['token']}/005").hidden_from("ego_vehicle").any()
+    assert not visibility_of(da_motion, f"{normal['token']}/005").hidden_from("ego_vehicle").any()
 
 
 def test_two_that_see_each_other_have_two_lines_and_the_legend_says_what_marks_mean(hidden: DeepAccident) -> None:
@@ -145,6 +145,6 @@ def test_no_actor_of_the_view_is_cut(hidden: DeepAccident, index: int) -> None:
     sample = hidden.get_sample(hidden.scenario[0], "ego_vehicle", index)
     ax = panel(hidden, sample)
     low, high = np.array([ax.get_xlim(), ax.get_ylim()]).T
-    known = sights(hidden, sample)
+    known = visibility_of(hidden, sample)
     corners = known.boxes.bottom_corners()[known.collides | known.records, :, :2].reshape(-1, 2)
     assert ((corners > low) & (corners < high)).all()

@@ -31,10 +31,10 @@ from deepaccident_devkit.safety import (
 from deepaccident_devkit.safety.avoidability import MASKS, last_moments
 from deepaccident_devkit.safety.contact import pair_of
 from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.collision import gap
 from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.recording import RecordingJob
+from deepaccident_devkit.synth.scenario import RecordingJob
 from deepaccident_devkit.synth.traffic.driving import HARDEST_BRAKING
+from deepaccident_devkit.synth.traffic.simulate import gap
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, FRAME_PERIOD
 
 pytestmark = pytest.mark.slow

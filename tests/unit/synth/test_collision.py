@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely import affinity, box
 
-from deepaccident_devkit.synth.collision import gap, separation
+from deepaccident_devkit.synth.traffic.simulate import gap, separation
 
 coordinates = st.floats(-8, 8)
 poses = st.tuples(coordinates, coordinates, st.floats(-4, 4)).map(np.array)

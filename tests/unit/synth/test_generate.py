@@ -9,11 +9,10 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.release import find_release, read_calib, read_image, read_label, read_meta, read_split_file
-from deepaccident_devkit.synth import SynthConfig, generate, make_release, recording
+from deepaccident_devkit.synth import SynthConfig, generate, make_release
 from deepaccident_devkit.synth.generate import Unfinished
 from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.recording import _Recorder, record_scenario
-from deepaccident_devkit.synth.scenario import build_scenario
+from deepaccident_devkit.synth.scenario import _KEPT, _Recorder, build_scenario, parts_of, record_scenario
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CHANNELS, LIDAR, MINI_SPLITS, SPLITS
 from deepaccident_devkit.validation import release_completeness, validate_release
 
@@ -93,9 +92,9 @@ def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, digests):
 
 
 def test_one_scenario_gives_work_to_several_processes():
-    assert recording.parts_of(SynthConfig(frames=None)) == recording.parts_of(SynthConfig(frames=60)) >= 4
-    assert recording.parts_of(SynthConfig(frames=2)) == 2
-    assert recording.parts_of(SynthConfig(frames=60, sensors="none")) == 1
+    assert parts_of(SynthConfig(frames=None)) == parts_of(SynthConfig(frames=60)) >= 4
+    assert parts_of(SynthConfig(frames=2)) == 2
+    assert parts_of(SynthConfig(frames=60, sensors="none")) == 1
 
 
 @pytest.fixture
@@ -173,7 +172,7 @@ def test_a_scenario_that_could_not_be_moved_in_is_not_made_again(tmp_path, diges
         patch.setattr(Unfinished, "gather", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             make_release(tmp_path / "out", config, workers=1)
-    assert recording._KEPT.made_ready.cache_info().currsize == 0
+    assert _KEPT.made_ready.cache_info().currsize == 0
     with monkeypatch.context() as patch:
         patch.setattr(generate, "record_scenario", lambda _: pytest.fail("made again"))
         make_release(tmp_path / "out", config, workers=1)

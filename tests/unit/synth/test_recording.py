@@ -11,7 +11,7 @@ from deepaccident_devkit.release import (
     read_meta,
     world_from_label_velocity,
 )
-from deepaccident_devkit.synth.collision import gap, separation
+from deepaccident_devkit.synth.traffic.simulate import gap, separation
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES
 
 FRAMES = (1, 2, 3)

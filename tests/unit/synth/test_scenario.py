@@ -5,11 +5,10 @@ import pytest
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth.collision import separation
-from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.plan import plan_scenarios
+from deepaccident_devkit.synth.plan import SynthConfig, plan_scenarios
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS
+from deepaccident_devkit.synth.traffic.simulate import separation
 from deepaccident_devkit.tables.build import accident_type
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 

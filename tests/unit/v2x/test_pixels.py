@@ -13,8 +13,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.recording import RecordingJob, record_scenario
-from deepaccident_devkit.synth.scenario import Scenario, build_scenario
+from deepaccident_devkit.synth.scenario import RecordingJob, Scenario, build_scenario, record_scenario
 from deepaccident_devkit.synth.sensors.agents import Agent, Camera, make_agents
 from deepaccident_devkit.synth.sensors.render import ray_directions, slopes
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting, make_scene

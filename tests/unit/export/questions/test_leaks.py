@@ -19,7 +19,7 @@ from deepaccident_devkit.release.layout import find_release
 from deepaccident_devkit.release.meta import write_meta
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.testing.editing import FIELD, ScenarioEditor
+from deepaccident_devkit.testing.breakages.breakage import FIELD, ScenarioEditor
 
 FORM = Questions(observers="+behind", window=WindowRules(observe=1.0, stride=0.5))
 Edit = Callable[[ScenarioEditor], None]

@@ -7,8 +7,8 @@ from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
 from deepaccident_devkit.evaluation.detection.result import DetectionResult
-from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.evaluation import render_breakdown
+from deepaccident_devkit.render.styles import AGENT_COLORS
 
 
 def test_breakdowns_have_a_bar_and_an_interval_a_group(detected: DetectionResult) -> None:

@@ -17,10 +17,10 @@ from deepaccident_devkit.evaluation import instances_of
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.colors import OUTCOME_COLORS
+from deepaccident_devkit.render.captions import moment_words, scene_words
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
 from deepaccident_devkit.render.evaluation.figures import complete_figure, run_figures, sample_figures
-from deepaccident_devkit.render.titles import moment_words, scene_words
+from deepaccident_devkit.render.styles import OUTCOME_COLORS
 
 pytestmark = pytest.mark.slow
 

@@ -26,7 +26,6 @@ from deepaccident_devkit.evaluation.accident.evaluator import ComparedAccidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.boxes import NEAREST_DRAWN
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, MISSING_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.outcomes import (
     draw_outcome_in_camera,
     render_evaluation,
@@ -35,6 +34,7 @@ from deepaccident_devkit.render.outcomes import (
 )
 from deepaccident_devkit.render.outcomes.above import FORESEEN_COLOR
 from deepaccident_devkit.render.outcomes.evaluation import AccidentVerdict
+from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.poses import camera_of
 

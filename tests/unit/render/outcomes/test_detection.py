@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import DetectedBoxes, detection_truth
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.outcomes import draw_detection_outcome
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
+from deepaccident_devkit.render.styles import OUTCOME_COLORS
 
 
 def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sample: str) -> None:

@@ -25,10 +25,10 @@ from deepaccident_devkit.evaluation import (
 from deepaccident_devkit.evaluation.accident.evaluator import PROTOCOLS, compared_accidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
-from deepaccident_devkit.render.colors import COLLIDER_COLOR
+from deepaccident_devkit.render.boxes import collider_ids
 from deepaccident_devkit.render.outcomes.above import verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
-from deepaccident_devkit.render.roles import collider_ids
+from deepaccident_devkit.render.styles import COLLIDER_COLOR
 
 
 def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample: str) -> None:

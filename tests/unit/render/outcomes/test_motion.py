@@ -10,9 +10,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import MotionEvaluator, MotionOutput, instances_of
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.outcomes import motion_outcome
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
+from deepaccident_devkit.render.styles import OUTCOME_COLORS
 
 
 def damaged(labels: MotionLabels) -> MotionOutput:

@@ -10,8 +10,8 @@ from replay_page import accident
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.entries import recording_of
+from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 

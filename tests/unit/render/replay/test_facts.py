@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from replay_page import accident, data_of, normal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.entries import recording_of
+from deepaccident_devkit.render.styles import COLLIDER_COLOR
 
 
 def test_the_countdown_ends_at_the_impact(da: DeepAccident, data: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from replay_page import accident, normal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
-from deepaccident_devkit.render.replay.recording import Recording, actor_entries, recording_of
+from deepaccident_devkit.render.replay.entries import Recording, actor_entries, recording_of
 from deepaccident_devkit.render.replay.sensors import Followed, _steady, follow_pair
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x.tracks import scenario_tracks

@@ -19,7 +19,7 @@ from deepaccident_devkit.errors import ChoiceError, TokenError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.render.replay.replay import replay_page
+from deepaccident_devkit.render.replay.page import replay_page
 
 
 def test_the_same_call_gives_the_same_bytes(da: DeepAccident, page: Path, tmp_path: Path) -> None:

@@ -14,10 +14,10 @@ from replay_page import accident, data_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.maps import town_map
 from deepaccident_devkit.release.npz import TAGS
-from deepaccident_devkit.render.colors import BEV_COLORS
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.entries import recording_of
 from deepaccident_devkit.render.replay.road import road_picture
+from deepaccident_devkit.render.styles import BEV_COLORS
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA
 
 

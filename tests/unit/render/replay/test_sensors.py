@@ -15,7 +15,7 @@ from replay_page import accident, data_of, picture
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render.replay import render_replay, sensors
-from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.entries import recording_of
 from deepaccident_devkit.render.replay.sensors import Followed, Jpegs, PictureSettings, camera_files, camera_pictures
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 

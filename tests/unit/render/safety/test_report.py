@@ -13,7 +13,7 @@ from report_page import Page, page_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, OutputFolderError, SensorFileError
-from deepaccident_devkit.render.replay import replay
+from deepaccident_devkit.render.replay import page as replay_page
 from deepaccident_devkit.render.safety import report as report_module
 from deepaccident_devkit.render.safety import save_safety_report
 from deepaccident_devkit.render.safety.report import by_severity, replay_names, report_html
@@ -143,7 +143,7 @@ def test_a_replay_page_that_cannot_be_made_is_named(
     def fails(*_: object, **_how: object) -> None:
         raise SensorFileError("front.jpg: cannot be read")
 
-    monkeypatch.setattr(replay, "render_replay", fails)
+    monkeypatch.setattr(replay_page, "render_replay", fails)
     page = page_of(save_safety_report(report, tmp_path, dataset=da_motion, workers=1)[-1])
     assert "replay pagesfront.jpg: cannot be read" in page.text
     assert all(str(each["href"]).startswith("#") for each in page.all("a"))

@@ -12,7 +12,7 @@ from video_views import colors, decoded
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.video import render_scenario_video, write_video
 
 

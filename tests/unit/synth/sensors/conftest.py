@@ -8,7 +8,7 @@ from deepaccident_devkit.synth.actors import MEDIAN_SIZES, Actor, Actors, Motion
 from deepaccident_devkit.synth.roads import Hump, Junction, RoadSpec
 from deepaccident_devkit.synth.sensors.rig import make_rig
 from deepaccident_devkit.synth.shapes import shape_of
-from deepaccident_devkit.synth.stage import random_world
+from deepaccident_devkit.synth.world import random_world
 from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID, VEHICLE_AGENTS
 
 RED, BLUE = (200, 30, 30), (30, 60, 200)

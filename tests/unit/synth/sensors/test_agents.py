@@ -7,7 +7,7 @@ from deepaccident_devkit.synth.actors import MEDIAN_SIZES
 from deepaccident_devkit.synth.roads import Junction, RoadSpec
 from deepaccident_devkit.synth.sensors.render import ray_directions, slopes
 from deepaccident_devkit.synth.solids import face_corners, face_planes
-from deepaccident_devkit.synth.stage import random_world
+from deepaccident_devkit.synth.world import random_world
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 

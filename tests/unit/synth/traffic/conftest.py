@@ -7,7 +7,7 @@ import pytest
 
 from deepaccident_devkit.synth.actors import random_body
 from deepaccident_devkit.synth.roads import Junction, RoadSpec, straight
-from deepaccident_devkit.synth.traffic.users import RoadUser, lane_span
+from deepaccident_devkit.synth.traffic.driving import RoadUser, lane_span
 
 
 @lru_cache(maxsize=8)

@@ -6,9 +6,9 @@ import pytest
 from deepaccident_devkit.synth.roads import Junction, RoadSpec
 from deepaccident_devkit.synth.roads.layout import OUTWARD
 from deepaccident_devkit.synth.spec import ActorSpec, BackgroundSpec, ScenarioSpec
+from deepaccident_devkit.synth.traffic.accidents import touching_pairs
 from deepaccident_devkit.synth.traffic.background import background_users, parked_vehicles
-from deepaccident_devkit.synth.traffic.casting import cast_actors
-from deepaccident_devkit.synth.traffic.impact import touching_pairs
+from deepaccident_devkit.synth.traffic.placement import cast_actors
 from deepaccident_devkit.synth.traffic.rights import RED, SignalPlan
 
 MANY = BackgroundSpec(vehicles=12, two_wheelers=6, parked=14, walking=8, crossing=6)

@@ -7,9 +7,15 @@ import pytest
 
 from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, draw, read_design
-from deepaccident_devkit.synth.traffic.casting import WARM_UP
-from deepaccident_devkit.synth.traffic.drama import Performance, perform_twin, set_stage, try_accident
-from deepaccident_devkit.synth.traffic.impact import least_gap, touching_pairs
+from deepaccident_devkit.synth.traffic.accidents import (
+    Performance,
+    least_gap,
+    perform_twin,
+    set_stage,
+    touching_pairs,
+    try_accident,
+)
+from deepaccident_devkit.synth.traffic.placement import WARM_UP
 
 pytestmark = pytest.mark.slow
 

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.collision import separation
-from deepaccident_devkit.synth.traffic.impact import impact_of, least_gap, touching_pairs
-from deepaccident_devkit.synth.traffic.simulate import Simulation
+from deepaccident_devkit.synth.traffic.accidents import impact_of, least_gap, touching_pairs
+from deepaccident_devkit.synth.traffic.simulate import Simulation, separation
 
 THREE_SIZES = np.array([[4.0, 2.0], [4.0, 2.0], [4.0, 2.0]])
 

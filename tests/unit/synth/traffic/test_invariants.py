@@ -5,16 +5,20 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.plan import plan_scenarios
+from deepaccident_devkit.synth.plan import SynthConfig, plan_scenarios
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS
-from deepaccident_devkit.synth.stage import random_world
-from deepaccident_devkit.synth.traffic.casting import WARM_UP, unplanned
-from deepaccident_devkit.synth.traffic.drama import Performance, perform_twin, set_stage, try_accident
+from deepaccident_devkit.synth.traffic.accidents import (
+    Performance,
+    perform_twin,
+    set_stage,
+    touching_pairs,
+    try_accident,
+)
 from deepaccident_devkit.synth.traffic.driving import HARDEST_BRAKING, MAX_STEER, PERIOD
-from deepaccident_devkit.synth.traffic.impact import touching_pairs
+from deepaccident_devkit.synth.traffic.placement import WARM_UP, unplanned
 from deepaccident_devkit.synth.traffic.rights import GREEN, RED
+from deepaccident_devkit.synth.world import random_world
 
 pytestmark = pytest.mark.slow
 

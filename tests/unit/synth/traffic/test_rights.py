@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.traffic.impact import touching_pairs
+from deepaccident_devkit.synth.traffic.accidents import touching_pairs
 from deepaccident_devkit.synth.traffic.rights import find_rights, find_zones, waiting_gap
 from deepaccident_devkit.synth.traffic.simulate import simulate
 

@@ -5,8 +5,8 @@ import pytest
 
 from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import draw, read_design
-from deepaccident_devkit.synth.traffic.casting import unplanned
-from deepaccident_devkit.synth.traffic.drama import Performance, perform_twin, set_stage, try_accident
+from deepaccident_devkit.synth.traffic.accidents import Performance, perform_twin, set_stage, try_accident
+from deepaccident_devkit.synth.traffic.placement import unplanned
 
 
 def played(seed, design=1):
@@ -55,7 +55,7 @@ def test_a_pedestrian_steps_out_behind_the_crest_of_a_hump():
 
 
 def test_where_there_are_two_lanes_some_change_into_the_victim_s(monkeypatch):
-    monkeypatch.setattr("deepaccident_devkit.synth.traffic.casting._PEDESTRIANS", 0.0)
+    monkeypatch.setattr("deepaccident_devkit.synth.traffic.placement._PEDESTRIANS", 0.0)
     met = found = 0
     for seed in range(60):
         rng = np.random.default_rng([seed, 79])

@@ -17,7 +17,7 @@ from deepaccident_devkit.synth.roads import (
     RoadSpec,
 )
 from deepaccident_devkit.synth.roads.layout import OUTWARD
-from deepaccident_devkit.synth.stage import LAMP_COLORS, random_world
+from deepaccident_devkit.synth.world import LAMP_COLORS, random_world
 
 SPECS = {
     "four-way": RoadSpec(),

@@ -1,18 +1,31 @@
-"""The titles of pictures: a moment in words, and its token small beneath; nothing is cut off."""
+"""What a picture says of itself: its moment in words, what its colours mean, and which sensor files are not there."""
 
 from __future__ import annotations
 
 import math
 import re
+import textwrap
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.release.store import listed
+from deepaccident_devkit.render.boxes import in_drawing_order
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import MUTED_COLOR
-from deepaccident_devkit.render.styles import current_style
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    CATEGORY_COLORS,
+    CATEGORY_MARKERS,
+    COLLIDER_COLOR,
+    MISSING_COLOR,
+    MUTED_COLOR,
+    current_style,
+)
+from deepaccident_devkit.taxonomy import LIDAR, short_name
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.font_manager import FontProperties
@@ -27,9 +40,18 @@ _PANEL_SHARE: Final = 0.78
 """Of a panel's width: what is beside the axes moves their title to one side, and few pixels make letters wider."""
 _TOKEN_TEXT: Final = 7.5
 """Points of a token's letters: it is there to be copied, not to be read."""
-_GID: Final = "token"
+_BENEATH: Final = "token"
 """Marks the token in a figure."""
 _CAPITALS: Final = re.compile(r"(?<=[a-z])(?=[A-Z])")
+INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
+"""A place in axes, so that nothing stands beside them."""
+_HANDLE: Final = 0.4
+"""Inches of a sign and the blanks around it."""
+_SPACING: Final[Mapping[str, Any]] = {"handlelength": 1.2, "columnspacing": 1.0}
+_MISSING: Final = "missing"
+"""Marks the words in a figure, so that `missing_words` finds them."""
+_CORNER_LETTERS: Final = 50
+"""In a line of a corner."""
 
 
 def scene_words(dataset: Dataset, scenario: str) -> str:
@@ -52,15 +74,10 @@ def moment_words(dataset: Dataset, token: str) -> str:
 def set_scene_title(
     where: Axes | Figure, dataset: Dataset, token: str, words: str = "", *, below: str = "", **style: Any
 ) -> None:
-    """Give axes or a figure a title: `Night, hard rain, Town10HD: 1.0 s to the impact, ego vehicle`, and the token.
+    """Title axes or a figure `Night, hard rain, Town10HD: 1.0 s to the impact, ego vehicle`, and a token small beneath.
 
-    Args:
-        where: axes or a figure.
-        dataset: the release.
-        token: what is shown: a scenario, frame, sample, sensor file, box or actor.
-        words: more about it, on the same line.
-        below: another line.
-        style: as `set_title` takes it.
+    The token is that of a scenario, frame, sample, sensor file, box or actor; `words` follow on the same line, `below`
+    on another one.
     """
     from matplotlib.axes import Axes
 
@@ -76,17 +93,10 @@ def set_scene_title(
 def set_title(
     where: Axes | Figure, words: str, *, token: str = "", fontsize: float | str | None = None, **style: Any
 ) -> None:
-    """Give axes or a figure a title that its figure's width does not cut off.
+    """Give axes or a figure a title that its figure's width does not cut off, and a token beneath if its style has any.
 
     If a line is a little too long, the letters are smaller. If it is far too long, it is broken, best after `/`, `:`
-    or a comma.
-
-    Args:
-        where: axes or a figure.
-        words: the title; the whole of it, and not only a line, is centred.
-        token: written small beneath, unless the style has no tokens.
-        fontsize: of the title; None for matplotlib's.
-        style: matplotlib's arguments for the title.
+    or a comma. The whole of it, and not only a line, is centred.
     """
     from matplotlib import rcParams
     from matplotlib.axes import Axes
@@ -113,10 +123,10 @@ def _write_token(where: Any, token: str, size: float, title: Any) -> None:
     from matplotlib.text import Annotation
 
     figure = where.figure
-    for older in [each for each in figure.artists if each.get_gid() == _GID and each.xycoords is title]:
+    for older in [each for each in figure.artists if each.get_gid() == _BENEATH and each.xycoords is title]:
         older.remove()
     if token:
-        how: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": size, "color": MUTED_COLOR, "gid": _GID}
+        how: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": size, "color": MUTED_COLOR, "gid": _BENEATH}
         figure.add_artist(Annotation(token, (0.5, 0), xycoords=title, annotation_clip=False, **how)).set_in_layout(
             False
         )
@@ -176,3 +186,102 @@ def _width_in(file: str, text: str, size: float) -> float:
 
     font = FontProperties(fname=file, size=size)
     return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0]) if text else 0.0
+
+
+def box_handles(colors: Collection[str]) -> list[Artist]:
+    """What these colours of boxes mean: a patch for each, or the mark of a class of small actors."""
+    from matplotlib.colors import to_rgba
+    from matplotlib.patches import Patch
+
+    agents = {short_name(agent): color for agent, color in AGENT_COLORS.items()}
+    meanings = {"colliding pair": COLLIDER_COLOR, **agents, **CATEGORY_COLORS}
+    return [
+        _mark(name, CATEGORY_MARKERS[name], color)
+        if name in CATEGORY_MARKERS
+        else Patch(label=name, facecolor=to_rgba(color, 0.25), edgecolor=color)
+        for name, color in meanings.items()
+        if color in colors
+    ]
+
+
+def agent_handles(agents: Collection[str]) -> list[Artist]:
+    """A dot for each agent, in the order of all pictures."""
+    return [_mark(short_name(agent), "o", AGENT_COLORS[agent]) for agent in in_drawing_order(agents)]
+
+
+def handles_from_above(colors: Collection[str], clouds: Collection[str]) -> list[Artist]:
+    """What the colours of boxes and of agents' clouds mean; an agent with a cloud is named once."""
+    known = {AGENT_COLORS[agent] for agent in clouds}
+    return [*box_handles(set(colors) - known), *agent_handles(clouds)]
+
+
+def _mark(label: str, marker: str, color: str) -> Artist:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], linestyle="none", marker=marker, color=color, label=label)
+
+
+def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int | None = None, **how: Any) -> None:
+    """Render a legend, by default below all panels of a figure, with as many columns as have room; none if empty."""
+    from matplotlib.font_manager import FontProperties
+
+    if handles:
+        font = FontProperties(size=SMALLEST_TEXT)
+        widest = max(text_width(str(handle.get_label()), font) for handle in handles) / 72 + _HANDLE
+        columns = max(1, min(columns or len(handles), int(room_of(where) / widest)))
+        style = {"loc": "outside lower center", "fontsize": SMALLEST_TEXT, "frameon": False, **_SPACING, **how}
+        where.legend(handles=list(handles), ncols=columns, **style)
+
+
+def draw_legend_of_fills(ax: Axes, colors: Mapping[str, str]) -> None:
+    """Put a legend of filled shapes into the axes."""
+    from matplotlib.patches import Patch
+
+    handles = [Patch(label=name, facecolor=(color, 0.4), edgecolor=color) for name, color in colors.items()]
+    draw_legend(ax, handles, columns=1, **INSIDE)
+
+
+def is_there(dataset: Dataset, sample_data: str) -> bool:
+    """Whether a sensor's file, by its token, is there."""
+    return dataset.sensor_path(sample_data).exists()
+
+
+def has_cloud(dataset: Dataset, sample: str) -> bool:
+    """Whether the LiDAR file of a sample, by its token, is there."""
+    return is_there(dataset, f"{sample}/{LIDAR}")
+
+
+def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
+    """Make axes a grey panel that names the agent and the camera of an image (a token) that is not there."""
+    agent, _, channel = sample_data.rsplit("/", 3)[1:]
+    ax.set_facecolor(MISSING_COLOR)
+    words = f"{agent}\n{channel}:\n{absence_text(dataset, sample_data)}"
+    ax.text(0.5, 0.95, words, ha="center", va="top", fontsize=SMALLEST_TEXT, transform=ax.transAxes, gid=_MISSING)
+
+
+def absence_text(dataset: Dataset, sample_data: str) -> str:
+    """Why a sensor's file, by its token, is not there: the folder has files of other frames, or none at all."""
+    folder = dataset.sensor_path(sample_data).parent
+    return "no file of this frame" if folder.is_dir() and listed(folder) else "not downloaded"
+
+
+def write_missing(ax: Axes, words: str) -> None:
+    """Write into the lower left corner of axes what is not in the picture; nothing if there are no words."""
+    if words:
+        paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
+        text = textwrap.fill(words, _CORNER_LETTERS)
+        style: dict[str, Any] = {"fontsize": SMALLEST_TEXT, "bbox": paper, "zorder": 8, "gid": _MISSING}
+        ax.annotate(text, (0, 0), (4, 4), xycoords="axes fraction", textcoords="offset points", **style)
+
+
+def missing_clouds_text(agents: Collection[str]) -> str:
+    """`no LiDAR file of ego_vehicle, infrastructure`; empty if it is nobody."""
+    return f"no LiDAR file of {', '.join(in_drawing_order(agents))}" if agents else ""
+
+
+def missing_words(drawn: Axes | Figure) -> list[str]:
+    """What a picture, or the picture of these axes, says of files that are not there, each once."""
+    figure: Any = drawn.figure
+    texts = figure.findobj(lambda artist: artist.get_gid() == _MISSING)
+    words = (" ".join(text.get_text().split()) for text in texts)
+    return list(dict.fromkeys(part for text in words for part in text.split("; ")))

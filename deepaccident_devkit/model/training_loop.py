@@ -24,11 +24,10 @@ from deepaccident_devkit.model.checkpoint import BEST, FINAL, load_weights, read
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.presets import ModelChoice
 from deepaccident_devkit.model.results import PredictConfig, check_images
-from deepaccident_devkit.model.training.config import TrainConfig
-from deepaccident_devkit.model.training.data import SCORE, Moments, batches, validated, validation_samples
-from deepaccident_devkit.model.training.state import (
+from deepaccident_devkit.model.training_run import (
     Place,
     Progress,
+    TrainConfig,
     add_to_log,
     cut_log,
     load_state,
@@ -36,14 +35,19 @@ from deepaccident_devkit.model.training.state import (
     read_log,
     save_state,
 )
-from deepaccident_devkit.model.training.step import (
+from deepaccident_devkit.model.training_step import (
+    SCORE,
+    Moments,
     TrainingStep,
+    batches,
     freeze,
     generator_of,
     learning_rate,
     optimizer_of,
     positions,
     training_batch,
+    validated,
+    validation_samples,
     with_dropped_partners,
 )
 from deepaccident_devkit.render.training import save_training

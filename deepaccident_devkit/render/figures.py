@@ -1,16 +1,19 @@
-"""Where panels are rendered, on the caller's axes or on new ones that a notebook shows, and which layers they have."""
+"""Figures and axes, made, laid out and written into files, and the layers that pictures have."""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Collection, Iterable
+import os
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Literal, get_args
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.colors import GRID_COLOR
-from deepaccident_devkit.render.styles import size_in_style
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.render.styles import GRID_COLOR, current_style, size_in_style
+from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.text import choice, path_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,25 +25,14 @@ Layer = Literal[
 """`image` is the camera's picture, `map` the town's ground by all its recordings, `bev` the simulator's camera from
 above, `labels` what the motion labels say."""
 LAYERS: tuple[Layer, ...] = get_args(Layer)
+_UNDATED: Final[Mapping[str, dict[str, Any]]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
 
 
 def layers_of(
     given: Iterable[Layer] | None, default: Iterable[Layer], possible: Collection[Layer] = LAYERS
 ) -> frozenset[Layer]:
-    """The layers to render.
-
-    Args:
-        given: the caller's layers, in a list or one alone. None stands for the default, an empty list for an empty
-            picture.
-        default: the layers rendered when the caller does not choose.
-        possible: the layers that the picture has.
-
-    Returns:
-        The layers chosen.
-
-    Raises:
-        ChoiceError: the picture does not have a layer.
-    """
+    """The layers to render of the possible ones: None is the default, an empty list none. Raises ChoiceError."""
     words = default if given is None else given
     return frozenset(choice("layers", layer, possible) for layer in ((words,) if isinstance(words, str) else words))
 
@@ -113,3 +105,52 @@ def settled(fig: Figure, passes: int = 1) -> Figure:
             for _ in range(passes):
                 engine.execute(fig)
     return fig
+
+
+def check_picture_path(path: str | os.PathLike[str]) -> Path:
+    """The path, if it has the suffix of a picture; raises ChoiceError."""
+    path = path_of(path)
+    if path.suffix.lower() not in PICTURE_SUFFIXES:
+        raise ChoiceError(f"path: expected a file that ends in {', '.join(PICTURE_SUFFIXES)}, found {str(path)!r}")
+    return path
+
+
+def figure_of_pixels(width: int, height: int, *, dpi: float) -> Figure:
+    """A figure that pyplot does not know, whose picture has exactly this width and height."""
+    whole = 1e-3  # a canvas drops fractions of pixels, and inches are rounded
+    figure = detached_figure(((width + whole) / dpi, (height + whole) / dpi))
+    figure.set_dpi(dpi)
+    return figure
+
+
+def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: float | None = None) -> Path:
+    """Write a `render_…` result's figure atomically into a file of one of `PICTURE_SUFFIXES`, and close it in pyplot.
+
+    `dpi` is pixels an inch; None for those of the style, in a notebook's 100. Raises ChoiceError for another suffix.
+    """
+    from matplotlib import pyplot as plt
+
+    path = check_picture_path(path)
+    figure: Any = drawn.figure
+    try:
+        return write_figure(figure, path, dpi=dpi or current_style().dpi)
+    finally:
+        plt.close(figure)
+
+
+def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None) -> Path:
+    """Write a figure as the path's suffix says, atomically and without a date: the same picture makes the same bytes.
+
+    `words` are the text entries of a PNG file. The figure is one from `detached_figure`; others stay open in pyplot.
+    """
+    kind = path.suffix[1:].lower()
+    with replacing(path) as temporary:
+        settled(figure, passes=3).savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
+    return path
+
+
+def figure_png(figure: Figure, *, dpi: float) -> bytes:
+    """A figure from `detached_figure` as the bytes of a PNG file."""
+    written = io.BytesIO()
+    settled(figure, passes=3).savefig(written, format="png", dpi=dpi)
+    return written.getvalue()

@@ -10,8 +10,8 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud
-from deepaccident_devkit.render.axes import LAYERS, Layer, figure_or_new, layers_of
 from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, draw_bev
+from deepaccident_devkit.render.boxes import at_once, in_drawing_order
 from deepaccident_devkit.render.camera import (
     CAMERA_DEFAULT,
     CAMERA_LAYERS,
@@ -20,19 +20,19 @@ from deepaccident_devkit.render.camera import (
     draw_image,
     draw_points_in_image,
 )
-from deepaccident_devkit.render.colors import AGENT_COLORS
-from deepaccident_devkit.render.legends import (
+from deepaccident_devkit.render.captions import (
     agent_handles,
     box_handles,
     draw_legend,
     handles_from_above,
     has_cloud,
     missing_clouds_text,
+    set_scene_title,
+    set_title,
     write_missing,
 )
-from deepaccident_devkit.render.roles import at_once, in_drawing_order
-from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.titles import set_scene_title, set_title
+from deepaccident_devkit.render.figures import LAYERS, Layer, figure_or_new, layers_of
+from deepaccident_devkit.render.styles import AGENT_COLORS, in_own_settings
 from deepaccident_devkit.taxonomy import CAMERAS, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes, project_to_image
 
@@ -177,15 +177,7 @@ def draw_shared_moment(
 ) -> None:
     """Render the front views of agents beside one view from above that they share, in world, as wide as they need.
 
-    Args:
-        dataset: the release.
-        frame: token or record.
-        agents: names; boxes and points from above are all of theirs.
-        layers: as in `render_frame`.
-        fig: an empty figure to render on; about 16 to 9, or wider.
-
-    Raises:
-        ChoiceError: no such layer.
+    The figure is an empty one of about 16 to 9, or wider.
     """
     in_cameras, from_above = panel_layers(layers)
     record = dataset.get("frame", frame)

@@ -1,22 +1,122 @@
-"""One step of a training: its learning rate, its random numbers, and one batch → its losses, with partner dropout."""
+"""A training step: moments in batches, their egos and partners, and the losses; and the score on validation samples."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW
+from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import Dataset as TorchDataset
 
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.evaluation import DetectionEvaluator, MotionEvaluator, detection_truth
+from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectedBoxes
+from deepaccident_devkit.evaluation.motion.evaluator import MOTION_PROTOCOLS
+from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, collate_all_egos, merged_evaluator
 from deepaccident_devkit.model.detection import detection_losses, detection_targets
-from deepaccident_devkit.model.entry import ModelInputs, mirrored_boxes, model_inputs
+from deepaccident_devkit.model.inputs import ModelInputs, mirrored_boxes, model_inputs
 from deepaccident_devkit.model.motion import MotionTargets, frame_mask, motion_losses
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
-from deepaccident_devkit.model.training.config import TrainConfig
+from deepaccident_devkit.model.results import PredictConfig, predictions
+from deepaccident_devkit.model.training_run import TrainConfig
+from deepaccident_devkit.motion import motion_labels, samples
+
+SCORE = "score"
+"""The mean of the IoU and the VPQ at all distances: what the best checkpoint has most of."""
+_WIDE = "100x100"
+_LISTS = ("boxes", "categories", "velocity_known")
+
+
+class Moments(TorchDataset[dict[str, Any]]):
+    """The moments of a split as `AllEgosDataset` has them, numbered on through the epochs."""
+
+    def __init__(self, dataset: Dataset, model: ModelConfig, config: TrainConfig, *, images_cache: Any = None) -> None:
+        """Find the labelled moments of the training's split; `images_cache` is that of `V2XConfig`.
+
+        Raises NotAvailableError: the split has no labelled samples; and the errors of `AllEgosDataset`.
+        """
+        self.model = model
+        tokens = samples(dataset, config.split, config.samples)
+        if not tokens:
+            raise NotAvailableError(f"{config.split}: has no samples to learn from; choose another split")
+        self.data = AllEgosDataset(
+            dataset,
+            tokens,
+            model.inputs(
+                config.agents,
+                boxes="sample",
+                labels=model.labels,
+                augmentation=RandomAugmentation() if config.augment else None,
+                seed=config.seed,
+                images_cache=images_cache,
+            ),
+        )
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, number: int) -> dict[str, Any]:
+        """The moment of a number (epoch · moments + position)."""
+        epoch, position = divmod(number, len(self.data))
+        return self.data.item(position, epoch)
+
+
+class _Given(Sampler[int]):
+    """Numbers that an iterator gives."""
+
+    def __init__(self, numbers: Iterable[int]) -> None:
+        self._numbers = numbers
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._numbers)
+
+
+def batches(moments: Moments, numbers: Iterable[int], config: TrainConfig, *, workers: int = 0) -> DataLoader[Any]:
+    """Batches of moments in the order of their numbers (`positions`), read by worker processes, or by this one (0)."""
+    return DataLoader(
+        moments,
+        batch_size=config.moments,
+        sampler=_Given(numbers),
+        collate_fn=collate_all_egos,
+        num_workers=workers,
+        pin_memory=False,
+    )
+
+
+def validation_samples(dataset: Dataset, config: TrainConfig) -> list[str]:
+    """Those that a run is validated with: two a second of the whole split, or evenly chosen ones of them."""
+    if config.validation is None:
+        return []
+    listed = samples(dataset, config.validation, "all")
+    wanted = config.validation_samples
+    if not wanted or wanted >= len(listed):
+        return listed
+    return [listed[index * len(listed) // wanted] for index in range(wanted)]
+
+
+def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig) -> dict[str, float]:
+    """IoU, VPQ and distance mAP of a model at samples (tokens), in [0, 1], and the `score`; NaN becomes 0.
+
+    Where several processes train, the tokens are this one's, and the scores are of all of them.
+    """
+    labels, rules = model.config.labels, DETECTION_PROTOCOLS["paper"]
+    counted = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)
+    motion, detection = MotionEvaluator(counted, trajectories=False), DetectionEvaluator(rules)
+    for found in predictions(model, dataset, tokens, config):
+        motion.update(found.token, found.motion, motion_labels(dataset, found.token, labels))
+        pose = dataset.world_from(found.token, rules.frame).inverse()
+        boxes = DetectedBoxes(boxes=found.boxes.boxes.transform(pose, rules.frame), scores=found.boxes.scores)
+        detection.update(found.token, boxes, detection_truth(dataset, found.token, rules))
+    wide = merged_evaluator(motion).compute().ranges[_WIDE]
+    percent = {"iou": wide.iou, "vpq": wide.pq, "map": merged_evaluator(detection).compute().mean_average_precision}
+    known = {name: 0.0 if math.isnan(value) else value / 100 for name, value in percent.items()}
+    return {**known, SCORE: (known["iou"] + known["vpq"]) / 2}
 
 
 def learning_rate(step: int, config: TrainConfig) -> float:
@@ -29,11 +129,7 @@ def learning_rate(step: int, config: TrainConfig) -> float:
 
 
 def freeze(model: nn.Module, beginnings: Sequence[str]) -> None:
-    """Stop parameters from being trained whose names begin so; their batch statistics go on.
-
-    Raises:
-        ConfigError: no parameter has such a name, or none is left to train.
-    """
+    """Stop parameters from being trained whose names begin so; their batch statistics go on. Raises ConfigError."""
     names = [name for name, _ in model.named_parameters()]
     for beginning in beginnings:
         if not any(name.startswith(beginning) for name in names):
@@ -61,14 +157,8 @@ def optimizer_of(model: nn.Module, config: TrainConfig) -> AdamW:
 def positions(count: int, config: TrainConfig, *, first: int, rank: int = 0, ranks: int = 1) -> Iterator[int]:
     """The moments of a process, without end: numbers of (epoch · count + position), each epoch in an order of its own.
 
-    They depend on the seed alone, so that a resumed run goes on where it stopped.
-
-    Args:
-        count: moments of the release.
-        config: its seed.
-        first: how many moments this process has had before.
-        rank: this process, from 0, of `ranks`, which take turns.
-        ranks: how many processes.
+    They depend on the seed alone, so that a resumed run goes on where it stopped, after the `first` moments that this
+    process has had. Processes (`rank` of `ranks`) take turns.
     """
     order: torch.Tensor | None = None
     ordered = -1
@@ -111,20 +201,10 @@ class Targets:
         return replace(self, motion=MotionTargets(*(each.to(device) for each in self.motion)), **lists)
 
 
-_LISTS = ("boxes", "categories", "velocity_known")
-
-
 def training_batch(
     batch: Mapping[str, Any], model: ModelConfig, config: TrainConfig, generator: torch.Generator
 ) -> tuple[ModelInputs, Targets]:
-    """The inputs and targets of a batch of `collate_all_egos`, some of whose egos are drawn if the training says so.
-
-    Args:
-        batch: with labels and boxes.
-        model: its frame.
-        config: its number of egos.
-        generator: draws them.
-    """
+    """The inputs and targets of a batch of `collate_all_egos`, some of whose egos are drawn if the training says so."""
     inputs = model_inputs(batch, model.handedness)
     rows = torch.arange(len(inputs.ego_rows))
     if config.egos is not None:
@@ -162,13 +242,7 @@ class TrainingStep(nn.Module):
         self.model = model
 
     def forward(self, inputs: ModelInputs, targets: Targets, noise: Tensor | None = None) -> dict[str, Tensor]:
-        """The weighted losses by name; their sum is what is minimised.
-
-        Args:
-            inputs: with G egos.
-            targets: theirs.
-            noise: of the latents; drawn from torch's own generator if None.
-        """
+        """The weighted losses of G egos by name, whose sum is minimised; noise of the latents is drawn if None."""
         config = self.model.config
         predicted = self.model(inputs, targets.motion, noise=noise)
         losses = motion_losses(predicted.motion, targets.motion, config.motion_loss)

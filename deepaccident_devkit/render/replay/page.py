@@ -12,21 +12,15 @@ from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
-from deepaccident_devkit.render.colors import (
-    CATEGORY_MARKERS,
-    COLLIDER_COLOR,
-    COLORS,
-    GRID_COLOR,
-    OUTCOME_COLORS,
-    POINT_COLOR,
-)
-from deepaccident_devkit.render.legends import is_there
-from deepaccident_devkit.render.replay.recording import (
+from deepaccident_devkit.render.captions import is_there
+from deepaccident_devkit.render.replay.entries import (
+    Foreseen,
     Recording,
     actor_entries,
     agent_entries,
     camera_entries,
     camera_title,
+    foreseen_entries,
     recording_of,
 )
 from deepaccident_devkit.render.replay.road import road_picture
@@ -40,7 +34,14 @@ from deepaccident_devkit.render.replay.sensors import (
     follow_pair,
     lidar_points,
 )
-from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
+from deepaccident_devkit.render.styles import (
+    CATEGORY_MARKERS,
+    COLLIDER_COLOR,
+    COLORS,
+    GRID_COLOR,
+    OUTCOME_COLORS,
+    POINT_COLOR,
+)
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.pages import document, part, source_hash
 from deepaccident_devkit.support.text import path_of
@@ -54,32 +55,196 @@ _BESIDE: Final = 8
 """Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
 
 
+def render_replay(
+    dataset: Dataset,
+    scenario: RowArgument | None,
+    path: str | os.PathLike[str],
+    *,
+    prediction: Foreseen | None = None,
+    agents: Agents = None,
+    progress: bool = False,
+) -> Path:
+    """Write a scenario as one HTML file that plays in any browser: no server, no network, small enough for a mail.
+
+    It shows the agents' cameras with the actors' boxes, one of them large, by default the one that shows the colliding
+    pair best; from above the road, all actors and their trails; who sees whom by the released rule, the LiDAR of the
+    first agent and the countdown to the impact. The road is what the agents' BEV cameras saw; where they have no files,
+    that of a town map (`town_map`), if one is kept. The front cameras, and the cameras while they show the pair best,
+    have the larger pictures; all are as large as the page's limit, `SIZE_LIMIT`, lets them be. What the release lacks
+    (images, points, labels) is left out, and the page says so.
+
+    Args:
+        dataset: the release.
+        scenario: token or record; None for the first that ends in an accident, or if there is no accident, for the
+            first one.
+        path: the file to write.
+        prediction: a model's results of motion or accidents, or predictions by sample token: the page shows what they
+            foresee and whether it is right by the accident protocol `boxes`. None for none.
+        agents: whose cameras, views and predictions are shown, as in `v2x.cooperating_agents`; None for all that are
+            there.
+        progress: whether to show a bar.
+
+    Returns:
+        The path written; the same bytes for the same release, arguments and kept town map.
+
+    Raises:
+        TokenError: no such scenario.
+        ChoiceError: no such agent, or `path` is a folder.
+        NotAvailableError: the release has no scenario, lacks one of the agents, or the prediction is of other samples.
+        EvaluationError: the prediction is neither of motion nor of accidents.
+        SensorFileError: an image or a point cloud cannot be read.
+    """
+    target = path_of(path)
+    if target.is_dir():
+        raise ChoiceError(f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}")
+    recording = recording_of(dataset, scenario, agents)
+    files = camera_files(recording)
+    data, followed = _data(recording, prediction, files)
+    data["points"] = lidar_points(recording, recording.agents[0])
+    free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
+    free -= _BESIDE * len(recording.frames) * len(files)
+    settings, jpegs = camera_pictures(files, followed, free, progress=progress)
+    said = notes(recording, files, settings, points=data["points"] is not None)
+    data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], jpegs)}
+    title = f"Accident replay: {recording.scenario['name']}"
+    write_bytes(target, replay_page(title, data).encode())
+    return target
+
+
+def tried_replay(dataset: Dataset, scenario: str, path: Path, *, prediction: Foreseen | None = None) -> str | None:
+    """Write a scenario's replay; None, or why there is none: a file cannot be read, or the prediction not be shown."""
+    try:
+        render_replay(dataset, scenario, path, prediction=prediction)
+    except (NotAvailableError, SensorFileError) as error:
+        return str(error)
+    return None
+
+
+def served_replay(
+    dataset: Dataset, scenario: RowArgument, folder: str, *, prediction: Foreseen | None = None
+) -> dict[str, Any]:
+    """What the scripts play on a page whose server has the pictures and points, for all cameras and agents.
+
+    They ask below `folder`, an address that ends in a slash, for `images/AGENT/CHANNEL/FRAME?width=PIXELS` (JPEG) and
+    `points/AGENT/FRAME`, which answers with `cloud_text`. Errors are those of `render_replay`.
+    """
+    recording = recording_of(dataset, scenario, None)
+    files = camera_files(recording)
+    data, _ = _data(recording, prediction, files)
+    points = [
+        [is_there(dataset, f"{recording.sample(agent, frame)}/{LIDAR}") for frame in recording.frames]
+        for agent in recording.agents
+    ]
+    for agent, cameras in zip(recording.agents, data["cameras"], strict=True):
+        for channel, camera in zip(CAMERAS, cameras, strict=True):
+            camera["channel"] = channel
+            camera["pictures"] = [None if path is None else 1 for path in files[agent, channel]]
+    return data | {
+        "points": None,
+        "notes": served_notes(recording, files),
+        "served": {"folder": folder, "points": [each if any(each) else None for each in points]},
+    }
+
+
+def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles) -> tuple[dict[str, Any], Followed]:
+    """The page's data, except pictures and points, and the cameras that follow the pair.
+
+    `automatic` has for each frame the number of the agent that shows the pair best, and for each agent its camera.
+    """
+    contact = recording.contact
+    moments = [
+        recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}") for frame in recording.frames
+    ]
+    data: dict[str, Any] = {
+        "scenario": recording.scenario["token"],
+        "facts": facts(recording),
+        "period": FRAME_PERIOD,
+        "countdown": [moment["time_to_impact"] for moment in moments],
+        "impact": None if contact is None else recording.places(contact.point[:2]),
+        "colors": {
+            "pair": COLLIDER_COLOR,
+            "points": POINT_COLOR,
+            "grid": GRID_COLOR,
+            **OUTCOME_COLORS,
+        },
+        "markers": dict(CATEGORY_MARKERS),
+        "agents": agent_entries(recording),
+        "actors": actor_entries(recording),
+        "road": road_picture(recording),
+        "prediction": None if prediction is None else foreseen_entries(recording, prediction),
+        "cameras": camera_entries(recording),
+    }
+    seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
+    there = {key: [path is not None for path in paths] for key, paths in files.items()}
+    followed = follow_pair(recording, seen, there)
+    data["automatic"] = {
+        "agents": [recording.agents.index(agent) for agent in followed.agents],
+        "cameras": [[camera_title(channel) for channel in followed.channels[agent]] for agent in recording.agents],
+    }
+    return data, followed
+
+
+def _with_pictures(
+    recording: Recording, cameras: list[list[dict[str, Any]]], jpegs: Jpegs
+) -> list[list[dict[str, Any]]]:
+    """For each agent its cameras that have pictures, with one for each frame in base64; null where there is none."""
+    shown = []
+    for agent, entries in zip(recording.agents, cameras, strict=True):
+        own = {camera_title(channel): each for channel, each in jpegs.get(agent, {}).items()}
+        shown.append(
+            [{**entry, "pictures": [*map(_coded, own[entry["title"]])]} for entry in entries if entry["title"] in own]
+        )
+    return shown
+
+
+def _coded(jpeg: bytes | None) -> str | None:
+    return None if jpeg is None else base64.b64encode(jpeg).decode("ascii")
+
+
+def replay_page(title: str, data: Mapping[str, Any]) -> str:
+    """A complete HTML page with the title of its window and the data that its scripts play.
+
+    By its policy a browser runs only this script, uses only this style, and loads nothing. The script shows all text
+    of the data as text, never as HTML.
+    """
+    style = COLORS + replay_style()
+    policy = f"default-src 'none'; img-src data:; style-src '{source_hash(style)}'; base-uri 'none'; form-action 'none'"
+    written = script_json(data)
+    return document("replay/replay.html", style=style, policy=policy, script=replay_script(), title=title, data=written)
+
+
+def script_json(data: Mapping[str, Any]) -> str:
+    """JSON that cannot end the HTML element around it."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+def replay_style() -> str:
+    """The rules of a replay, beside those of the colours."""
+    return part("replay/replay.css")
+
+
+def replay_script() -> str:
+    """The scripts of a replay; each uses the ones before it."""
+    return "".join(part(f"replay/{name}.js") for name in ("sources", "ground", "panels", "cameras", "replay"))
+
+
 def facts(recording: Recording) -> list[list[str]]:
     """Names and values of the facts about a scenario and its end; unknown values are left out."""
     return [[name, value] for name, value in (*_setting(recording), *_ending(recording)) if value]
 
 
 def notes(recording: Recording, files: CameraFiles, settings: PictureSettings | None, *, points: bool) -> list[str]:
-    """Sentences on what is missing in the release or was left out.
-
-    Args:
-        recording: the scenario and the agents.
-        files: of all cameras.
-        settings: how their pictures are written; None if there is none.
-        points: whether there are LiDAR points.
-    """
+    """Sentences on what is missing in the release or was left out; the settings are None if there is no picture."""
     title = short_name(recording.agents[0])
     absent = f"No LiDAR points: no file of {title} is here; unpack the archive of lidar01."
     return [*_labels(recording), *_missing_pictures(files), *_pictures(files, settings), *[absent] * (not points)]
 
 
 def served_notes(recording: Recording, files: CameraFiles) -> list[str]:
-    """Sentences on what is missing in the release, for a page that has no pictures itself.
-
-    Args:
-        recording: the scenario and the agents.
-        files: of all cameras.
-    """
+    """Sentences on what is missing in the release, for a page that has no pictures itself."""
     return [*_labels(recording), *_missing_pictures(files)]
 
 
@@ -159,199 +324,3 @@ def _missing_pictures(files: CameraFiles) -> Iterator[str]:
         yield f"No pictures: none of the {wanted} camera files is here; unpack the cameras' archives."
     elif found < wanted:
         yield f"{wanted - found} of {wanted} camera files are missing in the release; unpack the cameras' archives."
-
-
-def render_replay(
-    dataset: Dataset,
-    scenario: RowArgument | None,
-    path: str | os.PathLike[str],
-    *,
-    prediction: Foreseen | None = None,
-    agents: Agents = None,
-    progress: bool = False,
-) -> Path:
-    """Write a scenario as one HTML file that plays in any browser: no server, no network, small enough for a mail.
-
-    It shows the agents' cameras with the actors' boxes, one of them large, by default the one that shows the colliding
-    pair best; from above the road, all actors and their trails; who sees whom by the released rule, the LiDAR of the
-    first agent and the countdown to the impact. The road is what the agents' BEV cameras saw; where they have no files,
-    that of a town map (`town_map`), if one is kept. The front cameras, and the cameras while they show the pair best,
-    have the larger pictures; all are as large as the page's limit, `SIZE_LIMIT`, lets them be. What the release lacks
-    (images, points, labels) is left out, and the page says so.
-
-    Args:
-        dataset: the release.
-        scenario: token or record; None for the first that ends in an accident, or if there is no accident, for the
-            first one.
-        path: the file to write.
-        prediction: a model's results of motion or accidents, or predictions by sample token: the page shows what they
-            foresee and whether it is right by the accident protocol `boxes`. None for none.
-        agents: whose cameras, views and predictions are shown, as in `v2x.cooperating_agents`; None for all that are
-            there.
-        progress: whether to show a bar.
-
-    Returns:
-        The path written; the same bytes for the same release, arguments and kept town map.
-
-    Raises:
-        TokenError: no such scenario.
-        ChoiceError: no such agent, or `path` is a folder.
-        NotAvailableError: the release has no scenario, lacks one of the agents, or the prediction is of other samples.
-        EvaluationError: the prediction is neither of motion nor of accidents.
-        SensorFileError: an image or a point cloud cannot be read.
-    """
-    target = path_of(path)
-    if target.is_dir():
-        raise ChoiceError(f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}")
-    recording = recording_of(dataset, scenario, agents)
-    files = camera_files(recording)
-    data, followed = _data(recording, prediction, files)
-    data["points"] = lidar_points(recording, recording.agents[0])
-    free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
-    free -= _BESIDE * len(recording.frames) * len(files)
-    settings, jpegs = camera_pictures(files, followed, free, progress=progress)
-    said = notes(recording, files, settings, points=data["points"] is not None)
-    data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], jpegs)}
-    title = f"Accident replay: {recording.scenario['name']}"
-    write_bytes(target, replay_page(title, data).encode())
-    return target
-
-
-def tried_replay(dataset: Dataset, scenario: str, path: Path, *, prediction: Foreseen | None = None) -> str | None:
-    """Write a scenario's replay; None, or why there is none: a file cannot be read, or the prediction not be shown.
-
-    Args:
-        dataset: the release.
-        scenario: token.
-        path: the file to write.
-        prediction: as of `render_replay`.
-    """
-    try:
-        render_replay(dataset, scenario, path, prediction=prediction)
-    except (NotAvailableError, SensorFileError) as error:
-        return str(error)
-    return None
-
-
-def served_replay(
-    dataset: Dataset, scenario: RowArgument, folder: str, *, prediction: Foreseen | None = None
-) -> dict[str, Any]:
-    """What the scripts play on a page whose server has the pictures and points, for all cameras and agents.
-
-    They ask below `folder` for `images/AGENT/CHANNEL/FRAME?width=PIXELS` (JPEG) and `points/AGENT/FRAME`, which answers
-    with `cloud_text`.
-
-    Args:
-        dataset: the release.
-        scenario: token or record.
-        folder: address that the page has of the scenario's files, ending in a slash.
-        prediction: as of `render_replay`.
-
-    Raises:
-        TokenError, NotAvailableError, EvaluationError, SensorFileError: as of `render_replay`.
-    """
-    recording = recording_of(dataset, scenario, None)
-    files = camera_files(recording)
-    data, _ = _data(recording, prediction, files)
-    points = [
-        [is_there(dataset, f"{recording.sample(agent, frame)}/{LIDAR}") for frame in recording.frames]
-        for agent in recording.agents
-    ]
-    for agent, cameras in zip(recording.agents, data["cameras"], strict=True):
-        for channel, camera in zip(CAMERAS, cameras, strict=True):
-            camera["channel"] = channel
-            camera["pictures"] = [None if path is None else 1 for path in files[agent, channel]]
-    return data | {
-        "points": None,
-        "notes": served_notes(recording, files),
-        "served": {"folder": folder, "points": [each if any(each) else None for each in points]},
-    }
-
-
-def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles) -> tuple[dict[str, Any], Followed]:
-    """The page's data, except pictures and points, and the cameras that follow the pair.
-
-    `automatic` has for each frame the number of the agent that shows the pair best, and for each agent its camera.
-    """
-    contact = recording.contact
-    moments = [
-        recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}") for frame in recording.frames
-    ]
-    data: dict[str, Any] = {
-        "scenario": recording.scenario["token"],
-        "facts": facts(recording),
-        "period": FRAME_PERIOD,
-        "countdown": [moment["time_to_impact"] for moment in moments],
-        "impact": None if contact is None else recording.places(contact.point[:2]),
-        "colors": {
-            "pair": COLLIDER_COLOR,
-            "points": POINT_COLOR,
-            "grid": GRID_COLOR,
-            **OUTCOME_COLORS,
-        },
-        "markers": dict(CATEGORY_MARKERS),
-        "agents": agent_entries(recording),
-        "actors": actor_entries(recording),
-        "road": road_picture(recording),
-        "prediction": None if prediction is None else verdicts(recording, prediction),
-        "cameras": camera_entries(recording),
-    }
-    seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
-    there = {key: [path is not None for path in paths] for key, paths in files.items()}
-    followed = follow_pair(recording, seen, there)
-    data["automatic"] = {
-        "agents": [recording.agents.index(agent) for agent in followed.agents],
-        "cameras": [[camera_title(channel) for channel in followed.channels[agent]] for agent in recording.agents],
-    }
-    return data, followed
-
-
-def _with_pictures(
-    recording: Recording, cameras: list[list[dict[str, Any]]], jpegs: Jpegs
-) -> list[list[dict[str, Any]]]:
-    """For each agent its cameras that have pictures, with one for each frame in base64; null where there is none."""
-    shown = []
-    for agent, entries in zip(recording.agents, cameras, strict=True):
-        own = {camera_title(channel): each for channel, each in jpegs.get(agent, {}).items()}
-        shown.append(
-            [{**entry, "pictures": [*map(_coded, own[entry["title"]])]} for entry in entries if entry["title"] in own]
-        )
-    return shown
-
-
-def _coded(jpeg: bytes | None) -> str | None:
-    return None if jpeg is None else base64.b64encode(jpeg).decode("ascii")
-
-
-def replay_page(title: str, data: Mapping[str, Any]) -> str:
-    """A complete HTML page.
-
-    By its policy a browser runs only this script, uses only this style, and loads nothing. The script shows all text
-    of the data as text, never as HTML.
-
-    Args:
-        title: of the window.
-        data: what the scripts play, as JSON holds it.
-    """
-    style = COLORS + replay_style()
-    policy = f"default-src 'none'; img-src data:; style-src '{source_hash(style)}'; base-uri 'none'; form-action 'none'"
-    written = script_json(data)
-    return document("replay/replay.html", style=style, policy=policy, script=replay_script(), title=title, data=written)
-
-
-def script_json(data: Mapping[str, Any]) -> str:
-    """JSON that cannot end the HTML element around it."""
-    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    for character in "<>&":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return text
-
-
-def replay_style() -> str:
-    """The rules of a replay, beside those of the colours."""
-    return part("replay/replay.css")
-
-
-def replay_script() -> str:
-    """The scripts of a replay; each uses the ones before it."""
-    return "".join(part(f"replay/{name}.js") for name in ("sources", "ground", "panels", "cameras", "replay"))

@@ -5,6 +5,7 @@ A part of that is recorded: it ends with the impact, or when ego has arrived, or
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -13,13 +14,20 @@ from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
-from deepaccident_devkit.synth.traffic.casting import WARM_UP, Cast, cast_actors
-from deepaccident_devkit.synth.traffic.impact import Impact, impact_of, least_gap, touching_pairs
+from deepaccident_devkit.synth.traffic.driving import RoadUser, middle_of
+from deepaccident_devkit.synth.traffic.placement import WARM_UP, Cast, cast_actors
 from deepaccident_devkit.synth.traffic.rights import AXIS_OF_ARM, SignalPlan, find_rights, plan_with_green
-from deepaccident_devkit.synth.traffic.simulate import Simulation, simulate
-from deepaccident_devkit.synth.traffic.users import RoadUser, middle_of
+from deepaccident_devkit.synth.traffic.simulate import Simulation, gap, separation, simulate
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+_LOOK_STEP = 5
+"""Which road users are near each other is computed once in so many steps."""
+_NEAR = 2.0
+"""How much nearer two can come between these steps, metres."""
+ContactSide = Literal["front", "back", "left", "right"]
+_AREA_MASS = 60.0
+"""Impact for each m² of the first box and m/s; so the numbers are about as large as in the real release."""
+_HALVINGS = 40
 _GREEN_TIMES = (14.0, 20.0)
 _GREEN_SHARE = (0.35, 0.75)
 """Least and largest share of the green that is over when the pair meets."""
@@ -35,6 +43,12 @@ _CLEAR = 1.0
 """The least distance between named road users in a normal twin, metres."""
 _DELAYS = (0.0, 1.5, 3.0, 5.0, 8.0, 1000.0)
 """Seconds by which one of the pair comes later if rules alone do not prevent a collision; tried in this order."""
+_LEAST_FRAMES, _MOST_FRAMES = 40, 100
+"""The fewest and the most frames of a recording if no number is given, as in the release."""
+_EARLIEST, _LATEST_END = 5.5, 10.0
+"""The least time from the beginning until the pair meets, and the latest end of a normal scenario, seconds."""
+_ARRIVAL = 25.0
+"""A normal scenario also ends when ego is so many metres past the middle of the junction."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,15 +91,40 @@ class Performance:
     present: tuple[int, ...]
 
 
-def set_stage(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float) -> Stage:
-    """Everyone's place at the beginning.
+@dataclass(frozen=True, slots=True)
+class Impact:
+    """The end of an accident.
 
-    Args:
-        rng: random numbers.
-        spec: the draw.
-        junction: its roads.
-        duration: seconds from the first recorded frame to when the pair meets.
+    Attributes:
+        time: seconds, when the boxes first touch.
+        side: the side of the first one's box that is hit.
+        strength: the impact in the meta file.
     """
+
+    time: float
+    side: ContactSide
+    strength: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Recorded:
+    """A part of a performance.
+
+    Attributes:
+        performance: what happens.
+        start: time of the first recorded frame, in the simulation's time, seconds.
+        frames: how many are recorded.
+        impact: the impact at its end; None if there is none.
+    """
+
+    performance: Performance
+    start: float
+    frames: int
+    impact: Impact | None
+
+
+def set_stage(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float) -> Stage:
+    """Everyone's place at the beginning; the pair meets `duration` seconds after the first recorded frame."""
     cast = cast_actors(rng, spec, junction, duration)
     signals = _signal_plan(rng, cast) if spec.road.signalized else None
     hold = max(duration - _LONGEST_DRIVE, 0.0)
@@ -100,15 +139,10 @@ def set_stage(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, 
     )
 
 
-def _held(user: RoadUser, seconds: float) -> RoadUser:
-    """The same road user, which first stands for some seconds."""
-    return user if seconds == 0 else replace(user, start_speed=0.0, delay=user.delay + seconds)
-
-
 def try_accident(stage: Stage) -> Performance | float:
-    """What happens up to the contact of a pair that breaks its rules; if they do not touch, their least distance.
+    """What happens up to the contact of a pair that breaks its rules; if they do not touch, their least distance (m).
 
-    It is in metres; infinite if their paths do not cross, or if others touch before.
+    It is infinite if their paths do not cross, or if others touch before.
     """
     pair = stage.cast.pair
     if pair is None:
@@ -139,6 +173,44 @@ def perform_twin(stage: Stage, end: float) -> Performance | None:
             return performance
         narrow = narrow or performance
     return narrow
+
+
+def recorded_accident(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
+    """The recording that ends with the impact; None records all frames that there are, within limits."""
+    pair = stage.cast.pair or (0, 0)
+    size = np.array([stage.users[row].body.size[:2] for row in pair])
+    impact = impact_of(performance.simulation, pair, size)
+    count = frames or _natural_frames(stage, impact.time)
+    return Recorded(
+        performance=performance, start=impact.time - FRAME_PERIOD * (count - 1), frames=count, impact=impact
+    )
+
+
+def recorded_normal(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
+    """The recording that ends when ego has arrived, or when time is over; arguments as in `recorded_accident`."""
+    begin = stage.cast.begin + WARM_UP
+    natural = _natural_frames(stage, min(_arrival_time(stage, performance), begin + _LATEST_END))
+    if frames is None:
+        return Recorded(performance=performance, start=begin, frames=natural, impact=None)
+    end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
+    return Recorded(performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None)
+
+
+def usual_duration(rng: np.random.Generator, frames: int | None) -> float:
+    """Seconds from the beginning until the pair meets: drawn, or as many as the wanted number of frames needs."""
+    natural = float(rng.uniform(_EARLIEST, _LATEST_END + 0.3))
+    return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
+
+
+def latest_end(stage: Stage, frames: int | None) -> float:
+    """The time until which a normal scenario is simulated, seconds."""
+    longest = max(_LATEST_END, (frames or 0) * FRAME_PERIOD)
+    return stage.cast.begin + WARM_UP + longest
+
+
+def _held(user: RoadUser, seconds: float) -> RoadUser:
+    """The same road user, which first stands for some seconds."""
+    return user if seconds == 0 else replace(user, start_speed=0.0, delay=user.delay + seconds)
 
 
 def _later_roles(cast: Cast) -> tuple[Role, ...]:
@@ -207,70 +279,6 @@ def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
     return plan_with_green(axis, 0.0, float(rng.uniform(*_GREEN_TIMES)), float(rng.uniform(*_GREEN_SHARE)))
 
 
-_LEAST_FRAMES, _MOST_FRAMES = 40, 100
-"""The fewest and the most frames of a recording if no number is given, as in the release."""
-_EARLIEST, _LATEST_END = 5.5, 10.0
-"""The least time from the beginning until the pair meets, and the latest end of a normal scenario, seconds."""
-_ARRIVAL = 25.0
-"""A normal scenario also ends when ego is so many metres past the middle of the junction."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Recorded:
-    """A part of a performance.
-
-    Attributes:
-        performance: what happens.
-        start: time of the first recorded frame, in the simulation's time, seconds.
-        frames: how many are recorded.
-        impact: the impact at its end; None if there is none.
-    """
-
-    performance: Performance
-    start: float
-    frames: int
-    impact: Impact | None
-
-
-def usual_duration(rng: np.random.Generator, frames: int | None) -> float:
-    """Seconds from the beginning until the pair meets: drawn, or as many as the wanted number of frames needs."""
-    natural = float(rng.uniform(_EARLIEST, _LATEST_END + 0.3))
-    return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
-
-
-def latest_end(stage: Stage, frames: int | None) -> float:
-    """The time until which a normal scenario is simulated, seconds."""
-    longest = max(_LATEST_END, (frames or 0) * FRAME_PERIOD)
-    return stage.cast.begin + WARM_UP + longest
-
-
-def recorded_accident(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
-    """The recording that ends with the impact.
-
-    Args:
-        stage: who took part.
-        performance: with a contact of the pair.
-        frames: how many are recorded; None for all that there are, within limits.
-    """
-    pair = stage.cast.pair or (0, 0)
-    size = np.array([stage.users[row].body.size[:2] for row in pair])
-    impact = impact_of(performance.simulation, pair, size)
-    count = frames or _natural_frames(stage, impact.time)
-    return Recorded(
-        performance=performance, start=impact.time - FRAME_PERIOD * (count - 1), frames=count, impact=impact
-    )
-
-
-def recorded_normal(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
-    """The recording that ends when ego has arrived, or when time is over; arguments as in `recorded_accident`."""
-    begin = stage.cast.begin + WARM_UP
-    natural = _natural_frames(stage, min(_arrival_time(stage, performance), begin + _LATEST_END))
-    if frames is None:
-        return Recorded(performance=performance, start=begin, frames=natural, impact=None)
-    end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
-    return Recorded(performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None)
-
-
 def _natural_frames(stage: Stage, end: float) -> int:
     since = end - (stage.cast.begin + WARM_UP)
     return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, _LEAST_FRAMES, _MOST_FRAMES))
@@ -286,3 +294,79 @@ def _arrival_time(stage: Stage, performance: Performance) -> float:
     along, _ = ego.path.project(simulation.poses[coarse, performance.present.index(row), :2])
     arrived = along > middle_of(ego.route) + _ARRIVAL
     return float(simulation.time[coarse][arrived.argmax()]) if arrived.any() else np.inf
+
+
+def impact_of(simulation: Simulation, pair: tuple[int, int], size: FloatArray) -> Impact:
+    """The impact that ends a simulation with a contact of a pair of rows; sizes are (2, 2) length and width, metres."""
+    rows = list(pair)
+    last = simulation.poses[-1][rows]
+    before = simulation.poses[-2][rows] if len(simulation.time) > 1 else last
+    share = _touching_share(before, last, size)
+    poses = before + share * (last - before)
+    period = float(simulation.time[-1] - simulation.time[-2]) if len(simulation.time) > 1 else 0.0
+    velocity = simulation.velocities[-1][rows]
+    return Impact(
+        time=float(simulation.time[-1]) - (1.0 - share) * period,
+        side=contact_side(poses, size),
+        strength=float(_AREA_MASS * size[0].prod() * np.hypot(*(velocity[0] - velocity[1]))),
+    )
+
+
+def _touching_share(before: FloatArray, after: FloatArray, size: FloatArray) -> float:
+    """The share of a step (2, 3) → (2, 3) that is over when the boxes touch, by halving; at the result they touch."""
+    apart, touching = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        middle = (apart + touching) / 2
+        first, second = before + middle * (after - before)
+        if separation(first, size[0], second, size[1]) > 0:
+            apart = middle
+        else:
+            touching = middle
+    return touching
+
+
+def contact_side(poses: FloatArray, size: FloatArray) -> ContactSide:
+    """The side of the first of two boxes that faces the second across the widest gap along any side's normal.
+
+    Poses are (2, 3) x, y (metres), yaw (radians) of the centres, sizes (2, 2) length and width, metres.
+    """
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    axes = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)  # box, axis, xy
+    normals = axes.reshape(4, 2)
+    reach = np.abs(np.einsum("na,bka->nbk", normals, axes) * size / 2).sum(axis=(1, 2))
+    apart = normals @ (poses[1, :2] - poses[0, :2])
+    best = int(np.argmax(np.abs(apart) - reach))
+    along, across = axes[0] @ (normals[best] * np.sign(apart[best]))
+    if abs(along) >= abs(across):
+        return "front" if along > 0 else "back"
+    return "left" if across > 0 else "right"
+
+
+def touching_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[tuple[int, int]]:
+    """Pairs of rows, the lower one first, that come nearer to each other than `margin`, along any side's normal.
+
+    Poses are (S, A, 3) x, y (metres), yaw (radians) of the boxes' centres, sizes (A, 2) length and width, metres.
+    """
+    found = []
+    for i, j in _near_pairs(poses, size, margin):
+        if (separation(poses[:, i], size[i], poses[:, j], size[j]) < margin).any():
+            found.append((i, j))
+    return found
+
+
+def least_gap(poses: FloatArray, size: FloatArray, rows: list[int], enough: float) -> float:
+    """The least distance in metres between any two of `rows`, or `enough`; arguments as in `touching_pairs`."""
+    pairs = _near_pairs(poses[:, rows], size[rows], enough)
+    gaps = [float(gap(poses[:, rows[i]], size[rows[i]], poses[:, rows[j]], size[rows[j]]).min()) for i, j in pairs]
+    return min([*gaps, enough])
+
+
+def _near_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[tuple[int, int]]:
+    """Pairs of rows that may come nearer than `margin`."""
+    moments = np.concatenate([poses[::_LOOK_STEP], poses[-1:]])
+    x, y = moments[..., 0], moments[..., 1]
+    square = (x[:, :, None] - x[:, None, :]) ** 2 + (y[:, :, None] - y[:, None, :]) ** 2
+    radius = np.hypot(size[:, 0], size[:, 1]) / 2
+    near = (square < (radius[:, None] + radius + margin + _NEAR) ** 2).any(axis=0)
+    rows, columns = np.nonzero(np.triu(near, 1))
+    return list(zip(rows.tolist(), columns.tolist(), strict=True))

@@ -1,20 +1,30 @@
-"""`Recording`: the scenario that is replayed, and where its actors, agents and cameras are at each moment."""
+"""What a replay's page has of a scenario: its agents, actors and cameras at each moment, and what a model foresees."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.render.colors import AGENT_COLORS
-from deepaccident_devkit.render.roles import actor_color, agent_letters, recorders_of
+from deepaccident_devkit.evaluation import Accident, AccidentContext, BoxAccidents, MotionOutput, accident_context
+from deepaccident_devkit.evaluation.accident import Prediction
+from deepaccident_devkit.evaluation.accident.scoring import ERRORS_AT, hit_of
+from deepaccident_devkit.evaluation.alarms.raised import Pair, named_alarms
+from deepaccident_devkit.evaluation.alarms.truth import RELEASED_HORIZON
+from deepaccident_devkit.evaluation.predictions import checked_prediction
+from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.geometry import SE3, quaternions
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.render.boxes import actor_color, agent_letters, recorders_of
+from deepaccident_devkit.render.outcomes.above import count_words
+from deepaccident_devkit.render.styles import AGENT_COLORS
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, AgentName, short_name
@@ -26,6 +36,12 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
+
+Foreseen = Results | Mapping[str, MotionOutput | Iterable[Accident]]
+"""A results file of motion or accidents, or predictions by sample token."""
+_RULES: Final = BoxAccidents()
+_SHOWN: Final = 3
+"""The most alarms of a sample that are shown: right alarms first, then the surest ones."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,18 +95,10 @@ class Recording(FrozenArrays):
 
 
 def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents) -> Recording:
-    """A scenario of a release.
+    """A scenario of a release: by default the first that ends in an accident or, without any, the first one.
 
-    Args:
-        dataset: the release.
-        scenario: token or record; None for the first that ends in an accident, or if there is no accident, for the
-            first one.
-        agents: whose view is shown, as `cooperating_agents` takes them, seen from the first agent that is there.
-
-    Raises:
-        TokenError: no such scenario.
-        NotAvailableError: the release has no scenario, or lacks one of the agents.
-        ChoiceError: no such agent or configuration.
+    Agents are as `cooperating_agents` takes them, seen from the first that is there; its errors are raised, and
+    NotAvailableError if the release has no scenario.
     """
     record = dataset.scenario[dataset.getind("scenario", default_scenario(dataset) if scenario is None else scenario)]
     first = sample_token(record["token"], agents_of(dataset, record)[0], 1)
@@ -234,3 +242,103 @@ def _seen(recording: Recording, ids: IntArray) -> AnyArray:
 
 def _milliradians(angle: float) -> int:
     return round(angle * 1000)
+
+
+def foreseen_entries(recording: Recording, prediction: Foreseen) -> dict[str, Any]:
+    """The foreseen accidents as the page has them: the rule in words, and each sample of the agents with a prediction.
+
+    Instance maps given by token have the orientation of the released labels. Raises NotAvailableError if no prediction
+    is of this scenario and these agents, or a sample has no label.
+    """
+    horizon = _horizon(prediction)
+    samples = [
+        _sample(recording, prediction, agent, frame, horizon)
+        for frame in recording.frames
+        for agent in recording.agents
+        if recording.sample(agent, frame) in prediction
+    ]
+    if not samples:
+        raise NotAvailableError(
+            f"prediction: has no sample of {recording.scenario['token']} and {', '.join(recording.agents)}; "
+            "choose a scenario and agents that it has, or replay without it"
+        )
+    rule = (
+        f"Protocol boxes: an accident within {horizon:g} s counts as foreseen if the errors of the two places "
+        f"are less than {ERRORS_AT:g} m in sum."
+    )
+    return {"rule": rule, "samples": samples}
+
+
+def _horizon(prediction: Foreseen) -> float:
+    form = prediction.form if isinstance(prediction, Results) else None
+    return RELEASED_HORIZON if form is None else min(RELEASED_HORIZON, (form.frames - 1) * form.step)
+
+
+def _sample(recording: Recording, prediction: Foreseen, agent: str, frame: int, horizon: float) -> dict[str, Any]:
+    token = recording.sample(agent, frame)
+    given, label, context = _loaded(recording, prediction, token, horizon)
+    truth = context.truth
+    if truth is None:  # only for the type checker: a context with a horizon has a truth
+        raise NotAvailableError(f"{token}: has no truth to compare with; choose a labelled sample")
+    world_from_ego = recording.dataset.world_from(token, "ego")
+    alarms = [
+        _alarm(recording, accident, ids, context, world_from_ego)
+        for accident, ids in named_alarms(given, label, truth, _RULES.reading)
+    ]
+    return {
+        "frame": frame - 1,
+        "agent": recording.agents.index(agent),
+        "verdict": _verdict(given, label, context),
+        "text": f"{short_name(agent)} at frame {frame}: {_truth_text(context)}",
+        "alarms": sorted(alarms, key=lambda alarm: not alarm["right"])[:_SHOWN],
+        "more": max(0, len(alarms) - _SHOWN),
+    }
+
+
+def _loaded(
+    recording: Recording, prediction: Foreseen, token: str, horizon: float
+) -> tuple[MotionOutput | list[Accident], MotionLabels | None, AccidentContext]:
+    if isinstance(prediction, Results):
+        setup = EvaluationSetup(task="accident", protocol="boxes", horizon=horizon)
+        given, label, context = SampleLoader(recording.dataset, prediction, setup)(token)
+        return checked_prediction(given), label, context
+    return checked_prediction(prediction[token]), None, accident_context(recording.dataset, token, horizon)
+
+
+def _verdict(given: Prediction, label: MotionLabels | None, context: AccidentContext) -> str:
+    """What the sample counts as, or `not judged`."""
+    counts = _RULES.counts(given, label, context)
+    if counts["unjudged"] and not (counts["positive"] or counts["alarms"]):
+        return "not judged"
+    return count_words(_RULES.result([counts]).within[ERRORS_AT])
+
+
+def _alarm(
+    recording: Recording, accident: Accident, ids: Pair | None, context: AccidentContext, world_from_ego: SE3
+) -> dict[str, Any]:
+    counts = _RULES.counts([accident], None, context)
+    off = counts["alarms"][0] if counts["alarms"] else None
+    right = bool(off and hit_of([off], ERRORS_AT))
+    text = f"foreseen in {accident.time:.1f} s, score {accident.score:.2g}"
+    if off and off["position"] is not None:
+        text += f": places off by {off['position']:.1f} m, time by {off['time']:+.1f} s"
+    elif off is None:
+        text += ": it would be after the end of the recording"
+    if ids is not None:
+        right_two = context.pair is not None and set(ids) == set(context.pair)
+        names = " and ".join("an unknown actor" if each is None else str(each) for each in ids)
+        text += f"; names {names}{', who collide' if right_two else ''}"
+    return {
+        "places": recording.places(world_from_ego.apply([[x, y, 0.0] for x, y in accident.positions.tolist()])[:, :2]),
+        "right": right,
+        "time": round(accident.time, 1),
+        "text": text,
+        "actors": [each for each in ids or () if each is not None],
+    }
+
+
+def _truth_text(context: AccidentContext) -> str:
+    truth = context.truth
+    if truth is None or truth.accident is None:
+        return "no accident comes within the horizon"
+    return f"an accident comes in {truth.accident.time:.1f} s"

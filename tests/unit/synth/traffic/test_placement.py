@@ -5,9 +5,9 @@ import pytest
 
 from deepaccident_devkit.synth.roads import Junction, RoadSpec, crossing
 from deepaccident_devkit.synth.spec import ActorSpec, MeetSpec, ScenarioSpec
-from deepaccident_devkit.synth.traffic.casting import WARM_UP, cast_actors, drive_alone
+from deepaccident_devkit.synth.traffic.driving import middle_of, road_crossing
+from deepaccident_devkit.synth.traffic.placement import WARM_UP, cast_actors, drive_alone
 from deepaccident_devkit.synth.traffic.simulate import simulate
-from deepaccident_devkit.synth.traffic.users import middle_of, road_crossing
 
 
 def test_one_set_on_its_way_comes_to_the_place_in_time(driver):

@@ -4,7 +4,7 @@ import numpy as np
 
 from deepaccident_devkit.synth.roads import GRASS, GroundMap, Hump, Terrain
 from deepaccident_devkit.synth.solids import Block
-from deepaccident_devkit.synth.stage.props import Prop, overlap, settled, solids_of, top_map
+from deepaccident_devkit.synth.world import Prop, overlap, settled, solids_of, top_map
 
 LOW = Prop(20, (Block((0.0, 4.0), (0.0, 2.0), (-0.2, 1.0), (1, 2, 3)),))
 HIGH = Prop(21, (Block((3.0, 5.0), (0.0, 2.0), (-0.2, 3.0), (1, 2, 3)), Block((5.0, 6.0), (-1, 1), (0, 2), (4, 5, 6))))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.synth.roads import SIDEWALK, Junction, RoadSpec
-from deepaccident_devkit.synth.stage.props import lanterns, traffic_light, yield_sign
+from deepaccident_devkit.synth.world import lanterns, traffic_light, yield_sign
 
 
 def middle(prop):

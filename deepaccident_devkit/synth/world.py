@@ -1,17 +1,146 @@
-"""Things that stand on the ground: street furniture, trees and houses, as blocks with a code for the map from above."""
+"""What stands still: the ground and its roads; on it street furniture, trees, houses and the infrastructure's pole."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from deepaccident_devkit.support.arrays import FloatArray
-from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, TREE, Arm, GroundMap, RoadSpec, Terrain
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.support.arrays import FloatArray, ShortRepr
+from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, TREE, Arm, GroundMap, Junction, RoadSpec, Terrain
 from deepaccident_devkit.synth.roads.layout import KERB_RADIUS, OUTWARD
 from deepaccident_devkit.synth.solids import Block, Color, Solids, build
+from deepaccident_devkit.synth.spec import View
 
 BASEMENT = 0.2
 """Metres that things reach into the ground."""
+LAMP_COLORS: tuple[Color, Color, Color] = ((230, 46, 38), (240, 186, 50), (52, 210, 96))
+"""The colours of lamps that are on: red, amber, green."""
+_DARK_LAMPS: tuple[Color, Color, Color] = ((72, 22, 20), (76, 58, 20), (18, 62, 32))
+_STEEL: Color = (92, 96, 100)
+_HOUSING: Color = (38, 40, 42)
+LANTERN_COLOR: Color = (226, 222, 200)
+"""The colour of a lantern's head, which shines at night."""
+_PLATE: Color = (230, 226, 220)
+_RIM: Color = (186, 34, 36)
+KERB_INSET = 0.3
+"""Metres from the kerb to the middle of a mast."""
+_BEHIND_LINE = 0.3
+"""Metres from the stop line or yield line, towards the junction, to the light or sign."""
+_LAMP_HEIGHTS = (3.35, 3.05, 2.75)
+"""Heights of the red, amber and green lamp above the ground, metres."""
+_LANTERN_SPACING = 28.0
+_LANTERN_HEIGHT = 6.0
+_BARK: Color = (92, 72, 54)
+_LEAVES: tuple[Color, ...] = ((70, 116, 54), (88, 132, 62), (58, 100, 58))
+_TREE_SPACING = 13.0
+_TREE_SHARE = 0.55
+"""The share of places that have a tree."""
+_TREE_INSET = 1.25
+"""Metres from the sidewalk to a trunk, so that crowns end at the sidewalk."""
+Span = tuple[float, float]
+STOREY = 3.2
+"""Height of a storey, metres."""
+_WALLS: tuple[Color, ...] = (
+    (176, 122, 96), (206, 190, 160), (170, 170, 166), (148, 100, 82), (220, 214, 200), (140, 150, 158), (190, 160, 128),
+)  # fmt: skip
+_SETBACK = (2.5, 4.6)
+"""Metres from the sidewalk to the fronts."""
+_LAST_HOUSE = 110.0
+_KERB_HOUSE_LENGTH = 20.5
+_KERB_HOUSE_STOREYS = 3
+_MAST_ROOM = 0.25
+"""Metres from the middle of a mast to the house on the kerb behind it."""
+_CODES = 240
+Corner = tuple[int, int]
+"""A corner, given by its signs of x and y."""
+_MAX_SLOPE = np.deg2rad(3.0)
+_POLE_HEIGHTS = (4.1, 4.6)
+"""The least and the greatest height of the infrastructure's sensors above the ground, metres: its cameras, some of
+them above the road, are higher than any truck."""
+_POLE_INSET = 0.15
+"""Metres from the sidewalk's outer edges to the middle of the pole: the farthest place from which it sees along the
+lanes."""
+_POLE_UNDER_SENSOR = 0.4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SignalHead:
+    """The lamps for the traffic that comes by one arm.
+
+    Attributes:
+        arm: by which the traffic comes.
+        rows: rows of the red, amber and green lamp in `World.props`.
+    """
+
+    arm: Arm
+    rows: tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class World(ShortRepr):
+    """Everything that does not change during a scenario, in the ground frame.
+
+    Attributes:
+        world_from_ground: where the junction lies in the town, and how it slopes.
+        ground: the map of the roads, as cameras and LiDAR see them.
+        top: the map of the ground with all that stands on it, as the BEV camera sees it.
+        props: buildings, trees, poles; the first solids are the lamps of `signals`.
+        terrain: how high the ground lies.
+        lidar_pole: `ground_from_lidar` of the infrastructure agent.
+        signals: the traffic lights, one for each arm; none at an unsignalised junction.
+    """
+
+    world_from_ground: SE3
+    ground: GroundMap
+    top: GroundMap
+    props: Solids
+    terrain: Terrain
+    lidar_pole: SE3
+    signals: tuple[SignalHead, ...]
+
+
+def random_world(
+    rng: np.random.Generator,
+    junction: Junction,
+    view: View = "open",
+    *,
+    between: tuple[Arm, Arm] = ("west", "north"),
+) -> World:
+    """A town around a junction; raises ConfigError if a hidden view's arms have no corner in common.
+
+    A `hidden` view puts a house on the kerb of the corner between two arms, and the pole on the opposite corner, where
+    it sees both; in the open one the pole sees these two best. Apart from house and pole both views give the same
+    world.
+    """
+    place, built, green, pole = rng.spawn(4)
+    spec, terrain = junction.spec, junction.terrain
+    buildings, plants = houses(built, spec), list(trees(green, spec))
+    lights = [traffic_light(spec, arm) for arm in junction.arms] if spec.signalized else []
+    corner = _pole_corner(pole, junction, between)
+    if view == "hidden":
+        hiding_corner = _corner_between(junction, between)
+        hiding = kerb_house(spec, hiding_corner)
+        buildings = [hiding, *(each for each in buildings if not overlap(each, hiding))]
+        plants = [each for each in plants if not overlap(each, hiding)]
+        corner = (-hiding_corner[0], -hiding_corner[1])
+    height = float(pole.uniform(*_POLE_HEIGHTS))
+    x, y = (sign * (spec.sidewalk_edge - _POLE_INSET) for sign in corner)
+    signs = [yield_sign(spec, arm) for arm in spec.yielding_arms]
+    stands: list[Prop] = [*lights, *signs, mast(x, y, height - _POLE_UNDER_SENSOR), *buildings, *plants]
+    stands += [each for each in lanterns(spec) if not any(overlap(each, other) for other in stands)]
+    props = [settled(each, terrain) for each in stands]
+    ground = junction.ground_map()
+    return World(
+        world_from_ground=_random_place(place, terrain),
+        ground=ground,
+        top=top_map(ground, props),
+        props=solids_of(props),
+        terrain=terrain,
+        lidar_pole=SE3.from_yaw(float(np.arctan2(-y, -x)), (x, y, height)),
+        signals=tuple(_signals(junction, props[: len(lights)])),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,38 +199,6 @@ def _corners(prop: Prop) -> FloatArray:
     return np.array([[x0, y0], [x0, y1], [x1, y0], [x1, y1]])
 
 
-LAMP_COLORS: tuple[Color, Color, Color] = ((230, 46, 38), (240, 186, 50), (52, 210, 96))
-"""The colours of lamps that are on: red, amber, green."""
-_DARK_LAMPS: tuple[Color, Color, Color] = ((72, 22, 20), (76, 58, 20), (18, 62, 32))
-_STEEL: Color = (92, 96, 100)
-_HOUSING: Color = (38, 40, 42)
-LANTERN_COLOR: Color = (226, 222, 200)
-"""The colour of a lantern's head, which shines at night."""
-_PLATE: Color = (230, 226, 220)
-_RIM: Color = (186, 34, 36)
-KERB_INSET = 0.3
-"""Metres from the kerb to the middle of a mast."""
-_BEHIND_LINE = 0.3
-"""Metres from the stop line or yield line, towards the junction, to the light or sign."""
-_LAMP_HEIGHTS = (3.35, 3.05, 2.75)
-"""Heights of the red, amber and green lamp above the ground, metres."""
-_LANTERN_SPACING = 28.0
-_LANTERN_HEIGHT = 6.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SignalHead:
-    """The lamps for the traffic that comes by one arm.
-
-    Attributes:
-        arm: by which the traffic comes.
-        rows: rows of the red, amber and green lamp in `World.props`.
-    """
-
-    arm: Arm
-    rows: tuple[int, int, int]
-
-
 def mast(x: float, y: float, top: float) -> Prop:
     """A mast whose top is `top` metres high."""
     return Prop(POLE, (_column(x, y, (-0.1, top)),))
@@ -129,13 +226,7 @@ def yield_sign(spec: RoadSpec, arm: Arm) -> Prop:
 
 
 def signal_head(arm: Arm, light: Prop, first_row: int) -> SignalHead:
-    """Where the lamps of a traffic light are.
-
-    Args:
-        arm: whose light it is.
-        light: from `traffic_light`.
-        first_row: row of the light's first block in the world's solids.
-    """
+    """Where the lamps of an arm's traffic light are, whose first block has that row of the world's solids."""
     red_row = first_row + len(light.blocks) - len(LAMP_COLORS)
     return SignalHead(arm=arm, rows=(red_row, red_row + 1, red_row + 2))
 
@@ -175,23 +266,14 @@ def _box(x: float, y: float, half: float, z: tuple[float, float], color: Color) 
     return Block((x - half, x + half), (y - half, y + half), z, color)
 
 
-_BARK: Color = (92, 72, 54)
-_LEAVES: tuple[Color, ...] = ((70, 116, 54), (88, 132, 62), (58, 100, 58))
-_SPACING = 13.0
-_SHARE = 0.55
-"""The share of places that have a tree."""
-_INSET = 1.25
-"""Metres from the sidewalk to a trunk, so that crowns end at the sidewalk."""
-
-
 def trees(rng: np.random.Generator, spec: RoadSpec) -> Iterator[Prop]:
     """Trees along both sides of each arm, with gaps."""
     for arm in spec.arms:
         out_x, out_y = OUTWARD[arm]
-        for along in np.arange(spec.stop_line[1] + 7.0, 105.0, _SPACING):
+        for along in np.arange(spec.stop_line[1] + 7.0, 105.0, _TREE_SPACING):
             for side in (1, -1):
-                place, present = float(along + rng.uniform(-2, 2)), rng.random() < _SHARE
-                beside = side * (spec.sidewalk_edge + _INSET)
+                place, present = float(along + rng.uniform(-2, 2)), rng.random() < _TREE_SHARE
+                beside = side * (spec.sidewalk_edge + _TREE_INSET)
                 if present:
                     yield _tree(rng, place * out_x - beside * out_y, place * out_y + beside * out_x)
 
@@ -207,23 +289,6 @@ def _tree(rng: np.random.Generator, x: float, y: float) -> Prop:
             Block((x - 1.15, x + 1.15), (y - 1.15, y + 1.15), (3.3, top), leaves, inset=(0.7, 0.7, 0.7)),
         ),
     )
-
-
-Span = tuple[float, float]
-
-STOREY = 3.2
-"""Height of a storey, metres."""
-_WALLS: tuple[Color, ...] = (
-    (176, 122, 96), (206, 190, 160), (170, 170, 166), (148, 100, 82), (220, 214, 200), (140, 150, 158), (190, 160, 128),
-)  # fmt: skip
-_SETBACK = (2.5, 4.6)
-"""Metres from the sidewalk to the fronts."""
-_LAST = 110.0
-_KERB_HOUSE_LENGTH = 20.5
-_KERB_HOUSE_STOREYS = 3
-_MAST_ROOM = 0.25
-"""Metres from the middle of a mast to the house on the kerb behind it."""
-_CODES = 240
 
 
 def houses(rng: np.random.Generator, spec: RoadSpec) -> list[Prop]:
@@ -267,7 +332,7 @@ def _closed_side(rng: np.random.Generator, spec: RoadSpec) -> Iterator[Block]:
 def _row(rng: np.random.Generator, spec: RoadSpec, start: float, deepest: float) -> Iterator[tuple[Span, Span]]:
     """Houses side by side from `start`: their extents along the road and away from it."""
     position = start + rng.uniform(1.5, 6)
-    while position < _LAST:
+    while position < _LAST_HOUSE:
         length, front = rng.uniform(10, 20), spec.sidewalk_edge + rng.uniform(*_SETBACK)
         yield (position, position + length), (front, min(front + rng.uniform(9, 14), deepest))
         position += length + rng.uniform(1, 7)
@@ -289,3 +354,43 @@ def _mirrored(span: Span, sign: int) -> Span:
 
 def _building(number: int, block: Block) -> Prop:
     return Prop(FIRST_BUILDING + number % _CODES, (block,))
+
+
+def _signals(junction: Junction, lights: list[Prop]) -> list[SignalHead]:
+    heads, row = [], 0
+    for arm, light in zip(junction.arms, lights, strict=False):
+        heads.append(signal_head(arm, light, row))
+        row += len(light.blocks)
+    return heads
+
+
+def _pole_corner(rng: np.random.Generator, junction: Junction, between: tuple[Arm, Arm]) -> Corner:
+    """One of the corners nearest to two arms; a three-way junction has corners only in the south."""
+    north = (1, -1) if "north" in junction.arms else (-1,)
+    toward = np.sum([OUTWARD[arm] for arm in between], axis=0)
+    nearness = {(x, y): int(toward @ (x, y)) for x in (1, -1) for y in north}
+    nearest = [corner for corner, near in nearness.items() if near == max(nearness.values())]
+    return nearest[int(rng.random() * len(nearest))]
+
+
+def _corner_between(junction: Junction, arms: tuple[Arm, Arm]) -> Corner:
+    (x_a, y_a), (x_b, y_b) = (OUTWARD[arm] for arm in arms)
+    corner = (x_a + x_b, y_a + y_b)
+    if 0 in corner or not set(arms) <= set(junction.arms):
+        raise ConfigError(
+            f"between: the arms {arms[0]} and {arms[1]} of a {junction.spec.kind} junction have no corner in common; "
+            f"choose two neighbours of {', '.join(junction.arms)}"
+        )
+    return corner
+
+
+def _random_place(rng: np.random.Generator, terrain: Terrain) -> SE3:
+    """Some hundred metres from the town's origin, in any direction; on a gentle slope if the ground has no hump."""
+    slope, uphill, yaw = rng.uniform(0, _MAX_SLOPE), rng.uniform(-np.pi, np.pi), rng.uniform(-np.pi, np.pi)
+    if not terrain.is_flat:
+        slope = 0.0
+    across = SE3.from_quaternion((np.cos(slope / 2), 0.0, np.sin(slope / 2), 0.0))
+    direction = SE3.from_yaw(uphill)
+    tilt = direction @ across @ direction.inverse()
+    x, y, z = rng.uniform((-400, -400, -2), (400, 400, 8))
+    return SE3.from_rotation(np.eye(3), (x, y, z)) @ tilt @ SE3.from_yaw(yaw)

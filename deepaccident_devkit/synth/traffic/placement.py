@@ -11,10 +11,13 @@ from deepaccident_devkit.synth.roads import LANE_WIDTH, Arm, Junction, Path, Rou
 from deepaccident_devkit.synth.spec import ActorSpec, MeetSpec, ScenarioSpec
 from deepaccident_devkit.synth.spec.checks import LEADERS
 from deepaccident_devkit.synth.spec.model import Role, Side
-from deepaccident_devkit.synth.traffic.driving import DECISION_STEPS, PERIOD, Tracks, free_acceleration
-from deepaccident_devkit.synth.traffic.users import (
+from deepaccident_devkit.synth.traffic.driving import (
+    DECISION_STEPS,
     MANNERS,
+    PERIOD,
     RoadUser,
+    Tracks,
+    free_acceleration,
     lane_span,
     lane_way,
     middle_of,
@@ -48,10 +51,7 @@ class Approach:
         return row * PERIOD
 
     def at(self, time: float) -> RoadUser:
-        """The road user as it is `time` seconds into the drive.
-
-        Before the start of the drive, a road user that starts from standing waits; another one is farther back.
-        """
+        """The road user `time` seconds into the drive; before, one that stands waits, others are farther back."""
         if time < 0 and self.user.start_speed == 0:
             return replace(self.user, delay=-time)
         if time < 0:
@@ -61,12 +61,7 @@ class Approach:
 
 
 def drive_alone(user: RoadUser, to: float = 0.0) -> Approach:
-    """The drive of a road user that is alone on its path: as in a simulation, except that it never leaves its path.
-
-    Args:
-        user: as at the start of the drive.
-        to: the drive goes on at least until the box's centre is so many metres along the path.
-    """
+    """The drive of a road user that is alone and stays on its path, at least until its centre is `to` metres along."""
     tracks = Tracks([user.path], np.array([user.manner.lateral]), np.array([user.walks]))
     temper, back = temper_of([user]), user.wheelbase / 2
     along, speed = np.array([user.start - back]), np.array([user.start_speed])
@@ -122,14 +117,7 @@ class Cast:
 
 
 def cast_actors(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float) -> Cast:
-    """The moving road users that a file names.
-
-    Args:
-        rng: random numbers.
-        spec: what the file says, every choice made.
-        junction: its roads.
-        duration: seconds from the first recorded frame to when the pair meets.
-    """
+    """The moving road users that a file names; the pair meets `duration` seconds after the first recorded frame."""
     begin = -(duration + WARM_UP)
     named = [actor for actor in spec.actors if actor.role != "parked"]
     leading = [actor for actor in named if actor.role not in LEADERS]
@@ -243,13 +231,7 @@ _OFFSETS = (-0.2, 0.2)
 
 
 def unplanned(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction) -> ScenarioSpec:
-    """The scenario with another accident: ego and other obey, and one of them meets a pedestrian or a third vehicle.
-
-    Args:
-        rng: random numbers.
-        spec: a designed scenario.
-        junction: its roads.
-    """
+    """A designed scenario with another accident: ego and other obey, and one meets a pedestrian or a third vehicle."""
     victims: tuple[Role, ...] = ("ego", "other")
     victim = spec.actor(victims[int(rng.integers(2))])
     used = {spec.actor(role).from_arm for role in victims}

@@ -20,8 +20,8 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import Route
 
 from deepaccident_devkit.explore.explorer import Explorer
-from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.replay import replay_script, replay_style
+from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.pages import part, path_in_address
 from deepaccident_devkit.support.pages import rendered as filled
 
@@ -50,14 +50,7 @@ def page(request: Request, template: str, *, status: int = 200, **context: Any) 
 
 
 def rendered(explorer: Explorer, template: str, root: str, **context: Any) -> str:
-    """A template as text.
-
-    Args:
-        explorer: whose page it is.
-        template: its file.
-        root: relative address of the first page.
-        **context: what it shows; all texts are escaped.
-    """
+    """A template as text, given the relative address of the first page (`root`); all texts are escaped."""
     addresses = {"asset": asset, "scenario_at": scenario_address, "thumbnail_at": thumbnail_address}
     served = {"root": root, "models": [*explorer.models], "static": False, "frame_number": frame_button}
     return filled(template, **addresses, **served, **context)
