@@ -60,7 +60,7 @@ def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a demo with few frames and small images, and what `deepaccident demo` printed."""
     out = tmp_path_factory.mktemp("demo") / "of a reader"
-    demo = importlib.import_module("deepaccident_devkit.cli.demo")
+    demo = importlib.import_module("deepaccident_devkit.synth.demo")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "_RELEASE", replace(demo._RELEASE, frames=12, image_size=(64, 36)))
         result = CliRunner().invoke(demo.demo, [str(out)], catch_exceptions=False)

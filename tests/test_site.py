@@ -13,6 +13,7 @@ import deepaccident_devkit
 DOCS = Path(__file__).parents[1] / "docs"
 NOT_FOR_USERS = {
     *(
+        "accidents",
         "archives",
         "arrays",
         "cli",
@@ -25,6 +26,8 @@ NOT_FOR_USERS = {
         "pages",
         "parallel",
         "reading",
+        "rooms",
+        "support",
         "tables",
         "text",
     ),

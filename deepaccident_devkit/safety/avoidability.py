@@ -11,12 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, each_scenario, reasons_text, those_of
-from deepaccident_devkit.safety.contact import Pair, SecondaryContact, contact_made, pair_of, secondary_contacts
-from deepaccident_devkit.safety.outcomes import (
+from deepaccident_devkit.accidents.contact import Pair, SecondaryContact, contact_made, pair_of, secondary_contacts
+from deepaccident_devkit.accidents.outcomes import (
     BRAKINGS,
     MOST_MARGIN,
     OUTCOMES,
@@ -27,6 +23,10 @@ from deepaccident_devkit.safety.outcomes import (
     outcomes_of,
     undisturbed,
 )
+from deepaccident_devkit.accidents.recorded import Accident, Skipped, accident_of, each_scenario, reasons_text, those_of
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats, checked, known
 from deepaccident_devkit.support.text import columns_text
 from deepaccident_devkit.taxonomy import FRAME_PERIOD

@@ -17,10 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import GeometryError, NotAvailableError
-from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import (
+from deepaccident_devkit.accidents.recorded import (
     Skipped,
     accident_of,
     each_scenario,
@@ -28,6 +25,9 @@ from deepaccident_devkit.safety.accidents import (
     skipped_rows,
     those_of,
 )
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import GeometryError, NotAvailableError
+from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, known
 from deepaccident_devkit.support.text import columns_text

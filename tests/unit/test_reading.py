@@ -119,7 +119,7 @@ NOT_OF_STRANGERS = {
     "archives.py": "its archives, of which the end was checked",
     "files.py": "the system's processes",
     "cli/streams.py": "nothing: the null device",
-    "cli/demo.py": "the mark of the demo's own folder",
+    "synth/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
     "explore/pages/scenarios.py": "the split file that was written a line before",
     "explore/pages/answers.py": "the package's own styles and scripts",

@@ -14,9 +14,9 @@ from deepaccident_devkit.explore.background import Job, State
 from deepaccident_devkit.explore.pages.answers import explorer_of, page, picture, with_slash
 from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.maps import kept_town_map, towns_of
+from deepaccident_devkit.maps.pictures import draw_whole_map
 from deepaccident_devkit.overview import Overview, overview
 from deepaccident_devkit.render.axes import detached_figure
-from deepaccident_devkit.render.ground import draw_whole_map
 from deepaccident_devkit.taxonomy import SPLITS
 
 TABS: Final[Mapping[str, str]] = {

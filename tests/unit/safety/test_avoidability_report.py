@@ -13,6 +13,8 @@ import pytest
 from replayed_accidents import head_on, rear_end
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.accidents.contact import SecondaryContact
+from deepaccident_devkit.accidents.outcomes import delta_v_ranges
 from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.safety import (
     OUTCOMES,
@@ -24,8 +26,6 @@ from deepaccident_devkit.safety import (
     outcome_shares,
 )
 from deepaccident_devkit.safety.avoidability import group_of
-from deepaccident_devkit.safety.contact import SecondaryContact
-from deepaccident_devkit.safety.outcomes import delta_v_ranges
 
 AVOIDED = OUTCOMES.index("avoided")
 

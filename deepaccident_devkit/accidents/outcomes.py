@@ -10,10 +10,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from deepaccident_devkit.accidents.contact import Pair, contact_times, impacts, pair_of
+from deepaccident_devkit.accidents.masses import MASS_UNCERTAINTY
+from deepaccident_devkit.accidents.recorded import Accident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.interactions.config import MASS_UNCERTAINTY
-from deepaccident_devkit.safety.accidents import Accident
-from deepaccident_devkit.safety.contact import Pair, contact_times, impacts, pair_of
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 
 OUTCOMES: Final = ("avoided", "stopped", "mitigated", "unchanged", "worsened")

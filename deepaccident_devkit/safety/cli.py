@@ -20,9 +20,6 @@ from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.pictures import write_figure
-from deepaccident_devkit.render.safety import render_lead_times, save_safety_report
-from deepaccident_devkit.render.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability
-from deepaccident_devkit.render.safety.report import REPLAYS
 from deepaccident_devkit.safety import (
     ObservationRule,
     avoidability_report,
@@ -32,6 +29,8 @@ from deepaccident_devkit.safety import (
     twin_report,
 )
 from deepaccident_devkit.safety.avoidability import GROUPS
+from deepaccident_devkit.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability, render_lead_times
+from deepaccident_devkit.safety.page import REPLAYS, save_safety_report
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 
 _DPI: Final = 150

@@ -16,9 +16,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.geometry.footprints import gaps_of_pairs
-from deepaccident_devkit.safety.accidents import Accident, recorded_path
-from deepaccident_devkit.safety.replay import (
+from deepaccident_devkit.accidents.recorded import Accident, recorded_path
+from deepaccident_devkit.accidents.replay import (
     HORIZON,
     BrakingPlans,
     Motion,
@@ -27,6 +26,7 @@ from deepaccident_devkit.safety.replay import (
     motion_of,
     replay,
 )
+from deepaccident_devkit.geometry.footprints import gaps_of_pairs
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import ScenarioTracks

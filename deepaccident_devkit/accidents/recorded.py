@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
+from deepaccident_devkit.accidents.masses import CLASS_MASSES, masses_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.interactions import CLASS_MASSES, masses_of
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.reports import Row
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
