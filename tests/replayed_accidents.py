@@ -1,4 +1,4 @@
-"""Accidents whose outcome under braking follows from school physics, for the tests of `deepaccident_devkit.accidents` and `safety`."""
+"""Accidents whose outcome under braking follows from school physics, for the tests of `accidents` and `safety`."""
 
 from collections.abc import Callable
 

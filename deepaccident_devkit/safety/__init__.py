@@ -39,12 +39,10 @@ from deepaccident_devkit.interactions import (
     time_to_collision,
     time_to_collision_1d,
 )
-from deepaccident_devkit.safety.avoidability import (
-    Avoidability,
+from deepaccident_devkit.safety.avoidability import Avoidability, avoidability, avoidability_of
+from deepaccident_devkit.safety.avoidability_report import (
     AvoidabilityReport,
     OutcomeShares,
-    avoidability,
-    avoidability_of,
     avoidability_report,
     outcome_shares,
 )
@@ -54,12 +52,10 @@ from deepaccident_devkit.safety.lead_times import (
     LeadTimeLedger,
     LeadTimes,
     MeanTime,
-    coalition_leads,
     lead_time_ledger,
     lead_times,
-    shapley_values,
 )
-from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
+from deepaccident_devkit.safety.observation import ObservationRule, coalition_leads, observed_actors, shapley_values
 from deepaccident_devkit.safety.report import AccidentRow, PairMeasures, SafetyReport, safety_report
 from deepaccident_devkit.safety.stories import Story, describe, scenario_facts, stories, story_text
 from deepaccident_devkit.safety.twins import Parting, TwinDiff, TwinReport, twin_diff, twin_report

@@ -28,7 +28,7 @@ from deepaccident_devkit.safety import (
     stories,
     twin_report,
 )
-from deepaccident_devkit.safety.avoidability import GROUPS
+from deepaccident_devkit.safety.avoidability_report import GROUPS
 from deepaccident_devkit.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability, render_lead_times
 from deepaccident_devkit.safety.page import REPLAYS, save_safety_report
 from deepaccident_devkit.support.files import writable_folder, write_bytes

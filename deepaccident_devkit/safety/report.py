@@ -12,14 +12,8 @@ from deepaccident_devkit.accidents.recorded import Skipped, each_scenario, those
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.interactions import InteractionConfig, InteractionPairs, interactions
 from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.avoidability import (
-    BRAKERS,
-    Avoidability,
-    AvoidabilityReport,
-    Dropped,
-    looked_into,
-    report_of,
-)
+from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability
+from deepaccident_devkit.safety.avoidability_report import AvoidabilityReport, Dropped, looked_into, report_of
 from deepaccident_devkit.safety.lead_times import LeadTimeLedger, LeadTimes, lead_times, ledger_of
 from deepaccident_devkit.safety.observation import ObservationRule
 from deepaccident_devkit.safety.stories import Story, scenario_facts, story_text
