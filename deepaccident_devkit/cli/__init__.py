@@ -19,7 +19,6 @@ from deepaccident_devkit.cli.interruption import run_interruptibly
 from deepaccident_devkit.cli.streams import lasting_streams
 from deepaccident_devkit.cli.verbs import LazyVerbs
 from deepaccident_devkit.errors import DeepAccidentError, SomeFailedError
-from deepaccident_devkit.rooms import ADDED, added
 
 _ERROR_STATUS = 2
 _FINDINGS_STATUS = 1
@@ -49,6 +48,8 @@ _VERBS: Final = {
 
 def _verb(name: str) -> click.Command:
     """A verb: one of a room, or of this package; raises MissingRoomError."""
+    from deepaccident_devkit.rooms import ADDED, added  # here: the list of verbs needs none of it
+
     found: click.Command = (
         added("verb", name) if name in ADDED["verb"] else getattr(import_module(f"{__name__}.{name}"), name)
     )
