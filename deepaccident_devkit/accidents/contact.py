@@ -69,15 +69,10 @@ class Impacts(FrozenArrays):
 
 
 def pair_of(paths: ArrayLike, sizes: ArrayLike, *, margin: float | None = None) -> Pair:
-    """The motions of two actors and the margin of their contact.
+    """The motions of two on paths (2, F, 3) of x, y, yaw at 10 Hz up to the impact, and the margin of their contact.
 
-    Args:
-        paths: (2, F, 3) x, y, yaw at 10 Hz, in any right-handed frame; metres, radians. The last frame is the impact.
-        sizes: (2, 2) lengths and widths, or (2, 3) heights too, metres.
-        margin: metres between the outlines that count as contact; None for the gap at the last frame.
-
-    Raises:
-        GeometryError: an array has another shape, there are fewer than two frames, or a path is not finite.
+    Any right-handed frame, metres, radians; `sizes` (2, 2 or more) begin with length and width. A `margin` of None
+    is the gap at the last frame. Raises GeometryError.
     """
     both = checked("paths", paths, (2, None, 3))
     flat = checked("sizes", np.asarray(sizes)[:, :2], (2, 2))
@@ -93,14 +88,9 @@ def contact_times(
 ) -> FloatArray:
     """(N,) seconds at which replays of a pair first touch; inf for those that never do.
 
-    Args:
-        pair: the recorded motions.
-        starts: (N, 2) seconds at which each of the two begins to brake; inf or NaN if it does not.
-        decelerations: (N,) m/s², of both.
-        window: seconds from and to which contact counts; None for all, to the end of the continuation.
-
-    Raises:
-        GeometryError: the arrays do not fit each other.
+    `starts` (N, 2) are the seconds at which each of the two begins to brake, inf or NaN if it does not;
+    `decelerations` (N,) are m/s² of both. Contact counts within the `window`, None for all to the end of the
+    continuation. Raises GeometryError.
     """
     return _search(pair, _plans(pair, starts, decelerations), window or _whole(pair), earliest=True)
 
@@ -114,17 +104,7 @@ def contact_made(
 
 
 def impacts(pair: Pair, starts: ArrayLike, decelerations: ArrayLike, times: FloatArray) -> Impacts:
-    """How fast the two are where replays first touch.
-
-    Args:
-        pair: the recorded motions.
-        starts: (N, 2) seconds at which each of the two begins to brake.
-        decelerations: (N,) m/s².
-        times: (N,) of the contacts; inf for those without.
-
-    Raises:
-        GeometryError: the arrays do not fit each other.
-    """
+    """How fast the two are where replays first touch: at `times` (N,), inf for none; else as `contact_times`."""
     hit = np.flatnonzero(np.isfinite(times))
     speeds, velocities = np.full((len(times), 2), np.nan), np.full((2, len(times), 2), np.nan)
     plans = _plans(pair, starts, decelerations)

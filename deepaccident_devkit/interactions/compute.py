@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.accidents.masses import masses_of
+from deepaccident_devkit.accidents.recorded import masses_of
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.conflicts import normals
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs

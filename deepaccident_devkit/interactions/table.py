@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, TypedDict
 
 import numpy as np
 
-from deepaccident_devkit.accidents.masses import CLASS_MASSES
+from deepaccident_devkit.accidents.recorded import CLASS_MASSES
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, checked_number
 from deepaccident_devkit.tables.columns import Key, Number, TableSpec, Vector

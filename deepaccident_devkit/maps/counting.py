@@ -101,12 +101,7 @@ def looks_of(dataset: Dataset, scenario_row: int, config: TownMapConfig) -> list
 
 
 def chosen_frames(xy: FloatArray, config: TownMapConfig) -> IntArray:
-    """The frames, from 0, of a recording that are read.
-
-    Args:
-        xy: (F, 2) where the agent is at each frame, 10 a second, metres.
-        config: how far apart they are.
-    """
+    """The frames, from 0, of a recording that are read, by where the agent is at each, 10 a second: (F, 2) metres."""
     steps = np.hypot(*np.diff(xy, axis=0).T)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     seconds = np.arange(len(xy)) * FRAME_PERIOD
@@ -182,16 +177,9 @@ def _add_looks(
 def codes_in_world(tags: ByteArray, world_from_ego: FloatArray, resolution: float) -> tuple[IntArray, ByteArray]:
     """A picture's ground in the cells of the world: what its pixel nearest to each cell's middle shows.
 
-    The road is taken for a plane through the agent's origin, which tilts as the agent does.
-
-    Args:
-        tags: (1200, 1200) uint8, CARLA's semantic tags, forward up.
-        world_from_ego: (4, 4) the agent's pose.
-        resolution: side of a cell, metres.
-
-    Returns:
-        Row and column (2,) of the first cell among those of the world; and (h, w) uint8, 0 for not seen, else 1 + the
-        position in `GROUND_CLASSES`; row = y index, column = x index, both rising.
+    The road is taken for a plane through the agent's origin, which tilts as the agent does; `tags` (1200, 1200) are
+    CARLA's, forward up. Gives row and column (2,) of the first cell among those of the world, and (h, w) uint8, 0
+    for not seen, else 1 + the position in `GROUND_CLASSES`; row = y index, column = x index, both rising.
     """
     low, high = cells_around(world_from_ego[None], resolution)
     y, x = (
@@ -225,15 +213,10 @@ def _code_of_tag() -> ByteArray:
 
 
 def hidden_ground(classes: ByteArray, resolution: float) -> ByteArray:
-    """The ground of small holes: what most of the cells around a hole are, road lines taken for road.
+    """(H, W) uint8, the ground of small holes: what most of the cells around a hole are, road lines taken for road.
 
-    Args:
-        classes: (H, W) uint8, 0 where nothing was seen, 1 road, 2 road line, then others.
-        resolution: side of a cell, metres.
-
-    Returns:
-        (H, W) uint8, the class of the cells of holes; 0 where something was seen, and in holes that are larger than
-        60 m² or reach the raster's edge.
+    `classes` (H, W) are 0 where nothing was seen, 1 road, 2 road line, then others. The result is 0 where something
+    was seen, and in holes that are larger than 60 m² or reach the raster's edge.
     """
     from scipy import ndimage
 

@@ -72,13 +72,7 @@ def map_beneath(dataset: Dataset, scenario: str, *, make: bool) -> TownMap | Non
 
 
 def draw_town_map(drawn: TownMap, ax: Axes, *, target_from_world: SE3) -> None:
-    """Render the part of a map that axes show, whose limits stay; what is no road or sidewalk is white.
-
-    Args:
-        drawn: the map.
-        ax: axes to render on.
-        target_from_world: from the world to the frame of the axes; its tilt is left out.
-    """
+    """Render the part of a map that axes show, whose limits stay; what is no road or sidewalk is white."""
     part = _shown(drawn, (ax.get_xlim(), ax.get_ylim()), target_from_world)
     if not part.agents.size:
         return

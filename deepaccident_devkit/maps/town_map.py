@@ -187,13 +187,7 @@ def _surface_and_all(counts: NDArray[np.uint16]) -> tuple[NDArray[np.uint32], ND
 
 
 def simplified(polygons: MultiPolygon, tolerance: float, least_area: float) -> MultiPolygon:
-    """Polygons with fewer corners, without small islands and holes.
-
-    Args:
-        polygons: of one area.
-        tolerance: how far an outline may move, metres; 0 leaves it.
-        least_area: smaller islands and holes go, square metres.
-    """
+    """Polygons whose outlines may move by `tolerance` metres, without smaller islands and holes, square metres."""
     import shapely
 
     parts = shapely.get_parts(polygons)

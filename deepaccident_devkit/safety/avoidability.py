@@ -204,15 +204,9 @@ class Avoidability(FrozenArrays):
 
 
 def last_moments(pair: Pair, brakers: tuple[bool, bool], decelerations: ArrayLike) -> LastMoments:
-    """The last moments to brake: each hundredth of a second is tried, since the answer may change more than once.
+    """The last moments to brake with decelerations (N,) m/s²: each hundredth of a second is tried.
 
-    Args:
-        pair: the recorded motions.
-        brakers: which of the two brake.
-        decelerations: (N,) m/s².
-
-    Raises:
-        GeometryError: the decelerations have another shape.
+    The answer may change more than once.
     """
     hard = checked("decelerations", decelerations, (None,))
     tried = np.arange(round(pair.duration / _SCAN_STEP) + 1) * _SCAN_STEP
@@ -325,14 +319,8 @@ def secondary_contacts(
 ) -> list[SecondaryContact]:
     """The first contacts of each of the pair with each other actor in N replays, which the recording does not have.
 
-    Args:
-        accident: the recorded motion of the pair.
-        tracks: of all actors of its scenario.
-        starts: (N, 2) seconds at which each of the two begins to brake; inf if it does not.
-        decelerations: (N,) m/s².
-
-    Returns:
-        By replay, then by time. Others that labels show at one frame alone have no motion, and are left out.
+    `starts` (N, 2) are the seconds at which each of the two begins to brake, inf if it does not. By replay, then by
+    time. Others that labels show at one frame alone have no motion, and are left out.
     """
     found = []
     for other, which in product(_others(accident, tracks), (0, 1)):

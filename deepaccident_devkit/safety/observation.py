@@ -97,17 +97,11 @@ def coalition_members(partners: int) -> BoolArray:
 
 
 def first_together(observed: ArrayLike) -> IntArray:
-    """The first frame at which the union over a coalition observes both colliders.
+    """(…, 2^n) position of the first frame at which the union over a coalition observes both; −1 for never.
 
-    Args:
-        observed: (…, 1 + n, 2, F) bool: whether the ego (first) and each partner observe each collider at each frame.
-            Recordings of several lengths can be one array if they end together, with False before their beginnings.
-
-    Returns:
-        (…, 2^n) position of the frame, from 0; −1 for a coalition that never does.
-
-    Raises:
-        GeometryError: `observed` has another shape.
+    `observed` (…, 1 + n, 2, F) says whether the ego, the first, and each partner observe each collider at each
+    frame. Recordings of several lengths can be one array if they end together, with False before their beginnings.
+    Raises GeometryError.
     """
     seen = as_numbers("observed", observed, "truth values (…, agents, 2, frames)", np.bool_)
     if seen.ndim < 3 or seen.shape[-2] != _PAIR or not seen.shape[-3]:
