@@ -3,39 +3,39 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit import maps, overview, selection, v2x
+from deepaccident_devkit import overview, selection, v2x
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError, escaped
-from deepaccident_devkit.interactions import interactions as interactions_of_scenario
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 
 
 class _Later:
-    """A function of a package that is slow to import: imported at its first use, and then kept in this one's place.
+    """A function of a package that is slow to import, or of a room: imported at its first use, and then kept.
 
     `DeepAccident` binds functions of all layers, and reading tables should not wait for the import of those that
     render.
     """
 
-    def __init__(self, package: str, function: str) -> None:
-        self._package = package
-        self._function = function
+    def __init__(self, load: Callable[[], Any]) -> None:
+        self._load = load
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._owner = owner
         self._name = name
 
     def __get__(self, instance: object, owner: type) -> Any:
-        function = getattr(import_module(self._package), self._function)
+        function = self._load()
         setattr(self._owner, self._name, function)
         return function.__get__(instance, owner)
 
@@ -52,15 +52,25 @@ class _Package:
     def __getattr__(self, name: str) -> _Later:
         if name.startswith("_"):  # what tools look for on any object
             raise AttributeError(name)
-        return _Later(self._name, name)
+        return _Later(lambda: getattr(import_module(self._name), name))
+
+
+class _Ring:
+    """The same for the rooms of the ring, which need not be there: what they add to the facade."""
+
+    def __getattr__(self, name: str) -> _Later:
+        return _Later(partial(added, "method", name))
 
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from deepaccident_devkit import motion, render, safety, validation
+    from deepaccident_devkit import interactions as pairs
+    from deepaccident_devkit import maps, motion, render, safety, validation
+    from deepaccident_devkit.maps import pictures as map_pictures
 else:
-    motion, render, safety, validation = map(_Package, ("motion", "render", "safety", "validation"))
+    motion, render, validation = map(_Package, ("motion", "render", "validation"))
+    map_pictures = maps = pairs = safety = _Ring()
 
 
 class DeepAccident(Dataset):
@@ -136,7 +146,7 @@ class DeepAccident(Dataset):
     trajectory = v2x.trajectory
     collision = v2x.collision
     message_sizes = v2x.message_sizes
-    interactions = interactions_of_scenario
+    interactions = pairs.interactions
     town_map = maps.town_map
     describe = safety.describe
     motion_labels = motion.motion_labels
@@ -161,7 +171,7 @@ class DeepAccident(Dataset):
     render_evaluation = render.render_evaluation
     render_scenario_video = render.render_scenario_video
     render_replay = render.render_replay
-    render_town_map = render.render_town_map
+    render_town_map = map_pictures.render_town_map
 
     def list_scenarios(self) -> None:
         """Print a line for each scenario."""

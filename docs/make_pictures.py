@@ -15,9 +15,9 @@ from PIL import Image
 from selenium import webdriver
 
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.cli.demo import SCENARIO
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.synth.demo import SCENARIO
 
 PAGE = Path(__file__).parent / "gallery.md"
 IMAGES = PAGE.parent / "images"

@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import matplotlib as mpl
 import pytest
@@ -14,13 +15,14 @@ from hypothesis import settings
 from scripts import loaded_script
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.synth import SynthConfig, make_release
 
 mpl.use("Agg")
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("repeatable")
 
 DATA = Path(__file__).parent / "data"
+MADE = os.environ.get("DEEPACCIDENT_TEST_RELEASES")
+"""The folder of the session's releases, if another session has made them (tests/test_rooms.py)."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -41,8 +43,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """A checkout that is on the path, but not installed, has no entry point for the test kit's plugin."""
-    if not config.pluginmanager.has_plugin("deepaccident"):
-        config.pluginmanager.register(importlib.import_module("deepaccident_devkit.testing.plugin"), "deepaccident")
+    manager = config.pluginmanager
+    if not manager.has_plugin("deepaccident") and not manager.is_blocked("deepaccident"):
+        manager.register(importlib.import_module("deepaccident_devkit.testing.plugin"), "deepaccident")
+
+
+def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
+    """A synthetic release of this name, made now if no other session has."""
+    if MADE is not None:
+        return Path(MADE) / name
+    from deepaccident_devkit.synth import SynthConfig, make_release
+
+    return make_release(factory.mktemp("synthetic") / name, SynthConfig(**config), workers=2)
 
 
 @pytest.fixture(scope="session")
@@ -51,16 +63,15 @@ def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     In its accidents ego and other collide, as designed. Its labels count the very points of its clouds.
     """
-    root = tmp_path_factory.mktemp("synthetic") / "deep accident"
-    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), layout="A", seed=3, unplanned=0, exact=True)
-    return make_release(root, config, workers=2)
+    size = {"scenarios": 4, "frames": 6, "image_size": (64, 36)}
+    return made("deep accident", tmp_path_factory, **size, layout="A", seed=3, unplanned=0, exact=True)
 
 
 @pytest.fixture(scope="session")
 def made_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a demo with few frames and small images, and what `deepaccident demo` printed."""
     out = tmp_path_factory.mktemp("demo") / "of a reader"
-    demo = importlib.import_module("deepaccident_devkit.cli.demo")
+    demo = importlib.import_module("deepaccident_devkit.synth.demo")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "_RELEASE", replace(demo._RELEASE, frames=12, image_size=(64, 36)))
         result = CliRunner().invoke(demo.demo, [str(out)], catch_exceptions=False)
@@ -71,8 +82,7 @@ def made_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 @pytest.fixture(scope="session")
 def release_root_b(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic release in layout B, labels only; read-only by agreement."""
-    root = tmp_path_factory.mktemp("synthetic") / "layout_b"
-    return make_release(root, SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False), workers=2)
+    return made("layout_b", tmp_path_factory, scenarios=6, frames=4, layout="B", seed=4, sensors=False)
 
 
 @pytest.fixture(scope="session")
@@ -98,11 +108,15 @@ def da_b(release_root_b: Path) -> DeepAccident:
 
 
 @pytest.fixture(scope="session")
-def da_motion(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+def motion_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An accident of ego and other and its normal twin of 3.5 s, labels only: with pasts, futures and ends."""
-    root = tmp_path_factory.mktemp("synthetic") / "motion"
-    make_release(root, SynthConfig(scenarios=2, frames=35, seed=5, sensors=False, unplanned=0), workers=2)
-    return DeepAccident("v1", root, verbose=False)
+    return made("motion", tmp_path_factory, scenarios=2, frames=35, seed=5, sensors=False, unplanned=0)
+
+
+@pytest.fixture(scope="session")
+def da_motion(motion_root: Path) -> DeepAccident:
+    """The release of `motion_root`, opened."""
+    return DeepAccident("v1", motion_root, verbose=False)
 
 
 @pytest.fixture(params=["A", "B"])

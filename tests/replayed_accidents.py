@@ -1,11 +1,11 @@
-"""Accidents whose outcome under braking follows from school physics, for the tests of `deepaccident_devkit.safety`."""
+"""Accidents whose outcome under braking follows from school physics, for the tests of `accidents` and `safety`."""
 
 from collections.abc import Callable
 
 import numpy as np
 from hypothesis import strategies as st
 
-from deepaccident_devkit.safety import Accident
+from deepaccident_devkit.accidents.recorded import Accident
 
 CAR = (4.0, 2.0, 1.5)
 STEP = 0.1

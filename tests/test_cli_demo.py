@@ -18,7 +18,7 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import make_release
 
-demo: Any = importlib.import_module("deepaccident_devkit.cli.demo")
+demo: Any = importlib.import_module("deepaccident_devkit.synth.demo")
 
 
 def run(*words: str) -> str:

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from deepaccident_devkit.cli.synth import synth
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.synth.cli import synth
 from deepaccident_devkit.synth.spec import design_text, parse_spec
 
 

@@ -1,4 +1,4 @@
-"""The command line: `deepaccident <verb>`, one module for each verb.
+"""The command line: `deepaccident <verb>`, one module for each verb; those of a room are there.
 
 A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error; 130 after Ctrl-C, 143 after
 SIGTERM, 141 if the reader of the output went away.
@@ -45,10 +45,20 @@ _VERBS: Final = {
 }
 
 
+def _verb(name: str) -> click.Command:
+    """A verb: one of a room, or of this package; raises MissingRoomError."""
+    from deepaccident_devkit.rooms import ADDED, added  # here: the list of verbs needs none of it
+
+    found: click.Command = (
+        added("verb", name) if name in ADDED["verb"] else getattr(import_module(f"{__name__}.{name}"), name)
+    )
+    return found
+
+
 @click.group(
     cls=LazyVerbs,
     verbs=_VERBS,
-    load=lambda name: getattr(import_module(f"{__name__}.{name}"), name),
+    load=_verb,
     invoke_without_command=True,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},

@@ -1,6 +1,5 @@
 """`deepaccident export`: the data in other tools' formats. Only the format that is written is imported."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,6 @@ from deepaccident_devkit.cli.options import (
     cooperating_parameter,
     engine_of,
     frame_range_parameter,
-    json_parameter,
     names_or_configuration,
     refuse_unused,
     release_parameters,
@@ -25,8 +23,9 @@ from deepaccident_devkit.cli.options import (
 )
 from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field_option, together, verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.errors import ExportError, NotAvailableError
+from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.motion import PRESETS
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.text import choice, size_text
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
 from deepaccident_devkit.v2x.collisions import default_scenario
@@ -300,47 +299,6 @@ def _camera_names(given: tuple[str, ...]) -> tuple[str, ...]:
     return CAMERAS if "all" in names else tuple(names) or CAMERAS[:1]
 
 
-@verb("town-maps", short_help=_LINES["town-maps"])
-@release_parameters
-@where_parameter
-@click.option("--out", required=True, type=click.Path(), metavar="FOLDER", help="Folder to write into.")
-@json_parameter
-def _town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -> None:
-    """Write a file FOLDER/TOWN.geojson for each town of the release in DATAROOT.
-
-    The maps are made from what the BEV cameras of all recordings saw. Coordinates are metres of the simulator's world,
-    right-handed: no longitude and latitude.
-    """
-    from deepaccident_devkit.maps import town_map, towns_of
-    from deepaccident_devkit.support.files import writable_folder
-
-    folder, dataset = writable_folder(out), DeepAccident(**release)
-    chosen = dataset.find(*where) if where else None
-    if chosen == []:
-        raise click.UsageError("no scenario matches --where, so there is no map; change it or omit it")
-    written: dict[str, dict[str, Any]] = {}
-    for town in towns_of(dataset, chosen):
-        try:
-            made = town_map(dataset, town, scenarios=chosen, progress=True, **engine_of(release))
-        except NotAvailableError as error:
-            click.echo(f"left out: {error}", err=True)
-            continue
-        path = made.to_geojson(folder / f"{made.town}.geojson")
-        counts = {name: getattr(made, name) for name in ("scenarios", "looks", "missing", "damaged")}
-        area = round(float(made.drivable().sum()) * made.resolution**2, 1)
-        written[made.town] = {"path": str(path), **counts, "drivable_square_metres": area}
-    if not written:
-        raise NotAvailableError("no town has a map: there is no readable file of a BEV camera")
-    click.echo(json.dumps(written, indent=2) if as_json else "\n".join(map(_town_line, written.values())))
-
-
-def _town_line(told: dict[str, Any]) -> str:
-    return (
-        f"{told['path']}: {told['drivable_square_metres']:,.0f} m² of road, from {told['looks']:,} pictures of "
-        f"{told['scenarios']:,} scenarios ({told['missing']:,} missing, {told['damaged']:,} damaged)"
-    )
-
-
 @verb("mcap", short_help=_LINES["mcap"])
 @release_parameters
 @click.argument("scenario", required=False)
@@ -395,7 +353,7 @@ _VERBS: Final[dict[str, Callable[[], click.Command]]] = {
     "opencood": _opencood,
     "parquet": _parquet,
     "questions": _questions,
-    "town-maps": lambda: _town_maps,
+    "town-maps": lambda: added("verb", "town-maps"),
     "webdataset": _webdataset,
 }
 """Name → what makes the verb."""

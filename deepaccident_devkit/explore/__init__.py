@@ -9,16 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit.explore.explorer import Explorer
-
 if TYPE_CHECKING:
+    from deepaccident_devkit.explore.explorer import Explorer
     from deepaccident_devkit.explore.pages import make_app
     from deepaccident_devkit.explore.static_pages import export_pages
 
 __all__ = ["Explorer", "explore", "export_pages", "make_app"]
 
-_LATER = {"export_pages": "static_pages", "make_app": "pages"}
-"""What needs the extra, and where it is."""
+_LATER = {"Explorer": "explorer", "export_pages": "static_pages", "make_app": "pages"}
+"""Where names are that the help of the command does without; all but the first need the extra."""
 
 
 def explore(
@@ -64,14 +63,15 @@ def explore(
 
 
 def __getattr__(name: str) -> Any:
-    """Import what needs the extra when it is asked for."""
+    """Import a name's module when it is asked for."""
     if name not in _LATER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
     from deepaccident_devkit.explore.serving import need_extra
 
-    need_extra()
+    if name != "Explorer":
+        need_extra()
     return getattr(import_module(f"{__name__}.{_LATER[name]}"), name)
 
 

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from deepaccident_devkit.accidents.recorded import each_scenario, those_of
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.explore.background import Job, Jobs
 from deepaccident_devkit.interactions import interactions_of
+from deepaccident_devkit.interactions.scenario import measures_of_moving_pairs
 from deepaccident_devkit.safety import lead_times
-from deepaccident_devkit.safety.accidents import each_scenario, those_of
-from deepaccident_devkit.selection.fields import FIELDS, group_texts, measures_of_moving_pairs
+from deepaccident_devkit.selection.fields import FIELDS, group_texts
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.text import natural_order
 

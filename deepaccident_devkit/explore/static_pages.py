@@ -25,12 +25,12 @@ from deepaccident_devkit.explore.pages.responses import assets
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_context
 from deepaccident_devkit.explore.scenarios import accident_columns
 from deepaccident_devkit.interactions import interactions
+from deepaccident_devkit.interactions.scenario import measures_of_moving_pairs
 from deepaccident_devkit.parallel import Engine, Places, run_batch
 from deepaccident_devkit.render.replay import recording_of, tried_replay
 from deepaccident_devkit.render.replay.page import facts
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.selection import find
-from deepaccident_devkit.selection.fields import measures_of_moving_pairs
 from deepaccident_devkit.support.files import (
     plain_names,
     replacing_folder,

@@ -1,9 +1,8 @@
 """Pairs of road users: how near they come to each other, how fast, and how soon they would touch."""
 
+from deepaccident_devkit.accidents.recorded import CLASS_MASSES, masses_of
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
-from deepaccident_devkit.interactions.approach import modified_ttc, nearest_approach
-from deepaccident_devkit.interactions.config import CLASS_MASSES, InteractionConfig, masses_of
 from deepaccident_devkit.interactions.encroachment import conflict_area_pet, post_encroachment_time
 from deepaccident_devkit.interactions.measures import (
     closing_speed,
@@ -14,14 +13,16 @@ from deepaccident_devkit.interactions.measures import (
     drac_of,
     impact_direction,
     impact_heading,
+    modified_ttc,
     modified_ttc_1d,
+    nearest_approach,
     relative_speed,
     time_exposed,
     time_integrated,
     time_to_collision_1d,
 )
 from deepaccident_devkit.interactions.scenario import interactions, interactions_of
-from deepaccident_devkit.interactions.table import InteractionPairs, Interactions
+from deepaccident_devkit.interactions.table import InteractionConfig, InteractionPairs, Interactions
 
 __all__ = [
     "CLASS_MASSES",

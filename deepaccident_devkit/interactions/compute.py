@@ -7,21 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deepaccident_devkit.accidents.recorded import masses_of
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs, normals
-from deepaccident_devkit.interactions.approach import modified_ttc
-from deepaccident_devkit.interactions.config import InteractionConfig, masses_of
 from deepaccident_devkit.interactions.encroachment import pieces_of, recorded_pet
 from deepaccident_devkit.interactions.measures import (
     closing_speed_of_boxes,
     delta_v,
     drac_of,
     impact_heading,
+    modified_ttc,
     relative_speed,
     time_exposed,
     time_integrated,
     time_to_collision_1d,
 )
+from deepaccident_devkit.interactions.table import InteractionConfig
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.tables import displacement_velocities
 from deepaccident_devkit.taxonomy import FRAME_PERIOD

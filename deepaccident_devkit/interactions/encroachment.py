@@ -55,17 +55,10 @@ def delays(
     second_velocity: FloatArray,
     spans: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """The range of delays (the second's time less the first's) at which two steadily moving boxes would touch.
+    """The least and most delays (…), seconds, at which two steadily moving boxes touch; ±infinite for none.
 
-    Args:
-        first: (…, 5) boxes at time 0.
-        second: (…, 5) boxes at time 0.
-        first_velocity: (…, 2) metres a second.
-        second_velocity: (…, 2) metres a second.
-        spans: (…, 2) begin and end of the times of the first that count, and (…, 2) of the second.
-
-    Returns:
-        (…,) least and (…,) most, seconds; the least is infinite and the most −infinite where there are none.
+    A delay is the second's time less the first's; boxes (…, 5) are at time 0, and `spans` the begins and ends (…,
+    2) of the times that count.
     """
     normal, gap, reach = side_gaps(first, second)
     first_way, second_way = along(normal, first_velocity), along(normal, second_velocity)
@@ -235,12 +228,9 @@ def pieces_of(boxes: FloatArray) -> Pieces:
 
 
 def recorded_pet(first: Pieces, second: Pieces) -> float:
-    """Least delay with which one of two recorded actors comes to where the other is at another time.
+    """Least delay, as of `post_encroachment_time`, with which one of two recorded actors comes to where the other is.
 
     Pieces are compared in the order of the least delay that they can have, until no other can have a smaller one.
-
-    Returns:
-        Seconds, signed and infinite as of `post_encroachment_time`.
     """
     one, other = np.nonzero(_near(first, second))
     one, other = _crossing(first, second, one, other)

@@ -6,7 +6,8 @@ They are kept in files, one a scenario, in the folder of the tables, so that the
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Generator, Iterator, Sequence
+import math
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -17,9 +18,15 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.interactions.compute import actor_motion, measured_pairs, pair_summaries
-from deepaccident_devkit.interactions.config import InteractionConfig
-from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names, interaction_specs
+from deepaccident_devkit.interactions.table import (
+    InteractionConfig,
+    InteractionPairs,
+    Interactions,
+    array_names,
+    interaction_specs,
+)
 from deepaccident_devkit.parallel import Places, Store, in_order, run_unordered
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 from deepaccident_devkit.support.files import place_in
 from deepaccident_devkit.tables.arrow_files import read_streams, streams
 from deepaccident_devkit.tables.columns import NULL_INTEGER
@@ -36,6 +43,8 @@ logger = logging.getLogger(__name__)
 FOLDER: Final = "interactions"
 VERSION: Final = "1"
 """Counted up where the same tracks give other numbers, so that kept files are made again."""
+_WORTH_A_BAR: Final = 32
+"""Scenarios whose interactions take some seconds, if none are kept."""
 
 
 def kept_path(dataset: Dataset, scenario: str) -> Path:
@@ -213,6 +222,36 @@ def _in_turn(
     with closing(made):
         for token in tokens:
             yield next(made) if token in absent else interactions(dataset, token)
+
+
+def _least(values: FloatArray) -> float:
+    return float(values.min(initial=math.inf))
+
+
+_MEASURES: Final[Mapping[str, Callable[[InteractionPairs, BoolArray], float]]] = {
+    "min_ttc": lambda pairs, moving: _least(pairs.min_ttc[moving]),
+    "min_pet": lambda pairs, moving: _least(np.abs(pairs.pet[moving])),
+    "min_gap": lambda pairs, moving: _least(pairs.min_gap[moving]),
+    "max_drac": lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0)),
+}
+"""The fields of queries that are measures of the pairs each of which moves at some frame."""
+
+
+def measures_of_moving_pairs(found: Interactions) -> dict[str, float | None]:
+    """These measures of a scenario's interactions; None without labels."""
+    moving = found.pairs.moving
+    return {name: measure(found.pairs, moving) if found.labelled else None for name, measure in _MEASURES.items()}
+
+
+def each_of_moving_pairs(name: str, dataset: Dataset, scenarios: Sequence[RowArgument]) -> Iterator[float | None]:
+    """One of these measures of each scenario, in their order."""
+    for found in interactions_of(dataset, scenarios, progress=len(scenarios) >= _WORTH_A_BAR):
+        yield measures_of_moving_pairs(found)[name]
+
+
+def least_times(dataset: Dataset, scenarios: Sequence[RowArgument], **how: Unpack[Engine]) -> list[FloatArray]:
+    """The least times to collision (L,) of each scenario's moving pairs, seconds; `how` as of `interactions_of`."""
+    return [each.pairs.min_ttc[each.pairs.moving] for each in interactions_of(dataset, scenarios, **how)]
 
 
 def interactions_of_tracks(

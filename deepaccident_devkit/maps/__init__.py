@@ -2,8 +2,7 @@
 
 from deepaccident_devkit.maps.counting import GROUND_CLASSES, TownMapConfig
 from deepaccident_devkit.maps.making import kept_town_map, town_map, towns_of
-from deepaccident_devkit.maps.polygons import Area
-from deepaccident_devkit.maps.town_map import TownMap
+from deepaccident_devkit.maps.town_map import Area, TownMap
 
 __all__ = [
     "GROUND_CLASSES",

@@ -1,6 +1,7 @@
 """Counting: how often the cells of a town's raster were seen as road, road line, sidewalk or something else.
 
-A map is made from some of the pictures of a scenario's BEV cameras, the looks.
+A map is made from some of the pictures of a scenario's BEV cameras, the looks. `hidden_ground` says what lies beneath
+the actors that stayed: ground that no picture saw, although pictures saw all around it.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ _MIDDLE: Final = (BEV_SHAPE[0] - 1) / 2
 """Row and column of the agent."""
 REACH: Final = BEV_RESOLUTION * BEV_SHAPE[0] / 2
 """Metres that a picture shows to each side of its agent."""
+_LARGEST: Final = 60.0
+"""Square metres of a hole that parked vehicles can make: two lorries. A larger one may be a yard."""
 Counts = NDArray[np.uint16]
 
 
@@ -98,12 +101,7 @@ def looks_of(dataset: Dataset, scenario_row: int, config: TownMapConfig) -> list
 
 
 def chosen_frames(xy: FloatArray, config: TownMapConfig) -> IntArray:
-    """The frames, from 0, of a recording that are read.
-
-    Args:
-        xy: (F, 2) where the agent is at each frame, 10 a second, metres.
-        config: how far apart they are.
-    """
+    """The frames, from 0, of a recording that are read, by where the agent is at each, 10 a second: (F, 2) metres."""
     steps = np.hypot(*np.diff(xy, axis=0).T)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     seconds = np.arange(len(xy)) * FRAME_PERIOD
@@ -179,16 +177,9 @@ def _add_looks(
 def codes_in_world(tags: ByteArray, world_from_ego: FloatArray, resolution: float) -> tuple[IntArray, ByteArray]:
     """A picture's ground in the cells of the world: what its pixel nearest to each cell's middle shows.
 
-    The road is taken for a plane through the agent's origin, which tilts as the agent does.
-
-    Args:
-        tags: (1200, 1200) uint8, CARLA's semantic tags, forward up.
-        world_from_ego: (4, 4) the agent's pose.
-        resolution: side of a cell, metres.
-
-    Returns:
-        Row and column (2,) of the first cell among those of the world; and (h, w) uint8, 0 for not seen, else 1 + the
-        position in `GROUND_CLASSES`; row = y index, column = x index, both rising.
+    The road is taken for a plane through the agent's origin, which tilts as the agent does; `tags` (1200, 1200) are
+    CARLA's, forward up. Gives row and column (2,) of the first cell among those of the world, and (h, w) uint8, 0
+    for not seen, else 1 + the position in `GROUND_CLASSES`; row = y index, column = x index, both rising.
     """
     low, high = cells_around(world_from_ego[None], resolution)
     y, x = (
@@ -219,3 +210,35 @@ def _code_of_tag() -> ByteArray:
     for code, name in enumerate(GROUND_CLASSES[:-1], 1):
         codes[TAGS[name]] = code
     return codes
+
+
+def hidden_ground(classes: ByteArray, resolution: float) -> ByteArray:
+    """(H, W) uint8, the ground of small holes: what most of the cells around a hole are, road lines taken for road.
+
+    `classes` (H, W) are 0 where nothing was seen, 1 road, 2 road line, then others. The result is 0 where something
+    was seen, and in holes that are larger than 60 m² or reach the raster's edge.
+    """
+    from scipy import ndimage
+
+    labels, count = ndimage.label(classes == 0)
+    filled = np.zeros_like(classes)
+    closed = np.bincount(labels.ravel(), minlength=count + 1) * resolution**2 <= _LARGEST
+    closed[0] = False
+    for edge in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        closed[edge] = False
+    rows, columns = np.nonzero(closed[labels])
+    holes = labels[rows, columns].astype(np.int64)
+    filled[rows, columns] = _classes_around(classes, rows, columns, holes, count)[holes]
+    return filled
+
+
+def _classes_around(classes: ByteArray, rows: IntArray, columns: IntArray, holes: IntArray, count: int) -> ByteArray:
+    """The most frequent class (1 + count,) beside the cells (N,) of each hole, by the hole's number."""
+    kinds = int(classes.max(initial=0)) + 1
+    votes = np.zeros((count + 1, max(kinds, 3)), dtype=np.int64)
+    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        np.add.at(votes, (holes, classes[rows + down, columns + right]), 1)
+    votes[:, 1] += votes[:, 2]
+    votes[:, [0, 2]] = 0
+    result: ByteArray = votes.argmax(axis=1).astype(np.uint8)
+    return result

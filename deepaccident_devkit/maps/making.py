@@ -23,9 +23,9 @@ from deepaccident_devkit.maps.counting import (
     Window,
     cells_around,
     count_scenario,
+    hidden_ground,
     looks_of,
 )
-from deepaccident_devkit.maps.hidden import hidden_ground
 from deepaccident_devkit.maps.town_map import TownMap, classes_of
 from deepaccident_devkit.parallel import Places, Store, run_unordered
 from deepaccident_devkit.support.arrays import IntArray, as_floats

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from deepaccident_devkit.geometry.cell_outlines import multi_polygon, outlines
 from deepaccident_devkit.maps.counting import GROUND_CLASSES
-from deepaccident_devkit.maps.polygons import AREAS, Area, geojson_of, outlines, simplified
 from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, as_floats, checked
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.text import choice, path_of
 
 if TYPE_CHECKING:
-    from shapely import MultiPolygon
+    from shapely import MultiPolygon, Polygon
 
+Area = Literal["drivable", "road_line", "sidewalk"]
+AREAS: Final[tuple[Area, ...]] = get_args(Area)
+_DECIMALS: Final = 3
+"""Of metres in GeoJSON."""
 _ROAD, _ROAD_LINE, _SIDEWALK, _OTHER = range(1, len(GROUND_CLASSES) + 1)
 
 
@@ -178,3 +184,48 @@ def classes_of(counts: NDArray[np.uint16]) -> ByteArray:
 def _surface_and_all(counts: NDArray[np.uint16]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     """How many pictures saw the road's surface, lines included, and how many saw anything."""
     return counts[:_ROAD_LINE].sum(axis=0, dtype=np.uint32), counts.sum(axis=0, dtype=np.uint32)
+
+
+def simplified(polygons: MultiPolygon, tolerance: float, least_area: float) -> MultiPolygon:
+    """Polygons whose outlines may move by `tolerance` metres, without smaller islands and holes, square metres."""
+    import shapely
+
+    parts = shapely.get_parts(polygons)
+    kept = [_without_holes(part, least_area) for part in parts[shapely.area(parts) >= least_area]]
+    if not tolerance:
+        return multi_polygon(kept)
+    whole = shapely.simplify(shapely.MultiPolygon(kept), tolerance)
+    parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(whole)))  # twice, as collections may hold several
+    return multi_polygon([part for part in parts if part.geom_type == "Polygon"])
+
+
+def geojson_of(town: str, areas: Mapping[Area, MultiPolygon]) -> bytes:
+    """A FeatureCollection with one feature for each polygon of each area; coordinates have three decimals."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"town": town, "area": area, "square_metres": round(part.area, 1)},
+            "geometry": {"type": "Polygon", "coordinates": _rings(part)},
+        }
+        for area, polygons in areas.items()
+        for part in polygons.geoms
+    ]
+    collection = {
+        "type": "FeatureCollection",
+        "name": town,
+        "coordinate_system": "local metres of the simulator's world, x and y, right-handed; no longitude and latitude",
+        "features": features,
+    }
+    return (json.dumps(collection, allow_nan=False, separators=(",", ":")) + "\n").encode()
+
+
+def _without_holes(polygon: Polygon, least_area: float) -> Polygon:
+    import shapely
+
+    holes = [ring for ring in polygon.interiors if shapely.Polygon(ring).area >= least_area]
+    return shapely.Polygon(polygon.exterior, holes)
+
+
+def _rings(polygon: Polygon) -> list[list[list[float]]]:
+    rings = [polygon.exterior, *polygon.interiors]
+    return [np.round(np.asarray(ring.coords), _DECIMALS).tolist() for ring in rings]

@@ -11,27 +11,34 @@
 The preset `released` is equal to the released modules, with their quirks as fields of its configuration; `tiny` is
 trained by a laptop (docs/training.md), and its weights come with the devkit (docs/model.md). `network` says which
 module does what on the way from images to predictions.
-Importing it without torch raises MissingExtraError.
+Importing a name from it without torch raises MissingExtraError.
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.errors import MissingExtraError
 
-try:
-    import safetensors  # noqa: F401 - as torch
-    import torch  # noqa: F401 - nothing here works without it
-except ModuleNotFoundError as error:
-    raise MissingExtraError(
-        "the model needs PyTorch and safetensors: in a checkout, pip install '.[torch]' "
-        "(for PyTorch's CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
-    ) from error
+if TYPE_CHECKING:
+    from deepaccident_devkit.model.checkpoint import Loaded, Weights, load_weights, read_weights, write_weights
+    from deepaccident_devkit.model.inputs import ModelInputs, model_inputs
+    from deepaccident_devkit.model.network import ModelConfig, Predictions, V2XFormer
+    from deepaccident_devkit.model.presets import PRESETS, ModelChoice, load_model
+    from deepaccident_devkit.model.results import PredictConfig, SamplePrediction, predict_results, predictions
+    from deepaccident_devkit.model.training_loop import train
+    from deepaccident_devkit.model.training_run import TrainConfig, checked_device
 
-from deepaccident_devkit.model.checkpoint import Loaded, Weights, load_weights, read_weights, write_weights
-from deepaccident_devkit.model.inputs import ModelInputs, model_inputs
-from deepaccident_devkit.model.network import ModelConfig, Predictions, V2XFormer
-from deepaccident_devkit.model.presets import PRESETS, ModelChoice, load_model
-from deepaccident_devkit.model.results import PredictConfig, SamplePrediction, predict_results, predictions
-from deepaccident_devkit.model.training_loop import train
-from deepaccident_devkit.model.training_run import TrainConfig, checked_device
+_HOMES = {
+    **dict.fromkeys(("Loaded", "Weights", "load_weights", "read_weights", "write_weights"), "checkpoint"),
+    **dict.fromkeys(("ModelInputs", "model_inputs"), "inputs"),
+    **dict.fromkeys(("ModelConfig", "Predictions", "V2XFormer"), "network"),
+    **dict.fromkeys(("PRESETS", "ModelChoice", "load_model"), "presets"),
+    **dict.fromkeys(("PredictConfig", "SamplePrediction", "predict_results", "predictions"), "results"),
+    "TrainConfig": "training_run",
+    "checked_device": "training_run",
+    "train": "training_loop",
+}
+"""Public name → its module."""
 
 __all__ = [
     "PRESETS",
@@ -55,3 +62,22 @@ __all__ = [
     "train",
     "write_weights",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name's module only when the name is used: the help of the command `train` needs no torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        import safetensors  # noqa: F401 - as torch
+        import torch  # noqa: F401 - nothing here works without it
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            "the model needs PyTorch and safetensors: in a checkout, pip install '.[torch]' "
+            "(for PyTorch's CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
+        ) from error
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,6 +1,6 @@
 """All pictures. A function for one panel takes `ax=` and returns the Axes; nothing here opens a window."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.render.accident import render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
@@ -8,7 +8,6 @@ from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.boxes import draw_box
 from deepaccident_devkit.render.camera import render_pointcloud_in_image, render_sample_data
 from deepaccident_devkit.render.figures import LAYERS, Layer, detached_figure
-from deepaccident_devkit.render.ground import render_town_map
 from deepaccident_devkit.render.link import render_link
 from deepaccident_devkit.render.motion import (
     draw_motion_labels,
@@ -23,6 +22,7 @@ from deepaccident_devkit.render.samples import render_calibration, render_frame,
 from deepaccident_devkit.render.styles import style
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 
 __all__ = [
@@ -58,5 +58,12 @@ __all__ = [
 
 if not TYPE_CHECKING:  # the types stay those of the functions themselves
     for _name in __all__:
-        if _name.startswith("render_"):
+        if _name.startswith("render_") and _name in globals():
             globals()[_name] = with_keywords_named(globals()[_name], __name__)
+
+
+def __getattr__(name: str) -> Any:
+    """Import the picture of a room when it is asked for."""
+    if name != "render_town_map":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return added("picture", name)

@@ -33,7 +33,7 @@ from deepaccident_devkit.render.captions import (
 )
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import Layer, axes_or_new, axis_words, check_view_range, layers_of
-from deepaccident_devkit.render.ground import draw_town_map, draw_underlay, map_beneath
+from deepaccident_devkit.render.ground import draw_underlay, map_beneath
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     CASING_COLOR,
@@ -43,6 +43,7 @@ from deepaccident_devkit.render.styles import (
     POINT_COLOR,
     in_own_settings,
 )
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame, short_name
@@ -194,7 +195,7 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     if "map" in layers or ("bev" in layers and not has_ground):
         town = map_beneath(dataset, record["scenario_token"], make="map" in layers)
     if town is not None:
-        draw_town_map(town, ax, target_from_world=target_from_world)
+        added("picture", "draw_town_map")(town, ax, target_from_world=target_from_world)
     if has_ground:
         image = dataset.load_bev(record)
         reach = view.view_range + float(np.abs(center - target_from_ego.translation[:2]).max())

@@ -1,5 +1,16 @@
 """Accidents looked into: who saw the danger first, when it was too late, what a warning would have prevented."""
 
+from deepaccident_devkit.accidents.outcomes import (
+    BRAKINGS,
+    OUTCOMES,
+    Braking,
+    Outcomes,
+    ReplayCheck,
+    outcomes_of,
+    undisturbed,
+)
+from deepaccident_devkit.accidents.recorded import Accident, Skipped, accident_of, accidents_of
+from deepaccident_devkit.accidents.twins import TornTwins, torn_twins, twin_of
 from deepaccident_devkit.interactions import (
     CLASS_MASSES,
     InteractionConfig,
@@ -28,13 +39,10 @@ from deepaccident_devkit.interactions import (
     time_to_collision,
     time_to_collision_1d,
 )
-from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, accidents_of
-from deepaccident_devkit.safety.avoidability import (
-    Avoidability,
+from deepaccident_devkit.safety.avoidability import Avoidability, avoidability, avoidability_of
+from deepaccident_devkit.safety.avoidability_report import (
     AvoidabilityReport,
     OutcomeShares,
-    avoidability,
-    avoidability_of,
     avoidability_report,
     outcome_shares,
 )
@@ -44,33 +52,13 @@ from deepaccident_devkit.safety.lead_times import (
     LeadTimeLedger,
     LeadTimes,
     MeanTime,
-    coalition_leads,
     lead_time_ledger,
     lead_times,
-    shapley_values,
 )
-from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
-from deepaccident_devkit.safety.outcomes import (
-    BRAKINGS,
-    OUTCOMES,
-    Braking,
-    Outcomes,
-    ReplayCheck,
-    outcomes_of,
-    undisturbed,
-)
+from deepaccident_devkit.safety.observation import ObservationRule, coalition_leads, observed_actors, shapley_values
 from deepaccident_devkit.safety.report import AccidentRow, PairMeasures, SafetyReport, safety_report
 from deepaccident_devkit.safety.stories import Story, describe, scenario_facts, stories, story_text
-from deepaccident_devkit.safety.twins import (
-    Parting,
-    TornTwins,
-    TwinDiff,
-    TwinReport,
-    torn_twins,
-    twin_diff,
-    twin_of,
-    twin_report,
-)
+from deepaccident_devkit.safety.twins import Parting, TwinDiff, TwinReport, twin_diff, twin_report
 
 __all__ = [
     "BRAKINGS",

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, each_scenario, reasons_text, those_of
-from deepaccident_devkit.safety.contact import Pair, SecondaryContact, contact_made, pair_of, secondary_contacts
-from deepaccident_devkit.safety.outcomes import (
+from deepaccident_devkit.accidents.contact import Pair, contact_made, contact_times, pair_of
+from deepaccident_devkit.accidents.outcomes import (
     BRAKINGS,
     MOST_MARGIN,
     OUTCOMES,
@@ -27,17 +23,13 @@ from deepaccident_devkit.safety.outcomes import (
     outcomes_of,
     undisturbed,
 )
+from deepaccident_devkit.accidents.recorded import Accident, accident_of, recorded_path
+from deepaccident_devkit.accidents.replay import HORIZON
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats, checked, known
-from deepaccident_devkit.support.text import columns_text
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from deepaccident_devkit.parallel import Engine
-    from deepaccident_devkit.tables.records import ScenarioRecord
-
 
 BRAKERS: Final = ("first", "second", "both")
 """Who of the pair brakes; the pair is in the meta file's order."""
@@ -47,13 +39,8 @@ _SCAN_STEP: Final = 0.01
 """Seconds between the starts of braking that are tried."""
 _HEAD_ON: Final = 3 * math.pi / 4
 """Least angle between the headings at the end, radians."""
-GROUPS: Final = ("vehicles", "head-on", "pedestrians")
-"""Kinds of accidents that are counted apart: with a pedestrian, who does not brake as a vehicle does; of vehicles that
-meet head-on, where it matters most how the other goes on if one of them brakes; and all others."""
-WARNED: Final = (*BRAKERS, "ego")
-"""Who is warned and brakes; `ego` alone counts only the accidents of the ego."""
-_SHARES: Final = (0.5, 0.9)
-"""Shares of accidents for which the text gives the seconds of warning that they need."""
+_NO_GAP: Final = 1e-9
+"""Metres of a gap that counts as contact: of others no contact is recorded that would need a margin."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,6 +59,29 @@ class LastMoments(FrozenArrays):
     time: FloatArray
     switches: IntArray
     extrapolated: BoolArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SecondaryContact:
+    """One of the pair touches another actor in a replay, and did not in the recording.
+
+    The other's motion stays as recorded, though a driver would react: these are no outcomes, but a hint.
+
+    Attributes:
+        replay: number of the replay.
+        actor_id: CARLA id of the one of the pair.
+        other_id: the other's.
+        category: the other's class.
+        time: seconds from the first frame of the accident.
+        extrapolated: whether it is after the end of the recording.
+    """
+
+    replay: int
+    actor_id: int
+    other_id: int
+    category: str
+    time: float
+    extrapolated: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -194,15 +204,9 @@ class Avoidability(FrozenArrays):
 
 
 def last_moments(pair: Pair, brakers: tuple[bool, bool], decelerations: ArrayLike) -> LastMoments:
-    """The last moments to brake: each hundredth of a second is tried, since the answer may change more than once.
+    """The last moments to brake with decelerations (N,) m/s²: each hundredth of a second is tried.
 
-    Args:
-        pair: the recorded motions.
-        brakers: which of the two brake.
-        decelerations: (N,) m/s².
-
-    Raises:
-        GeometryError: the decelerations have another shape.
+    The answer may change more than once.
     """
     hard = checked("decelerations", decelerations, (None,))
     tried = np.arange(round(pair.duration / _SCAN_STEP) + 1) * _SCAN_STEP
@@ -299,319 +303,92 @@ def _secondary(
     return tuple(secondary_contacts(accident, tracks, starts, np.tile(decelerations, len(MASKS))))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OutcomeShares(FrozenArrays):
-    """Shares of outcomes over a group of accidents, for L leads of the warning and K ways to brake.
-
-    Accidents whose recording is shorter than a lead do not count at it. Arrays are read-only; NaN where none counts.
-
-    Attributes:
-        group: one of `GROUPS`.
-        warned: one of `WARNED`.
-        brakings: the K ways to brake.
-        leads: (L,) seconds from the warning to the end of the recording: 0, 0.1, …
-        accidents: (L,) how many count.
-        shares: (L, K, 5) of `OUTCOMES`.
-        extrapolated: (L, K) share in which they touch only after the end of the recording.
-        relative_speed: (L, K) mean over all of these of the speed between the two at the contact, m/s; 0 if avoided.
-        delta_v: (L, K, 3) the same of the larger delta-v of the two: with the assumed masses; the least and the most
-            with masses that are wrong by up to `MASS_UNCERTAINTY`.
-    """
-
-    group: str
-    warned: str
-    brakings: tuple[Braking, ...]
-    leads: FloatArray
-    accidents: IntArray
-    shares: FloatArray
-    extrapolated: FloatArray
-    relative_speed: FloatArray
-    delta_v: FloatArray
-
-
-def group_of(accident: Avoidability) -> str:
-    """The one of `GROUPS` that an accident is counted in."""
-    if accident.pedestrian:
-        return "pedestrians"
-    return "head-on" if accident.head_on else "vehicles"
-
-
-def outcomes_if_warned(accident: Avoidability, warned: str) -> Outcomes | None:
-    """What warnings of the one of `WARNED` change; None if the ego is to be warned and is not of the pair."""
-    if warned != "ego":
-        return accident.outcomes[BRAKERS.index(warned)]
-    agents = accident.accident.agents
-    return accident.outcomes[agents.index("ego_vehicle")] if "ego_vehicle" in agents else None
-
-
-def outcome_shares(accidents: Sequence[Avoidability]) -> list[OutcomeShares]:
-    """The shares of outcomes of each group of accidents and for each who is warned; groups without any are left out.
-
-    Args:
-        accidents: computed for the same ways to brake.
-    """
-    result = []
-    for group in GROUPS:
-        members = [each for each in accidents if group_of(each) == group]
-        for warned in WARNED:
-            told = [(each, found) for each in members if (found := outcomes_if_warned(each, warned)) is not None]
-            if told:
-                result.append(_shares(group, warned, told))
-    return result
-
-
-def _shares(group: str, warned: str, told: Sequence[tuple[Avoidability, Outcomes]]) -> OutcomeShares:
-    brakings = told[0][0].brakings
-    longest = max(len(outcomes.outcome) for _, outcomes in told)
-    sums = np.zeros((longest, len(brakings), len(OUTCOMES) + 5))
-    accidents = np.zeros(longest, dtype=np.int64)
-    for accident, outcomes in told:
-        rows = slice(0, len(outcomes.outcome))
-        accidents[rows] += 1
-        sums[rows] += _figures(accident, outcomes)
-    means = sums / accidents[:, None, None]
-    shares, extrapolated, relative, delta_v = np.split(means, np.cumsum([len(OUTCOMES), 1, 1]), axis=2)
-    return OutcomeShares(
-        group=group,
-        warned=warned,
-        brakings=brakings,
-        leads=as_floats(np.arange(longest) * FRAME_PERIOD),
-        accidents=accidents,
-        shares=shares,
-        extrapolated=extrapolated[..., 0],
-        relative_speed=relative[..., 0],
-        delta_v=delta_v,
-    )
-
-
-def _figures(accident: Avoidability, outcomes: Outcomes) -> FloatArray:
-    """(L, K, 10) of one accident: each outcome 0 or 1, extrapolated 0 or 1, relative speed, delta-v, least, most."""
-    relative = outcomes.delta_v.sum(axis=-1)  # the shares of the two add up to 1
-    ranges = delta_v_ranges(accident.accident.masses, relative).max(axis=-2)
-    classes = outcomes.outcome[..., None] == np.arange(len(OUTCOMES))
-    return np.dstack([classes, outcomes.extrapolated, relative, outcomes.delta_v.max(axis=-1), ranges])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AvoidabilityReport(Report):
-    """When accidents could have been avoided by braking.
-
-    Attributes:
-        dataroot: the release's folder.
-        version: `v1` or `v1-mini`.
-        accidents: those whose recording shows them, in the release's order.
-        dropped: those whose recording does not: the two are too far apart at the end.
-        skipped: scenarios of which meta or labels are missing.
-        margins: scenario → metres between the two at the last frame, for all accidents, dropped ones too.
-    """
-
-    dataroot: str
-    version: str
-    accidents: tuple[Avoidability, ...]
-    dropped: tuple[Skipped, ...]
-    skipped: tuple[Skipped, ...]
-    margins: Mapping[str, float]
-
-    @property
-    def shares(self) -> list[OutcomeShares]:
-        """Shares of outcomes by the seconds of warning, for each group of accidents and for each who is warned."""
-        return outcome_shares(self.accidents)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Values for JSON: counts, what is left out and why, and the last moments of each accident."""
-        return {
-            "dataroot": self.dataroot,
-            "version": self.version,
-            "dropped": {each.scenario: each.reason for each in self.dropped},
-            "skipped": {each.scenario: each.reason for each in self.skipped},
-            "margins": dict(self.margins),
-            "accidents": [{"group": group_of(each), **each.to_dict(warnings=False)} for each in self.accidents],
-        }
-
-    def named_tables(self) -> dict[str, Iterable[Row]]:
-        """Last moments, contacts with others, shares of outcomes, the self-check, and what is left out."""
-        return {
-            "avoidability_last_moments": self._last_moment_rows(),
-            "avoidability_secondary_contacts": self._secondary_rows(),
-            "avoidability_outcome_shares": self._share_rows(),
-            "avoidability_self_check": self._check_rows(),
-            "avoidability_left_out": self._left_out_rows(),
-        }
-
-    def to_text(self) -> str:
-        """Some aligned blocks for a terminal."""
-        counts = f"{len(self.accidents)} accidents"
-        left_out = {"dropped, as the two are too far apart at the end": self.dropped, "skipped": self.skipped}
-        for word, which in left_out.items():
-            counts += f"; {len(which)} {word}" if which else ""
-        blocks = [f"DeepAccident {self.version} at {self.dataroot}\n{counts}"]
-        blocks += [
-            self._group_text(group) for group in GROUPS if any(group_of(each) == group for each in self.accidents)
-        ]
-        if self.margins:
-            blocks.append(self._margins_text())
-        blocks += [reasons_text(word, which) for word, which in left_out.items() if which]
-        return "\n\n".join(blocks)
-
-    @property
-    def margin_counts(self) -> dict[str, int]:
-        """Size in words → how many of the `margins` are of that size."""
-        bounds = [0, 0.01, 0.1, 0.5, MOST_MARGIN]
-        counts = np.histogram(list(self.margins.values()), bins=[*bounds, np.inf])[0].tolist()
-        names = [f"below {bound:g} m" for bound in bounds[1:]] + [f"{MOST_MARGIN:g} m or more"]
-        return dict(zip(names, counts, strict=True))
-
-    def members(self, group: str) -> list[Avoidability]:
-        """The accidents of one of `GROUPS`."""
-        return [each for each in self.accidents if group_of(each) == group]
-
-    def _group_text(self, group: str) -> str:
-        """A line for each who brakes and how hard: how many are avoidable, and how much warning they need."""
-        members = self.members(group)
-        reactions = sorted({braking.reaction for braking in members[0].brakings})
-        heading = ["brakes", "m/s²", "avoidable", "hit only after the end"]
-        rows = [heading + [f"reaction {each:g} s" for each in reactions]]
-        slack = np.stack([each.slack for each in members])
-        extrapolated = np.stack([each.last_moments.extrapolated for each in members]).reshape(slack.shape)
-        for row, brakers in enumerate(BRAKERS):
-            for column, deceleration in enumerate(members[0].decelerations.tolist()):
-                needed = np.sort(slack[:, row, column])  # those that nothing avoids are last
-                places = [int(np.ceil(share * len(needed))) - 1 for share in _SHARES]
-                counts = (np.isfinite(needed).sum(), extrapolated[:, row, column].sum())
-                cells = [" / ".join(_seconds_text(needed[place] + each) for place in places) for each in reactions]
-                rows.append([brakers, f"{deceleration:g}", *(str(count) for count in counts), *cells])
-        meant = " and ".join(f"{share:.0%}" for share in _SHARES)
-        return (
-            f"{group}: {len(members)} accidents; seconds of warning that {meant} of them need\n{columns_text(rows)}\n"
-            f"{_secondary_text(members)}"
-        )
-
-    def _margins_text(self) -> str:
-        """How many margins of the self-check there are of each size; the largest by name."""
-        lines = [f"  {name}: {count}" for name, count in self.margin_counts.items() if count]
-        largest = max(self.margins, key=lambda name: self.margins[name])
-        lines.append(f"  the largest: {self.margins[largest]:.3f} m, {largest}")
-        return "\n".join(["gaps at the last frame, which count as contact:", *lines])
-
-    def _last_moment_rows(self) -> Iterator[Row]:
-        names = ("brakers", "deceleration", "avoidable", "last_moment", "slack", "switches", "extrapolated")
-        yield ("scenario", "group", "first_id", "first", "second_id", "second", *names, "secondary")
-        for each in self.accidents:
-            accident = each.accident
-            who = [value for pair in zip(accident.actor_ids, accident.categories, strict=True) for value in pair]
-            for row in each.last_moment_rows():
-                values = (row[name] for name in names)
-                yield (accident.scenario, group_of(each), *who, *values, len(row["secondary"]))
-
-    def _secondary_rows(self) -> Iterator[Row]:
-        names = ("actor_id", "other_id", "category", "time", "extrapolated")
-        yield ("scenario", "brakers", "deceleration", *names)
-        for each in self.accidents:
-            for row in each.last_moment_rows():
-                for contact in row["secondary"]:
-                    values = (contact[name] for name in names)
-                    yield (each.accident.scenario, row["brakers"], row["deceleration"], *values)
-
-    def _share_rows(self) -> Iterator[Row]:
-        yield (
-            *("group", "warned", "reaction", "deceleration", "lead", "accidents", *OUTCOMES),
-            *("extrapolated", "relative_speed", "delta_v", "delta_v_least", "delta_v_most"),
-        )
-        for each in self.shares:
-            for column, braking in enumerate(each.brakings):
-                for row, lead in enumerate(each.leads.tolist()):
-                    values = [*each.shares[row, column], each.extrapolated[row, column]]
-                    values += [each.relative_speed[row, column], *each.delta_v[row, column]]
-                    key = (each.group, each.warned, braking.reaction, braking.deceleration, round(lead, 1))
-                    yield (*key, int(each.accidents[row]), *(round(float(value), 6) for value in values))
-
-    def _check_rows(self) -> Iterator[Row]:
-        sides = ("first", "second")
-        yield (
-            *("scenario", "margin", "time", "end", *(f"speed_{side}" for side in sides)),
-            *(f"delta_v_{side}{end}" for side in sides for end in ("", "_least", "_most")),
-        )
-        for each in self.accidents:
-            told = each.to_dict(warnings=False)["recorded"]
-            changes = zip(told["delta_v"], told["delta_v_ranges"], strict=True)
-            delta_v = [value for change, both in changes for value in (change, *both)]
-            key = (each.accident.scenario, told["margin"], told["time"], round(each.accident.duration, 1))
-            yield (*key, *told["speeds"], *delta_v)
-
-    def _left_out_rows(self) -> Iterator[Row]:
-        yield ("scenario", "why", "reason", "margin")
-        for word, which in (("dropped", self.dropped), ("skipped", self.skipped)):
-            for each in which:
-                yield (each.scenario, word, each.reason, self.margins.get(each.scenario))
-
-
 @dataclass(frozen=True, slots=True)
-class Dropped:
-    """An accident that its recording does not show.
+class _Other:
+    """Another actor: its path at the accident's frames, and the seconds within which labels show it."""
 
-    Attributes:
-        why: in words.
-        margin: metres between the two at the last frame.
+    actor_id: int
+    category: str
+    path: FloatArray
+    size: FloatArray
+    window: tuple[float, float]
+
+
+def secondary_contacts(
+    accident: Accident, tracks: ScenarioTracks, starts: FloatArray, decelerations: FloatArray
+) -> list[SecondaryContact]:
+    """The first contacts of each of the pair with each other actor in N replays, which the recording does not have.
+
+    `starts` (N, 2) are the seconds at which each of the two begins to brake, inf if it does not. By replay, then by
+    time. Others that labels show at one frame alone have no motion, and are left out.
     """
-
-    why: Skipped
-    margin: float
-
-
-def looked_into(dataset: Dataset, scenario: ScenarioRecord) -> Avoidability | Dropped | None:
-    """When a scenario's accident could have been avoided; None if it has no collision. Raises NotAvailableError."""
-    accident = accident_of(dataset, scenario)
-    if accident is None:
-        return None
-    check = undisturbed(accident)
-    if not check.usable:
-        return Dropped(Skipped(scenario=accident.scenario, reason=unusable(accident, check)), check.margin)
-    return avoidability_of(accident, scenario_tracks(dataset, scenario))
-
-
-def avoidability_report(
-    dataset: Dataset,
-    scenarios: Iterable[RowArgument] | None = None,
-    **how: Unpack[Engine],
-) -> AvoidabilityReport:
-    """When the accidents of scenarios could have been avoided by braking, in the nine ways of `BRAKINGS`.
-
-    Args:
-        dataset: the release.
-        scenarios: tokens or records; None for all. Those whose meta file names no collision do not count.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
-
-    Raises:
-        TokenError: no such scenario.
-    """
-    work: Callable[[Dataset, Any], Avoidability | Dropped | None] = looked_into
-    return report_of(dataset, each_scenario(work, dataset, scenarios, label="replaying", at_once=1, **how))
+    found = []
+    for other, which in product(_others(accident, tracks), (0, 1)):
+        rows = np.flatnonzero(np.isfinite(starts[:, which]))
+        if not len(rows) or not _may_meet(accident.paths[which], accident.sizes[which], other):
+            continue
+        for row, time in zip(
+            rows, _new_contacts(accident, which, other, starts[rows], decelerations[rows]), strict=True
+        ):
+            if np.isfinite(time):
+                found.append(
+                    SecondaryContact(
+                        replay=int(row),
+                        actor_id=accident.actor_ids[which],
+                        other_id=other.actor_id,
+                        category=other.category,
+                        time=float(time),
+                        extrapolated=bool(time > accident.duration),
+                    )
+                )
+    return sorted(found, key=lambda each: (each.replay, each.time, each.other_id))
 
 
-def report_of(dataset: Dataset, found: Sequence[Avoidability | Dropped | Skipped | None]) -> AvoidabilityReport:
-    """The report of what `looked_into` gave for scenarios, in their order."""
-    accidents, dropped = those_of(Avoidability, found), those_of(Dropped, found)
-    margins = {each.accident.scenario: each.check.margin for each in accidents}
-    return AvoidabilityReport(
-        dataroot=str(dataset.dataroot),
-        version=dataset.version,
-        accidents=accidents,
-        dropped=tuple(each.why for each in dropped),
-        skipped=those_of(Skipped, found),
-        margins={**margins, **{each.why.scenario: each.margin for each in dropped}},
+def _new_contacts(
+    accident: Accident, which: int, other: _Other, starts: FloatArray, decelerations: FloatArray
+) -> FloatArray:
+    """(N,) seconds at which one of the pair touches another in N replays; inf if never, or in the recording too."""
+    paths = np.stack([accident.paths[which], other.path])
+    pair = pair_of(paths, [accident.sizes[which, :2], other.size], margin=_NO_GAP)
+    begun = np.full((len(starts) + 1, 2), np.inf)  # the last one is the recording
+    begun[:-1, 0] = starts[:, which]
+    times = contact_times(pair, begun, np.append(decelerations, 1.0), window=other.window)
+    return times[:-1] if times[-1] > accident.duration else np.full(len(starts), np.inf)
+
+
+def _others(accident: Accident, tracks: ScenarioTracks) -> Iterator[_Other]:
+    frames = np.arange(accident.first_frame, accident.last_frame + 1)
+    within = (tracks.index >= frames[0]) & (tracks.index <= frames[-1])
+    for actor in np.unique(tracks.actor_id[within]).tolist():
+        rows = np.flatnonzero(within & (tracks.actor_id == actor))
+        if actor in accident.actor_ids or len(rows) < 2:
+            continue
+        yield _other(tracks, rows, frames)
+
+
+def _other(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> _Other:
+    first, last = ((tracks.index[rows[end]] - frames[0]) * FRAME_PERIOD for end in (0, -1))
+    stays = tracks.index[rows[-1]] == frames[-1]
+    return _Other(
+        actor_id=int(tracks.actor_id[rows[0]]),
+        category=CATEGORIES[int(tracks.boxes.category[rows[-1]])],
+        path=recorded_path(tracks, rows, frames),
+        size=np.median(tracks.boxes.size[rows, :2], axis=0),
+        window=(float(first), float(last + HORIZON if stays else last)),
     )
 
 
-def _secondary_text(accidents: Sequence[Avoidability]) -> str:
-    """In how many replays of braking at the last moment another actor is touched."""
-    touched = [{each.replay for each in accident.secondary} for accident in accidents]
-    before = [{each.replay for each in accident.secondary if not each.extrapolated} for accident in accidents]
-    replays = sum(int(np.isfinite(accident.last_moments.time).sum()) for accident in accidents)
-    return (
-        f"other road users, who do not react, are touched in {sum(map(len, before))} of {replays} replays of the last "
-        f"moment before the recording ends, in {sum(map(len, touched))} if all go straight on for 3 s"
-    )
+def _may_meet(path: FloatArray, size: FloatArray, other: _Other) -> bool:
+    """Whether the two can touch at all: a braking actor is where it was recorded, or earlier on its path."""
+    mine, theirs = _positions(path), _positions(other.path)
+    apart = np.hypot(*(mine[:, None] - theirs[None]).transpose(2, 0, 1))
+    steps = sum(np.hypot(*np.diff(each, axis=0).T).max() for each in (mine, theirs))
+    reach = (np.hypot(*size[:2]) + np.hypot(*other.size)) / 2 + steps
+    not_ahead = np.arange(len(mine))[:, None] <= np.arange(len(theirs)) + 1
+    return bool((not_ahead & (apart <= reach)).any())
 
 
-def _seconds_text(seconds: float) -> str:
-    return f"{seconds:.2f}" if np.isfinite(seconds) else "–"
+def _positions(path: FloatArray) -> FloatArray:
+    """Positions at each frame of the recording and of its continuation."""
+    onward = np.arange(1, round(HORIZON / FRAME_PERIOD) + 1)[:, None] * (path[-1, :2] - path[-2, :2])
+    return np.concatenate([path[:, :2], path[-1, :2] + onward])

@@ -1,8 +1,6 @@
 """How long before an accident's impact sets of agents first observe both colliders, and what each partner adds.
 
-First over arrays, then of an accident, then of all accidents of a release. An ego and n partners observe two
-colliders. A coalition is the ego with some of the partners: of coalition number k, partner i is one if bit i of k is
-set, so that number 0 is the ego alone and the last one is all of them.
+First of an accident, then of all accidents of a release.
 """
 
 from __future__ import annotations
@@ -11,16 +9,11 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
-from math import factorial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import GeometryError, NotAvailableError
-from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import (
+from deepaccident_devkit.accidents.recorded import (
     Skipped,
     accident_of,
     each_scenario,
@@ -28,17 +21,26 @@ from deepaccident_devkit.safety.accidents import (
     skipped_rows,
     those_of,
 )
-from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers, known
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.reports import Report, Row
+from deepaccident_devkit.safety.observation import (
+    ObservationRule,
+    coalition_members,
+    first_together,
+    leads_from,
+    observed_actors,
+    shapley_values,
+)
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, known
 from deepaccident_devkit.support.text import columns_text
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, AgentName, short_name
+from deepaccident_devkit.taxonomy import AGENTS, AgentName, short_name
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from deepaccident_devkit.parallel import Engine
 
-_PAIR = 2
 EGO: Final = AGENTS[0]
 PARTNERS: Final = AGENTS[1:]
 """The agents that can join `ego_vehicle`."""
@@ -56,88 +58,6 @@ _OF_ACCIDENT: Final = (
     "missing",
     "num_frames",
 )
-
-
-def coalition_members(partners: int) -> BoolArray:
-    """Which partners are in each coalition: (2^n, n)."""
-    return np.asarray((np.arange(1 << partners)[:, None] >> np.arange(partners) & 1).astype(bool))
-
-
-def first_together(observed: ArrayLike) -> IntArray:
-    """The first frame at which the union over a coalition observes both colliders.
-
-    Args:
-        observed: (…, 1 + n, 2, F) bool: whether the ego (first) and each partner observe each collider at each frame.
-            Recordings of several lengths can be one array if they end together, with False before their beginnings.
-
-    Returns:
-        (…, 2^n) position of the frame, from 0; −1 for a coalition that never does.
-
-    Raises:
-        GeometryError: `observed` has another shape.
-    """
-    seen = as_numbers("observed", observed, "truth values (…, agents, 2, frames)", np.bool_)
-    if seen.ndim < 3 or seen.shape[-2] != _PAIR or not seen.shape[-3]:
-        raise GeometryError(f"observed: expected shape (…, agents, 2, frames), found {seen.shape}")
-    coalitions = coalition_members(seen.shape[-3] - 1)
-    both = np.zeros((*seen.shape[:-3], len(coalitions), seen.shape[-1]), dtype=bool)
-    for number, members in enumerate(coalitions):
-        union = np.asarray(seen[..., np.concatenate([[True], members]), :, :].any(axis=-3))
-        both[..., number, :] = union[..., 0, :] & union[..., 1, :]
-    return np.where(both.any(axis=-1), both.argmax(axis=-1) if both.shape[-1] else 0, -1)
-
-
-def coalition_leads(observed: ArrayLike) -> FloatArray:
-    """Seconds from the first frame at which a coalition observes both colliders to the last frame, the impact.
-
-    Args:
-        observed: (…, 1 + n, 2, F) bool, as of `first_together`.
-
-    Returns:
-        (…, 2^n) seconds; 0 for a coalition that never does.
-
-    Raises:
-        GeometryError: `observed` has another shape.
-    """
-    return leads_from(first_together(observed), np.shape(observed)[-1])
-
-
-def leads_from(first: IntArray, frames: int) -> FloatArray:
-    """Seconds from the frames that `first_together` gives (…) to the last one of so many; 0 where it gives −1."""
-    return np.asarray(np.where(first < 0, 0, frames - 1 - first) * FRAME_PERIOD)
-
-
-def shapley_values(leads: ArrayLike) -> FloatArray:
-    """Each partner's exact Shapley value of the gain in lead time over the ego alone.
-
-    That is how much a partner adds to those who joined before it, as a mean over all orders of joining. The values
-    add up to the gain of all partners together.
-
-    Args:
-        leads: (…, 2^n) of each coalition, as `coalition_leads` gives them.
-
-    Returns:
-        (…, n) in the unit of `leads`.
-
-    Raises:
-        GeometryError: the number of coalitions is no power of two.
-    """
-    values = as_numbers("leads", leads)
-    count = values.shape[-1] if values.ndim else 0
-    partners = count.bit_length() - 1
-    if count != 1 << max(partners, 0):
-        raise GeometryError(f"leads: expected one for each of 2^n coalitions, found shape {values.shape}")
-    members = coalition_members(partners)
-    sizes = members.sum(axis=1)
-    weights = np.array(
-        [factorial(size) * factorial(partners - size - 1) / factorial(partners) for size in range(partners)]
-    )
-    result = np.zeros((*values.shape[:-1], partners))
-    for partner in range(partners):
-        without = np.flatnonzero(~members[:, partner])
-        gains = values[..., without + (1 << partner)] - values[..., without]
-        result[..., partner] = gains @ weights[sizes[without]]
-    return result
 
 
 _MEMBERS: Final = coalition_members(len(PARTNERS))

@@ -1,20 +1,28 @@
-"""Which agent observes which actor at which frame, by a declared rule, from the labels alone."""
+"""Which agent observes which actor at which frame, by a declared rule, and when sets of agents first observe two.
+
+All is from the labels alone. An ego and n partners observe two colliders. A coalition is the ego with some of the
+partners: of coalition number k, partner i is one if bit i of k is set, so that number 0 is the ego alone and the last
+one is all of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import factorial
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.support.arrays import BoolArray, IntArray, checked_whole
+from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, as_numbers, checked_whole
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.tables import visible_mask
-from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, AgentName
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, INFRASTRUCTURE, AgentName
 
+_PAIR = 2
 ObservationKind = Literal["points", "released", "annotated"]
 
 
@@ -81,6 +89,82 @@ def observed_actors(
     observed[there.searchsorted(codes[at[seen]]), position[seen], frame[seen]] = True
     observed[_themselves(dataset, row, there, actor_ids)] = True
     return tuple(AGENTS[code] for code in there.tolist()), observed
+
+
+def coalition_members(partners: int) -> BoolArray:
+    """Which partners are in each coalition: (2^n, n)."""
+    return np.asarray((np.arange(1 << partners)[:, None] >> np.arange(partners) & 1).astype(bool))
+
+
+def first_together(observed: ArrayLike) -> IntArray:
+    """(…, 2^n) position of the first frame at which the union over a coalition observes both; −1 for never.
+
+    `observed` (…, 1 + n, 2, F) says whether the ego, the first, and each partner observe each collider at each
+    frame. Recordings of several lengths can be one array if they end together, with False before their beginnings.
+    Raises GeometryError.
+    """
+    seen = as_numbers("observed", observed, "truth values (…, agents, 2, frames)", np.bool_)
+    if seen.ndim < 3 or seen.shape[-2] != _PAIR or not seen.shape[-3]:
+        raise GeometryError(f"observed: expected shape (…, agents, 2, frames), found {seen.shape}")
+    coalitions = coalition_members(seen.shape[-3] - 1)
+    both = np.zeros((*seen.shape[:-3], len(coalitions), seen.shape[-1]), dtype=bool)
+    for number, members in enumerate(coalitions):
+        union = np.asarray(seen[..., np.concatenate([[True], members]), :, :].any(axis=-3))
+        both[..., number, :] = union[..., 0, :] & union[..., 1, :]
+    return np.where(both.any(axis=-1), both.argmax(axis=-1) if both.shape[-1] else 0, -1)
+
+
+def coalition_leads(observed: ArrayLike) -> FloatArray:
+    """Seconds from the first frame at which a coalition observes both colliders to the last frame, the impact.
+
+    Args:
+        observed: (…, 1 + n, 2, F) bool, as of `first_together`.
+
+    Returns:
+        (…, 2^n) seconds; 0 for a coalition that never does.
+
+    Raises:
+        GeometryError: `observed` has another shape.
+    """
+    return leads_from(first_together(observed), np.shape(observed)[-1])
+
+
+def leads_from(first: IntArray, frames: int) -> FloatArray:
+    """Seconds from the frames that `first_together` gives (…) to the last one of so many; 0 where it gives −1."""
+    return np.asarray(np.where(first < 0, 0, frames - 1 - first) * FRAME_PERIOD)
+
+
+def shapley_values(leads: ArrayLike) -> FloatArray:
+    """Each partner's exact Shapley value of the gain in lead time over the ego alone.
+
+    That is how much a partner adds to those who joined before it, as a mean over all orders of joining. The values
+    add up to the gain of all partners together.
+
+    Args:
+        leads: (…, 2^n) of each coalition, as `coalition_leads` gives them.
+
+    Returns:
+        (…, n) in the unit of `leads`.
+
+    Raises:
+        GeometryError: the number of coalitions is no power of two.
+    """
+    values = as_numbers("leads", leads)
+    count = values.shape[-1] if values.ndim else 0
+    partners = count.bit_length() - 1
+    if count != 1 << max(partners, 0):
+        raise GeometryError(f"leads: expected one for each of 2^n coalitions, found shape {values.shape}")
+    members = coalition_members(partners)
+    sizes = members.sum(axis=1)
+    weights = np.array(
+        [factorial(size) * factorial(partners - size - 1) / factorial(partners) for size in range(partners)]
+    )
+    result = np.zeros((*values.shape[:-1], partners))
+    for partner in range(partners):
+        without = np.flatnonzero(~members[:, partner])
+        gains = values[..., without + (1 << partner)] - values[..., without]
+        result[..., partner] = gains @ weights[sizes[without]]
+    return result
 
 
 def _rows_of(keys: IntArray, first: int, end: int) -> slice:

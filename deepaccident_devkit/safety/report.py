@@ -7,21 +7,15 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from deepaccident_devkit.accidents.outcomes import BRAKINGS
+from deepaccident_devkit.accidents.recorded import Skipped, each_scenario, those_of, tried
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.interactions import InteractionConfig, InteractionPairs, interactions
 from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import Skipped, each_scenario, those_of, tried
-from deepaccident_devkit.safety.avoidability import (
-    BRAKERS,
-    Avoidability,
-    AvoidabilityReport,
-    Dropped,
-    looked_into,
-    report_of,
-)
+from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability
+from deepaccident_devkit.safety.avoidability_report import AvoidabilityReport, Dropped, looked_into, report_of
 from deepaccident_devkit.safety.lead_times import LeadTimeLedger, LeadTimes, lead_times, ledger_of
 from deepaccident_devkit.safety.observation import ObservationRule
-from deepaccident_devkit.safety.outcomes import BRAKINGS
 from deepaccident_devkit.safety.stories import Story, scenario_facts, story_text
 from deepaccident_devkit.safety.twins import Parting, TwinDiff, TwinReport, diff_of_accident, twins_of
 from deepaccident_devkit.support.arrays import ShortRepr, known

@@ -13,10 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.safety.accidents import (
+from deepaccident_devkit.accidents.recorded import (
     Accident,
     Skipped,
     accident_of,
@@ -25,6 +22,9 @@ from deepaccident_devkit.safety.accidents import (
     those_of,
     tried,
 )
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability
 from deepaccident_devkit.safety.observation import observed_actors
 from deepaccident_devkit.support.arrays import ShortRepr, known

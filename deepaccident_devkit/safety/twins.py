@@ -1,22 +1,16 @@
-"""Twins: an accident scenario and the normal one of the same name and subtype, and those that a split tears apart."""
+"""How an accident and its twin part: who acts differently from when on, and how near the colliders come in the twin."""
 
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import combinations
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError, NotAvailableError, TokenError
-from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
-from deepaccident_devkit.reports import Report, Row
-from deepaccident_devkit.safety.accidents import (
+from deepaccident_devkit.accidents.recorded import (
     Skipped,
     accident_of,
     each_scenario,
@@ -24,6 +18,11 @@ from deepaccident_devkit.safety.accidents import (
     skipped_rows,
     those_of,
 )
+from deepaccident_devkit.accidents.twins import TornTwins, torn_twins, twin_of
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
+from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.twin_matching import MatchedBy, Recording, matched_rows, recording_of, shift_of, shifted
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked_number, known
 from deepaccident_devkit.support.text import columns_text, number_text
@@ -33,9 +32,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from deepaccident_devkit.parallel import Engine
-    from deepaccident_devkit.tables.records import ScenarioRecord
 
-_OTHER_ENDING: Final[Mapping[str, str]] = {"normal": "accident", "accident": "normal"}
 _OF_TWINS: Final = (
     "accident",
     "twin",
@@ -63,58 +60,6 @@ _OF_ACTORS: Final = (
 _NAMED: Final = 2
 """Actors that a line names at most."""
 _APART: Final = "the recordings do not begin together, so that it is not known when they part"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TornTwins:
-    """Two scenarios of one name and subtype that belong to different splits.
-
-    Attributes:
-        scenarios: their tokens.
-        splits: the split of each.
-    """
-
-    scenarios: tuple[str, str]
-    splits: tuple[str, str]
-
-
-def twin_of(dataset: Dataset, scenario: RowArgument) -> ScenarioRecord | None:
-    """The scenario of the same name and subtype with the other ending; None if this release has none.
-
-    Args:
-        dataset: the release.
-        scenario: token or record.
-
-    Raises:
-        TokenError: no such scenario.
-    """
-    record = dataset.get("scenario", scenario)
-    family, _, ending = record["scenario_type"].rpartition("_")
-    if ending not in _OTHER_ENDING:
-        return None
-    try:
-        return dataset.scenario.get(f"{family}_{_OTHER_ENDING[ending]}/{record['name']}")
-    except TokenError:
-        return None
-
-
-def torn_twins(split_of: Mapping[str, str | None]) -> tuple[TornTwins, ...]:
-    """The twins of which each is in another split; what is learnt from one is then known of the other.
-
-    Args:
-        split_of: scenario token → its split; scenarios without one do not count.
-    """
-    twins: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for token, split in split_of.items():
-        scenario_type, _, name = token.partition("/")
-        if split is not None:
-            twins[scenario_type.rpartition("_")[0], name].append(token)
-    return tuple(
-        TornTwins(scenarios=pair, splits=(str(split_of[pair[0]]), str(split_of[pair[1]])))
-        for tokens in twins.values()
-        for pair in combinations(tokens, 2)
-        if split_of[pair[0]] != split_of[pair[1]]
-    )
 
 
 _NEVER: Final = 10**6

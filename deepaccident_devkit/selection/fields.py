@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
-
-import numpy as np
 
 from deepaccident_devkit import taxonomy
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import FieldError, NotAvailableError
-from deepaccident_devkit.interactions import InteractionPairs, Interactions, interactions_of
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.text import columns_text, possible_text
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
 from deepaccident_devkit.tables.records import table_spec
@@ -38,8 +35,6 @@ _OF_MOVING_PAIRS: Final = {
     "max_drac": "The most deceleration that a moving pair needs to avoid a crash (m/s²).",
 }
 _SHORT = {"type": "scenario_type", "length": "num_frames"}
-_WORTH_A_BAR: Final = 32
-"""Scenarios whose interactions take some seconds, if none are kept."""
 _FEW: Final = ("scenario_type", "town")
 """Columns of words that are not limited, yet few."""
 _KNOWN: dict[str, Sequence[str | int]] = {
@@ -192,36 +187,19 @@ def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
     return None if contact is None or math.isnan(contact.closing_speed) else contact.closing_speed
 
 
-def measures_of_moving_pairs(found: Interactions) -> dict[str, float | None]:
-    """The fields that are measures of a scenario's interactions, of the pairs each of which moves at some frame."""
-    moving = found.pairs.moving
-    return {name: measure(found.pairs, moving) if found.labelled else None for name, measure in _MEASURES.items()}
-
-
 def _of_moving_pairs(name: str) -> Field:
-    """One of these fields."""
+    """One of the fields that are measures of a scenario's interactions."""
 
-    def read_all(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterator[float | None]:
-        progress = len(scenarios) >= _WORTH_A_BAR
-        for found in interactions_of(dataset, scenarios, progress=progress):
-            yield measures_of_moving_pairs(found)[name]
+    def read_all(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterable[float | None]:
+        values: Iterable[float | None] = added("field", name)(name, dataset, scenarios)
+        return values
 
     def read(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
-        return next(read_all(dataset, [scenario]))
+        return next(iter(read_all(dataset, [scenario])))
 
     return Field(name, "measure", _OF_MOVING_PAIRS[name], read, costly=True, read_all=read_all)
 
 
-def _least(values: FloatArray) -> float:
-    return float(values.min(initial=math.inf))
-
-
-_MEASURES: Final[Mapping[str, Callable[[InteractionPairs, BoolArray], float]]] = {
-    "min_ttc": lambda pairs, moving: _least(pairs.min_ttc[moving]),
-    "min_pet": lambda pairs, moving: _least(np.abs(pairs.pet[moving])),
-    "min_gap": lambda pairs, moving: _least(pairs.min_gap[moving]),
-    "max_drac": lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0)),
-}
 _DERIVED = (
     Field(
         "weather_group",
@@ -290,7 +268,7 @@ _DERIVED = (
         _closing_speed,
         costly=True,
     ),
-    *map(_of_moving_pairs, _MEASURES),
+    *map(_of_moving_pairs, _OF_MOVING_PAIRS),
     Field(
         "accident_visibility",
         "word",

@@ -11,7 +11,7 @@ from deepaccident_devkit import taxonomy
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.interactions import interactions_of
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.statistics.report import DatasetStatistics
 from deepaccident_devkit.statistics.results import (
     CRITICAL,
@@ -390,8 +390,7 @@ def _distribution(
 
 def _interactions(chosen: _Chosen, **how: Unpack[Engine]) -> list[Histogram]:
     """The least time to collision of pairs of which each moves at some frame, and of scenarios."""
-    found = interactions_of(chosen.dataset, list(chosen.scenarios.values()), **how)
-    pairs: list[FloatArray] = [each.pairs.min_ttc[each.pairs.moving] for each in found]
+    pairs: list[FloatArray] = added("table", "interactions")(chosen.dataset, list(chosen.scenarios.values()), **how)
     codes = chosen.scenario_group[list(chosen.scenarios)]
     of_pairs = np.concatenate([np.zeros(0), *pairs])
     of_scenarios = np.array([each.min(initial=np.inf) for each in pairs])

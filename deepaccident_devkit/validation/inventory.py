@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import permutations
 
+from deepaccident_devkit.accidents.twins import torn_twins
 from deepaccident_devkit.errors import ReleaseError, shortened
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_split_file, store
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.safety import torn_twins
 from deepaccident_devkit.support.reading import fault_text, irregular_text
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.indexing import SplitAssignment, assign_splits

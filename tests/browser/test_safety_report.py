@@ -6,8 +6,8 @@ import pytest
 from chromium import Browser
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.safety import save_safety_report
 from deepaccident_devkit.safety import safety_report
+from deepaccident_devkit.safety.page import save_safety_report
 
 pytestmark = pytest.mark.slow
 

@@ -16,6 +16,9 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import safety
+from deepaccident_devkit.accidents.contact import Pair, contact_made, contact_times, impacts, pair_of
+from deepaccident_devkit.accidents.outcomes import delta_v_of
+from deepaccident_devkit.accidents.replay import braking_plans, replay
 from deepaccident_devkit.evaluation.warning.recordings import AlarmRuns
 from deepaccident_devkit.safety import (
     COALITIONS,
@@ -28,9 +31,6 @@ from deepaccident_devkit.safety import (
     shapley_values,
 )
 from deepaccident_devkit.safety.avoidability import last_moments
-from deepaccident_devkit.safety.contact import Pair, contact_made, contact_times, impacts, pair_of
-from deepaccident_devkit.safety.outcomes import delta_v_of
-from deepaccident_devkit.safety.replay import braking_plans, replay
 from deepaccident_devkit.taxonomy import AGENTS
 
 HORIZON, WINDOW = 20.0, 10.0

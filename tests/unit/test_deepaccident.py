@@ -5,14 +5,14 @@ import subprocess
 import sys
 from typing import Any
 
-from deepaccident_devkit import DeepAccident, motion, render, safety, validation
+from deepaccident_devkit import DeepAccident, maps, motion, render, safety, validation
 from deepaccident_devkit.deepaccident import _Later, _Package
 
 LATE = {
     name: getattr(package, name)
-    for package in (motion, render, safety, validation)
+    for package in (maps, motion, render, safety, validation)
     for name in package.__all__
-    if hasattr(DeepAccident, name) and name != "interactions"  # of a lower layer, which is there at once
+    if hasattr(DeepAccident, name)
 }
 
 
@@ -21,9 +21,8 @@ def run(code: str) -> str:
 
 
 def test_nothing_heavy_is_imported_before_it_is_used() -> None:
-    packages = [
-        f"deepaccident_devkit.{name}" for name in ("motion", "render", "safety", "validation", "evaluation", "synth")
-    ]
+    names = ("motion", "render", "safety", "interactions", "maps", "validation", "evaluation", "synth")
+    packages = [f"deepaccident_devkit.{name}" for name in names]
     heavy = [*packages, "cv2", "matplotlib", "scipy", "shapely"]
     code = "import sys; from deepaccident_devkit import DeepAccident; DeepAccident.find; DeepAccident.transform; "
     assert run(f"{code}print([name for name in {heavy} if name in sys.modules])") == "[]\n"

@@ -118,7 +118,7 @@ NOT_OF_STRANGERS = {
     "support/reading.py": "the gate",
     "support/files.py": "the system's processes",
     "cli/process.py": "nothing: the null device",
-    "cli/demo.py": "the mark of the demo's own folder",
+    "synth/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
     "explore/pages/release.py": "the split file that was written a line before",
     "explore/pages/responses.py": "the package's own styles and scripts",

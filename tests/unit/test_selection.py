@@ -10,8 +10,9 @@ from tiny import META, NAME, TYPE, label_lines, write_tiny_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError
 from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES
+from deepaccident_devkit.interactions import scenario as interactions_module
 from deepaccident_devkit.overview import _counts
-from deepaccident_devkit.selection import Filter, fields, parse_where
+from deepaccident_devkit.selection import Filter, parse_where
 from deepaccident_devkit.selection.fields import FIELDS, group_texts
 from deepaccident_devkit.tables.records import CollisionRecord, ScenarioRecord
 from deepaccident_devkit.v2x import accident_visibility, accident_visible
@@ -428,13 +429,13 @@ def test_the_most_critical_moving_pair(da_motion: DeepAccident, monkeypatch: pyt
     assert da_motion.find("min_ttc>0.3") == [normal]
     assert da_motion.find("max_drac>20") == [accident]
     asked: list[str] = []
-    computed = fields.interactions_of
+    computed = interactions_module.interactions_of
 
     def noted(dataset: DeepAccident, scenarios, **how):
         asked.extend(scenario["token"] for scenario in scenarios)
         return computed(dataset, scenarios, **how)
 
-    monkeypatch.setattr(fields, "interactions_of", noted)
+    monkeypatch.setattr(interactions_module, "interactions_of", noted)
     assert da_motion.find(min_ttc="..100", collision=False) == [normal]
     assert asked == [normal["token"]], "costly fields come last"
 

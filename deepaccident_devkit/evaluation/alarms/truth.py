@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from deepaccident_devkit.accidents.twins import twin_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation.alarms.reading import InstanceTracks
@@ -16,7 +17,6 @@ from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.box_arrays import gaps, time_to_collision
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.collisions import labelled_pair

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from deepaccident_devkit.accidents.outcomes import OUTCOMES, outcomes_of, undisturbed
+from deepaccident_devkit.accidents.recorded import Accident, Skipped, accident_of
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, breakdown
@@ -32,7 +34,6 @@ from deepaccident_devkit.evaluation.warning.prevention import (
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN, UNPLACED
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.reports import Table
-from deepaccident_devkit.safety import OUTCOMES, Accident, Skipped, accident_of, outcomes_of, undisturbed
 from deepaccident_devkit.support.arrays import IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 

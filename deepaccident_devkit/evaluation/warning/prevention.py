@@ -13,11 +13,12 @@ from typing import Final
 
 import numpy as np
 
+from deepaccident_devkit.accidents.outcomes import BRAKINGS, OUTCOMES, Braking
+from deepaccident_devkit.accidents.recorded import Skipped
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import ratio
 from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.warning.recordings import MINUTE, AlarmRuns, Drive, ScoresOf, series_of
-from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Braking, Skipped
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 

@@ -20,9 +20,9 @@ from deepaccident_devkit.explore.models import Model
 from deepaccident_devkit.explore.pages.responses import explorer_of, page, picture, with_slash
 from deepaccident_devkit.explore.scenarios import UNKNOWN, VISIBILITY_RANKS, ending
 from deepaccident_devkit.maps import kept_town_map, towns_of
+from deepaccident_devkit.maps.pictures import draw_whole_map
 from deepaccident_devkit.overview import Overview, overview
 from deepaccident_devkit.render.figures import detached_figure
-from deepaccident_devkit.render.ground import draw_whole_map
 from deepaccident_devkit.selection.fields import FIELDS
 from deepaccident_devkit.splits import save_selection
 from deepaccident_devkit.support.text import number_text

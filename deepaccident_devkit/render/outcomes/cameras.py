@@ -13,7 +13,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Prediction
 from deepaccident_devkit.geometry import SE3, Boxes, PinholeCamera
-from deepaccident_devkit.maps.polygons import outlines
+from deepaccident_devkit.geometry.cell_outlines import outlines
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image, write_beside
 from deepaccident_devkit.render.camera import draw_image

@@ -10,13 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit.geometry import SE3
-from deepaccident_devkit.maps import GROUND_CLASSES, TownMap
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.captions import is_there
 from deepaccident_devkit.render.ground import map_beneath
 from deepaccident_devkit.render.replay.entries import Recording
 from deepaccident_devkit.render.styles import BEV_COLORS
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE
 
@@ -96,12 +96,11 @@ def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatAr
     return merged
 
 
-def _mapped(town: TownMap, low: FloatArray, high: FloatArray, cell: float) -> ByteArray:
+def _mapped(town: Any, low: FloatArray, high: FloatArray, cell: float) -> ByteArray:
     """(H, W) uint8: the ground by a town's map, as `_merged` gives it."""
-    kinds = np.array([0, *(1 + _GROUND.index(name) if name in _GROUND else 0 for name in GROUND_CLASSES)])
     across, down = np.meshgrid(*_middles(low, high, cell))
-    classes = town.classes_at(np.column_stack([across.ravel(), down.ravel()])).reshape(across.shape)
-    return kinds.astype(np.uint8)[classes]
+    ground: ByteArray = added("picture", "ground_at")(town, np.column_stack([across.ravel(), down.ravel()]), _GROUND)
+    return ground.reshape(across.shape)
 
 
 def _middles(low: FloatArray, high: FloatArray, cell: float) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,7 @@ from deepaccident_devkit.motion import samples
 from deepaccident_devkit.release.layout import write_split_file
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-demo: Any = importlib.import_module("deepaccident_devkit.cli.demo")
+demo: Any = importlib.import_module("deepaccident_devkit.synth.demo")
 
 
 def test_they_are_small_halves_with_their_provenance() -> None:

@@ -350,7 +350,7 @@ def test_the_verb_makes_one_call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         CliRunner().invoke(deepaccident, command, catch_exceptions=False)
         return calls.pop()
 
-    monkeypatch.setattr(import_module("deepaccident_devkit.cli.explore"), "DeepAccident", dict)
+    monkeypatch.setattr(import_module("deepaccident_devkit.explore.cli"), "DeepAccident", dict)
     for name in ("explore", "export_pages"):
         monkeypatch.setitem(vars(package), name, called)
     monkeypatch.setitem(vars(package), "Explorer", lambda *given, **options: (*given, options))

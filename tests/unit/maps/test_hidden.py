@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.maps.hidden import hidden_ground
+from deepaccident_devkit.maps.counting import hidden_ground
 
 
 @pytest.fixture

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from deepaccident_devkit.geometry.cell_outlines import outlines
 from deepaccident_devkit.maps import TownMap
-from deepaccident_devkit.maps.polygons import geojson_of, outlines, simplified
+from deepaccident_devkit.maps.town_map import geojson_of, simplified
 
 ORIGIN = np.array([-12.5, 7.25])
 masks = st.tuples(st.integers(1, 12), st.integers(1, 12)).flatmap(lambda shape: arrays(np.bool_, shape))

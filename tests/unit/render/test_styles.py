@@ -15,11 +15,11 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.render.notebook import png_of
-from deepaccident_devkit.render.safety import render_lead_times
 from deepaccident_devkit.render.statistics import render_statistics
 from deepaccident_devkit.render.training import render_curve
 from deepaccident_devkit.render.video import Scene, views_of
 from deepaccident_devkit.safety import lead_time_ledger
+from deepaccident_devkit.safety.figures import render_lead_times
 from deepaccident_devkit.statistics import dataset_statistics
 
 HOSTILE: dict[str, Any] = {

@@ -16,6 +16,7 @@ import pytest
 from generator_truth import STEP, STEPS_A_FRAME, Truth
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.accidents.contact import pair_of
 from deepaccident_devkit.interactions import masses_of
 from deepaccident_devkit.parallel import in_order, run_unordered
 from deepaccident_devkit.safety import (
@@ -29,7 +30,6 @@ from deepaccident_devkit.safety import (
     undisturbed,
 )
 from deepaccident_devkit.safety.avoidability import MASKS, last_moments
-from deepaccident_devkit.safety.contact import pair_of
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.scenario import RecordingJob

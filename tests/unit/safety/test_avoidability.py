@@ -8,6 +8,8 @@ import pytest
 from replayed_accidents import accident, head_on, rear_end, straight
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.accidents.contact import pair_of
+from deepaccident_devkit.accidents.outcomes import delta_v_ranges
 from deepaccident_devkit.errors import GeometryError, NotAvailableError
 from deepaccident_devkit.safety import (
     Accident,
@@ -19,8 +21,6 @@ from deepaccident_devkit.safety import (
     undisturbed,
 )
 from deepaccident_devkit.safety.avoidability import BRAKERS, MASKS, last_moments
-from deepaccident_devkit.safety.contact import pair_of
-from deepaccident_devkit.safety.outcomes import delta_v_ranges
 
 FIRST, SECOND, BOTH = MASKS
 

@@ -13,6 +13,7 @@ import pytest
 from replayed_accidents import head_on, rear_end
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.accidents.outcomes import delta_v_ranges
 from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.safety import (
     OUTCOMES,
@@ -23,9 +24,8 @@ from deepaccident_devkit.safety import (
     avoidability_report,
     outcome_shares,
 )
-from deepaccident_devkit.safety.avoidability import group_of
-from deepaccident_devkit.safety.contact import SecondaryContact
-from deepaccident_devkit.safety.outcomes import delta_v_ranges
+from deepaccident_devkit.safety.avoidability import SecondaryContact
+from deepaccident_devkit.safety.avoidability_report import group_of
 
 AVOIDED = OUTCOMES.index("avoided")
 
@@ -178,7 +178,7 @@ def test_of_a_release(own_release: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (own_release / bare["folder"] / bare["scenario_type"] / "meta" / f"{bare['name']}.txt").unlink()
     shutil.rmtree(own_release / ".deepaccident")
     dataset = DeepAccident("v1", own_release, verbose=False)
-    module = importlib.import_module("deepaccident_devkit.safety.avoidability")
+    module = importlib.import_module("deepaccident_devkit.safety.avoidability_report")
     real = module.accident_of
 
     def moved_apart(dataset: DeepAccident, scenario: str) -> object:

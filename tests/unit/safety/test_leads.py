@@ -9,7 +9,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, coalition_leads, shapley_values
-from deepaccident_devkit.safety.lead_times import coalition_members, first_together
+from deepaccident_devkit.safety.observation import coalition_members, first_together
 
 observations = st.integers(1, 12).flatmap(lambda frames: arrays(np.bool_, (5, 2, frames)))
 

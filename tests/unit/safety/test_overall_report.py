@@ -23,7 +23,7 @@ from deepaccident_devkit.safety import (
     stories,
     twin_report,
 )
-from deepaccident_devkit.safety.avoidability import Dropped
+from deepaccident_devkit.safety.avoidability_report import Dropped
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 from replayed_accidents import CAR, rear_end, straight
 
 from deepaccident_devkit.geometry import Boxes, quaternions
-from deepaccident_devkit.safety.contact import secondary_contacts
+from deepaccident_devkit.safety.avoidability import secondary_contacts
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.v2x.tracks import ScenarioTracks
 

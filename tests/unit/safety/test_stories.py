@@ -8,9 +8,9 @@ import pytest
 from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli.safety import safety
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.safety import lead_times, stories, story_text
+from deepaccident_devkit.safety.cli import safety
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 PAIR = [

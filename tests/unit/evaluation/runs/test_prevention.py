@@ -12,6 +12,7 @@ from evaluation_runs import evaluation_run
 from numpy.testing import assert_array_equal
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.accidents import outcomes
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation import (
     Accident,
@@ -26,7 +27,7 @@ from deepaccident_devkit.evaluation.runs.prevention import accident_outcomes, pr
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.warning.prevention import NOMINAL, SETTINGS
 from deepaccident_devkit.evaluation.warning.recordings import REFERENCES
-from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, accident_of, outcomes, outcomes_of
+from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, accident_of, outcomes_of
 
 EVERYONE = ("ego_vehicle", "other_vehicle_behind", "infrastructure")
 

@@ -20,7 +20,7 @@ from deepaccident_devkit.cli.options import PATH, use_threads_sparingly, workers
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.errors import ConfigError, MissingExtraError
+from deepaccident_devkit.errors import ConfigError, MissingExtraError, MissingRoomError
 from deepaccident_devkit.evaluation.numbers import headlines
 from deepaccident_devkit.evaluation.results import ResultsTask, read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
@@ -30,6 +30,7 @@ from deepaccident_devkit.render import detached_figure, render_replay
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
 from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.render.styles import page_style
+from deepaccident_devkit.rooms import need_room
 from deepaccident_devkit.support.files import place_in, remove_leftovers, write_bytes
 from deepaccident_devkit.support.pages import document
 from deepaccident_devkit.support.text import columns_text
@@ -200,10 +201,11 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
     (out / MODEL_PICTURE).unlink(missing_ok=True)  # of an earlier demo
     use_threads_sparingly()
     try:
+        need_room("model", "the picture of a model")
         from deepaccident_devkit.model import PredictConfig, load_model, predictions
 
         model = load_model("tiny")
-    except MissingExtraError:
+    except (MissingExtraError, MissingRoomError):
         return False
     token = release.samples_of(_accident_and_before(release)[1])[0]["token"]
     label = motion_labels(release, token, model.config.labels)

@@ -27,7 +27,7 @@ from deepaccident_devkit.safety import (
     MeanTime,
     OutcomeShares,
 )
-from deepaccident_devkit.safety.avoidability import GROUPS
+from deepaccident_devkit.safety.avoidability_report import GROUPS
 from deepaccident_devkit.safety.lead_times import CAVEAT
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import choice

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.accidents.recorded import CLASS_MASSES, accident_of, accidents_of, masses_of
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
-from deepaccident_devkit.interactions import CLASS_MASSES, masses_of
-from deepaccident_devkit.safety import accident_of, accidents_of
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 

@@ -10,10 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from deepaccident_devkit.accidents.contact import Pair, contact_times, impacts, pair_of
+from deepaccident_devkit.accidents.recorded import MASS_UNCERTAINTY, Accident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.interactions.config import MASS_UNCERTAINTY
-from deepaccident_devkit.safety.accidents import Accident
-from deepaccident_devkit.safety.contact import Pair, contact_times, impacts, pair_of
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 
 OUTCOMES: Final = ("avoided", "stopped", "mitigated", "unchanged", "worsened")
@@ -104,15 +103,7 @@ class Outcomes(FrozenArrays):
 
 
 def delta_v_of(masses: ArrayLike, relative_speeds: ArrayLike) -> FloatArray:
-    """(…, 2) changes of the two speeds by a plastic, central impact, m/s.
-
-    Args:
-        masses: (2,) kilograms.
-        relative_speeds: (…) m/s.
-
-    Raises:
-        GeometryError: the masses have another shape.
-    """
+    """(…, 2) changes of both speeds by a plastic, central impact, by masses (2,) kg and relative speeds (…), m/s."""
     both = checked("masses", masses, (2,))
     return np.asarray(np.asarray(relative_speeds)[..., None] * (both[::-1] / both.sum()))
 

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from refusals import assert_refused
 from replayed_accidents import head_on, rear_end, straight, wild_accidents
 
+from deepaccident_devkit.accidents.contact import Pair, contact_made, contact_times, impacts, pair_of
+from deepaccident_devkit.accidents.recorded import Accident
+from deepaccident_devkit.accidents.replay import HORIZON, braking_plans, replay
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
-from deepaccident_devkit.safety import Accident
-from deepaccident_devkit.safety.contact import Pair, contact_made, contact_times, impacts, pair_of
-from deepaccident_devkit.safety.replay import HORIZON, braking_plans, replay
 
 NOBODY = np.array([[np.inf, np.inf]])
 

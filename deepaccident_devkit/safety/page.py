@@ -16,15 +16,10 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.parallel import Engine, Places, run_batch
 from deepaccident_devkit.render.figures import detached_figure, write_figure
 from deepaccident_devkit.render.replay import tried_replay
-from deepaccident_devkit.render.safety.figures import (
-    AVOIDABILITY_SIZE,
-    LEAD_TIME_SIZE,
-    render_avoidability,
-    render_lead_times,
-)
 from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.safety import COALITIONS, OUTCOMES, PARTNERS, AccidentRow, OutcomeShares, SafetyReport
-from deepaccident_devkit.safety.avoidability import GROUPS
+from deepaccident_devkit.safety.avoidability_report import GROUPS
+from deepaccident_devkit.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability, render_lead_times
 from deepaccident_devkit.safety.lead_times import CAVEAT
 from deepaccident_devkit.safety.report import CRITICAL, DECELERATIONS, actor_name
 from deepaccident_devkit.support.files import place_in, plain_names, writable_folder, write_bytes

@@ -13,10 +13,10 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps import town_map
+from deepaccident_devkit.maps.pictures import draw_town_map, render_town_map
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.captions import missing_words
-from deepaccident_devkit.render.ground import draw_town_map, render_town_map
 from deepaccident_devkit.render.styles import BEV_COLORS
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR
 

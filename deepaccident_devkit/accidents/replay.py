@@ -116,15 +116,7 @@ class ReplayStates(NamedTuple):
 
 
 def motion_of(path: ArrayLike, *, horizon: float = HORIZON) -> Motion:
-    """The motion along a path of 10 Hz.
-
-    Args:
-        path: (F, 3) x, y, yaw at each frame, F ≥ 2.
-        horizon: seconds that it goes on after the last frame.
-
-    Raises:
-        GeometryError: the path has another shape, fewer than two frames, or a number that is not finite.
-    """
+    """The motion along a path (F, 3) of x, y, yaw at 10 Hz that goes on for `horizon` seconds; raises GeometryError."""
     poses = checked("path", path, (None, 3)).copy()
     if len(poses) < 2 or not np.isfinite(poses).all():
         raise GeometryError(
@@ -154,16 +146,10 @@ def motion_of(path: ArrayLike, *, horizon: float = HORIZON) -> Motion:
 
 
 def braking_plans(motion: Motion, starts: ArrayLike, decelerations: ArrayLike) -> BrakingPlans:
-    """The plans of N replays that begin to brake at some times.
+    """The plans of N replays that begin to brake at `starts` (N,) seconds, with (N,) m/s² or one number.
 
-    Args:
-        motion: the recorded one.
-        starts: (N,) seconds. From the end of the recording on, braking has no effect: these, inf and NaN are plans
-            without braking. Before 0 nothing is recorded, and the braking begins at 0.
-        decelerations: (N,) m/s², above 0; or one number.
-
-    Raises:
-        GeometryError: the arrays do not fit each other.
+    From the end of the recording on, braking has no effect: these, inf and NaN are plans without braking. Before 0
+    nothing is recorded, and the braking begins at 0. Raises GeometryError.
     """
     given = checked("starts", starts, (None,))
     hard = checked("decelerations", np.broadcast_to(decelerations, given.shape), given.shape)
@@ -180,14 +166,7 @@ def braking_plans(motion: Motion, starts: ArrayLike, decelerations: ArrayLike) -
 
 
 def replay(motion: Motion, plans: BrakingPlans, rows: IntArray, times: FloatArray) -> ReplayStates:
-    """Where replays of one actor are.
-
-    Args:
-        motion: the recorded one.
-        plans: of the replays.
-        rows: (N,) numbers of replays.
-        times: (N,) seconds, from 0 to the end of the continuation.
-    """
+    """Where replays of one actor are, by their numbers (N,) among plans, at `times` (N,) seconds of the motion."""
     stretches = motion.stretches(times)
     speeds = motion.speeds[stretches]
     passed = times - motion.times[stretches]

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from replayed_accidents import straight, wild_paths
 
+from deepaccident_devkit.accidents.replay import HORIZON, Motion, ReplayStates, braking_plans, motion_of, replay
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.safety.replay import HORIZON, Motion, ReplayStates, braking_plans, motion_of, replay
 
 NEVER = np.inf
 

@@ -14,10 +14,9 @@ from report_page import Page, page_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, OutputFolderError, SensorFileError
 from deepaccident_devkit.render.replay import page as replay_page
-from deepaccident_devkit.render.safety import report as report_module
-from deepaccident_devkit.render.safety import save_safety_report
-from deepaccident_devkit.render.safety.report import by_severity, replay_names, report_html
 from deepaccident_devkit.safety import SafetyReport, Skipped, Story, safety_report
+from deepaccident_devkit.safety import page as report_module
+from deepaccident_devkit.safety.page import by_severity, replay_names, report_html, save_safety_report
 from deepaccident_devkit.support.pages import source_hash
 
 HOSTILE = "type1_subtype1_accident/<script>alert(1)</script><img src=\"https://evil.example/x\" onerror='x'>"

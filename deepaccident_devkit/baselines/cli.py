@@ -25,6 +25,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.motion.sample_labels import no_samples_text
+from deepaccident_devkit.rooms import need_room
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.v2x import Link
@@ -124,6 +125,7 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
     refuse_unused("with a trained model, which runs on this machine", "scheduler")
     if agents == _ALONE:
         refuse_unused("with --agents single, which has no partners", *(name for name in _LINK if name != "seed"))
+    need_room("model", "a trained model")
     use_threads_sparingly()
     from deepaccident_devkit.model import PredictConfig, checked_device, load_model, predict_results
 

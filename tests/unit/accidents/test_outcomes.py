@@ -8,9 +8,19 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from replayed_accidents import accident, head_on, rear_end, straight, swapped, wild_accidents
 
+from deepaccident_devkit.accidents.outcomes import (
+    BRAKINGS,
+    MOST_MARGIN,
+    OUTCOMES,
+    Braking,
+    _reductions,
+    delta_v_of,
+    delta_v_ranges,
+    outcomes_of,
+    undisturbed,
+)
+from deepaccident_devkit.accidents.recorded import Accident
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Accident, Braking, outcomes_of, undisturbed
-from deepaccident_devkit.safety.outcomes import MOST_MARGIN, _reductions, delta_v_of, delta_v_ranges
 
 AT_ONCE = (Braking(reaction=0.0, deceleration=5.0),)
 FIRST, SECOND, BOTH = (True, False), (False, True), (True, True)

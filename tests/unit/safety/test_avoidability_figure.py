@@ -8,8 +8,8 @@ from replayed_accidents import head_on, rear_end
 
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.render.figures import detached_figure
-from deepaccident_devkit.render.safety import render_avoidability
 from deepaccident_devkit.safety import OUTCOMES, AvoidabilityReport, avoidability_of
+from deepaccident_devkit.safety.figures import render_avoidability
 
 
 def report_of(*accidents: object) -> AvoidabilityReport:

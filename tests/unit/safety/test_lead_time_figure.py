@@ -4,8 +4,8 @@ from matplotlib.figure import Figure
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.render.safety import render_lead_times
 from deepaccident_devkit.safety import COALITIONS, ObservationRule, lead_time_ledger
+from deepaccident_devkit.safety.figures import render_lead_times
 
 
 def test_bars_are_the_means(da_b: DeepAccident) -> None:

@@ -19,9 +19,6 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.render.figures import detached_figure, write_figure
-from deepaccident_devkit.render.safety import render_lead_times, save_safety_report
-from deepaccident_devkit.render.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability
-from deepaccident_devkit.render.safety.report import REPLAYS
 from deepaccident_devkit.safety import (
     ObservationRule,
     avoidability_report,
@@ -30,7 +27,9 @@ from deepaccident_devkit.safety import (
     stories,
     twin_report,
 )
-from deepaccident_devkit.safety.avoidability import GROUPS
+from deepaccident_devkit.safety.avoidability_report import GROUPS
+from deepaccident_devkit.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability, render_lead_times
+from deepaccident_devkit.safety.page import REPLAYS, save_safety_report
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 
 _DPI: Final = 150

@@ -7,19 +7,15 @@ they nearly touch.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
-from deepaccident_devkit.safety.accidents import Accident, recorded_path
-from deepaccident_devkit.safety.replay import (
-    HORIZON,
+from deepaccident_devkit.accidents.replay import (
     BrakingPlans,
     Motion,
     ReplayStates,
@@ -27,9 +23,8 @@ from deepaccident_devkit.safety.replay import (
     motion_of,
     replay,
 )
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
-from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD
-from deepaccident_devkit.v2x.tracks import ScenarioTracks
 
 _COARSE: Final = 0.32
 """Seconds of the longest intervals."""
@@ -74,15 +69,10 @@ class Impacts(FrozenArrays):
 
 
 def pair_of(paths: ArrayLike, sizes: ArrayLike, *, margin: float | None = None) -> Pair:
-    """The motions of two actors and the margin of their contact.
+    """The motions of two on paths (2, F, 3) of x, y, yaw at 10 Hz up to the impact, and the margin of their contact.
 
-    Args:
-        paths: (2, F, 3) x, y, yaw at 10 Hz, in any right-handed frame; metres, radians. The last frame is the impact.
-        sizes: (2, 2) lengths and widths, or (2, 3) heights too, metres.
-        margin: metres between the outlines that count as contact; None for the gap at the last frame.
-
-    Raises:
-        GeometryError: an array has another shape, there are fewer than two frames, or a path is not finite.
+    Any right-handed frame, metres, radians; `sizes` (2, 2 or more) begin with length and width. A `margin` of None
+    is the gap at the last frame. Raises GeometryError.
     """
     both = checked("paths", paths, (2, None, 3))
     flat = checked("sizes", np.asarray(sizes)[:, :2], (2, 2))
@@ -98,14 +88,9 @@ def contact_times(
 ) -> FloatArray:
     """(N,) seconds at which replays of a pair first touch; inf for those that never do.
 
-    Args:
-        pair: the recorded motions.
-        starts: (N, 2) seconds at which each of the two begins to brake; inf or NaN if it does not.
-        decelerations: (N,) m/s², of both.
-        window: seconds from and to which contact counts; None for all, to the end of the continuation.
-
-    Raises:
-        GeometryError: the arrays do not fit each other.
+    `starts` (N, 2) are the seconds at which each of the two begins to brake, inf or NaN if it does not;
+    `decelerations` (N,) are m/s² of both. Contact counts within the `window`, None for all to the end of the
+    continuation. Raises GeometryError.
     """
     return _search(pair, _plans(pair, starts, decelerations), window or _whole(pair), earliest=True)
 
@@ -119,17 +104,7 @@ def contact_made(
 
 
 def impacts(pair: Pair, starts: ArrayLike, decelerations: ArrayLike, times: FloatArray) -> Impacts:
-    """How fast the two are where replays first touch.
-
-    Args:
-        pair: the recorded motions.
-        starts: (N, 2) seconds at which each of the two begins to brake.
-        decelerations: (N,) m/s².
-        times: (N,) of the contacts; inf for those without.
-
-    Raises:
-        GeometryError: the arrays do not fit each other.
-    """
+    """How fast the two are where replays first touch: at `times` (N,), inf for none; else as `contact_times`."""
     hit = np.flatnonzero(np.isfinite(times))
     speeds, velocities = np.full((len(times), 2), np.nan), np.full((2, len(times), 2), np.nan)
     plans = _plans(pair, starts, decelerations)
@@ -276,127 +251,3 @@ def _note(found: FloatArray, rows: IntArray, marks: FloatArray) -> None:
     """Note the times at which replays are in contact, if they are earlier than those noted before."""
     hit = marks[_Mark.GAP] <= 0
     np.minimum.at(found, rows[hit], marks[_Mark.TIME, hit])
-
-
-_NO_GAP: Final = 1e-9
-"""Metres of a gap that counts as contact: of others no contact is recorded that would need a margin."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SecondaryContact:
-    """One of the pair touches another actor in a replay, and did not in the recording.
-
-    The other's motion stays as recorded, though a driver would react: these are no outcomes, but a hint.
-
-    Attributes:
-        replay: number of the replay.
-        actor_id: CARLA id of the one of the pair.
-        other_id: the other's.
-        category: the other's class.
-        time: seconds from the first frame of the accident.
-        extrapolated: whether it is after the end of the recording.
-    """
-
-    replay: int
-    actor_id: int
-    other_id: int
-    category: str
-    time: float
-    extrapolated: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Other:
-    """Another actor: its path at the accident's frames, and the seconds within which labels show it."""
-
-    actor_id: int
-    category: str
-    path: FloatArray
-    size: FloatArray
-    window: tuple[float, float]
-
-
-def secondary_contacts(
-    accident: Accident, tracks: ScenarioTracks, starts: FloatArray, decelerations: FloatArray
-) -> list[SecondaryContact]:
-    """The first contacts of each of the pair with each other actor in N replays, which the recording does not have.
-
-    Args:
-        accident: the recorded motion of the pair.
-        tracks: of all actors of its scenario.
-        starts: (N, 2) seconds at which each of the two begins to brake; inf if it does not.
-        decelerations: (N,) m/s².
-
-    Returns:
-        By replay, then by time. Others that labels show at one frame alone have no motion, and are left out.
-    """
-    found = []
-    for other, which in product(_others(accident, tracks), (0, 1)):
-        rows = np.flatnonzero(np.isfinite(starts[:, which]))
-        if not len(rows) or not _may_meet(accident.paths[which], accident.sizes[which], other):
-            continue
-        for row, time in zip(
-            rows, _new_contacts(accident, which, other, starts[rows], decelerations[rows]), strict=True
-        ):
-            if np.isfinite(time):
-                found.append(
-                    SecondaryContact(
-                        replay=int(row),
-                        actor_id=accident.actor_ids[which],
-                        other_id=other.actor_id,
-                        category=other.category,
-                        time=float(time),
-                        extrapolated=bool(time > accident.duration),
-                    )
-                )
-    return sorted(found, key=lambda each: (each.replay, each.time, each.other_id))
-
-
-def _new_contacts(
-    accident: Accident, which: int, other: _Other, starts: FloatArray, decelerations: FloatArray
-) -> FloatArray:
-    """(N,) seconds at which one of the pair touches another in N replays; inf if never, or in the recording too."""
-    paths = np.stack([accident.paths[which], other.path])
-    pair = pair_of(paths, [accident.sizes[which, :2], other.size], margin=_NO_GAP)
-    begun = np.full((len(starts) + 1, 2), np.inf)  # the last one is the recording
-    begun[:-1, 0] = starts[:, which]
-    times = contact_times(pair, begun, np.append(decelerations, 1.0), window=other.window)
-    return times[:-1] if times[-1] > accident.duration else np.full(len(starts), np.inf)
-
-
-def _others(accident: Accident, tracks: ScenarioTracks) -> Iterator[_Other]:
-    frames = np.arange(accident.first_frame, accident.last_frame + 1)
-    within = (tracks.index >= frames[0]) & (tracks.index <= frames[-1])
-    for actor in np.unique(tracks.actor_id[within]).tolist():
-        rows = np.flatnonzero(within & (tracks.actor_id == actor))
-        if actor in accident.actor_ids or len(rows) < 2:
-            continue
-        yield _other(tracks, rows, frames)
-
-
-def _other(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> _Other:
-    first, last = ((tracks.index[rows[end]] - frames[0]) * FRAME_PERIOD for end in (0, -1))
-    stays = tracks.index[rows[-1]] == frames[-1]
-    return _Other(
-        actor_id=int(tracks.actor_id[rows[0]]),
-        category=CATEGORIES[int(tracks.boxes.category[rows[-1]])],
-        path=recorded_path(tracks, rows, frames),
-        size=np.median(tracks.boxes.size[rows, :2], axis=0),
-        window=(float(first), float(last + HORIZON if stays else last)),
-    )
-
-
-def _may_meet(path: FloatArray, size: FloatArray, other: _Other) -> bool:
-    """Whether the two can touch at all: a braking actor is where it was recorded, or earlier on its path."""
-    mine, theirs = _positions(path), _positions(other.path)
-    apart = np.hypot(*(mine[:, None] - theirs[None]).transpose(2, 0, 1))
-    steps = sum(np.hypot(*np.diff(each, axis=0).T).max() for each in (mine, theirs))
-    reach = (np.hypot(*size[:2]) + np.hypot(*other.size)) / 2 + steps
-    not_ahead = np.arange(len(mine))[:, None] <= np.arange(len(theirs)) + 1
-    return bool((not_ahead & (apart <= reach)).any())
-
-
-def _positions(path: FloatArray) -> FloatArray:
-    """Positions at each frame of the recording and of its continuation."""
-    onward = np.arange(1, round(HORIZON / FRAME_PERIOD) + 1)[:, None] * (path[-1, :2] - path[-2, :2])
-    return np.concatenate([path[:, :2], path[-1, :2] + onward])
