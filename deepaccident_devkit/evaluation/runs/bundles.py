@@ -15,7 +15,7 @@ import msgspec
 
 from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.results.header import check_token
+from deepaccident_devkit.evaluation.results.records import check_token
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
 from deepaccident_devkit.evaluation.runs.many_samples import remove_checkpoints
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
