@@ -187,3 +187,7 @@ class SomeFailedError(UnavailableError, RuntimeError):
 
 class MissingExtraError(UnavailableError, ImportError):
     """An optional dependency is needed and not installed."""
+
+
+class MissingRoomError(UnavailableError, ImportError):
+    """A part of the devkit is needed that this installation lacks."""

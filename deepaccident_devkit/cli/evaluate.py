@@ -46,8 +46,8 @@ from deepaccident_devkit.evaluation.runs import (
     results_text,
     save_run,
     summary_text,
-    with_prevented,
 )
+from deepaccident_devkit.evaluation.runs.further import with_further
 from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
@@ -217,7 +217,7 @@ def _written(
     resampling = Resampling(resamples=options["resamples"])
     run = run.broken_down((EVERYTHING, *(by or breakdowns_of(run.setup.task))), resampling, **engine)
     if options.get("prevented"):
-        run = with_prevented(run, dataset, resampling, progress=True, **engine)
+        run = with_further(run, "prevented", dataset, resampling, progress=True, **engine)
     text = ""
     if options["sanity"]:
         run, text = _with_sanity(run, dataset, results, options)

@@ -4,6 +4,8 @@
 says which differences of two are real.
 """
 
+from typing import Any
+
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
 from deepaccident_devkit.evaluation.runs.compare import ComparedNumber, Comparison, compare_bundles
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
@@ -17,12 +19,12 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     evaluate_results,
 )
 from deepaccident_devkit.evaluation.runs.many_samples import evaluation_store
-from deepaccident_devkit.evaluation.runs.prevention import prevented_accidents, with_prevented
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import Coverage, SampleSelection, coverage
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
 from deepaccident_devkit.evaluation.runs.verification import Difference, Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes
+from deepaccident_devkit.rooms import added_name
 
 __all__ = [
     "BREAKDOWNS",
@@ -56,3 +58,12 @@ __all__ = [
     "verify_bundle",
     "with_prevented",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """What the room `safety` adds, imported when it is asked for."""
+    return added_name(__name__, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.predictors import predictors_text
-from deepaccident_devkit.evaluation.runs.prevention import prevention_text
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
 from deepaccident_devkit.support.text import columns_text
 
@@ -40,7 +40,7 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
         ("evaluated", _head(summary)),
         ("results", _headlines(summary)),
         *((("predictors", table),) if (table := predictors_text(summary["metrics"])) else ()),
-        *((("prevented accidents", prevention_text(part)),) if (part := summary.get("prevented")) else ()),
+        *((each.title, each.text(part)) for each, part in further_results(summary)),
         ("counts", "\n".join(_counts(summary["metrics"]))),
         *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
     ]

@@ -1,8 +1,10 @@
 """How early an accident is warned of, and how often an alarm is false."""
 
+from typing import Any
+
 from deepaccident_devkit.evaluation.warning.anticipation import AnticipationFigures, AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint
-from deepaccident_devkit.evaluation.warning.evaluator import WARNING_PROTOCOLS, PreventedEvaluator, WarningEvaluator
+from deepaccident_devkit.evaluation.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
 from deepaccident_devkit.evaluation.warning.field import (
     FieldFigures,
     FieldResult,
@@ -10,14 +12,8 @@ from deepaccident_devkit.evaluation.warning.field import (
     field_figures,
     printed_figures,
 )
-from deepaccident_devkit.evaluation.warning.prevention import (
-    AccidentOutcomes,
-    OutcomeTable,
-    PreventedResult,
-    PreventionCurve,
-    PreventionFigures,
-)
 from deepaccident_devkit.evaluation.warning.recordings import ScoreSeries
+from deepaccident_devkit.rooms import added_name
 
 __all__ = [
     "WARNING_PROTOCOLS",
@@ -40,3 +36,12 @@ __all__ = [
     "field_figures",
     "printed_figures",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """What the room `safety` adds, imported when it is asked for."""
+    return added_name(__name__, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -35,6 +35,7 @@ from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_dete
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title, set_title
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -118,8 +119,10 @@ def _mark(run: EvaluationRun) -> str:
 
 
 def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
-    """All figures of a run: those of its task, then breakdowns with several groups of which one has a number."""
-    own = _FIGURES[run.setup.task](run)
+    """All figures of a run: of its task, of further results, and of breakdowns with several groups and a number."""
+    own = [*_FIGURES[run.setup.task](run)]
+    for name, told in run.further.items():
+        own += added("result", name).figures(told.groups[0].result)
     left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.setup.task == "warning" else ()))
     broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
     numbers = [path for path in MAIN_NUMBERS[run.setup.task] if _headline(run.setup.task, run.result, path) is not None]
@@ -137,7 +140,7 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
     yield RunFigure(
         name="accuracy",
         caption=f"Accident prediction accuracy over the allowed distance; APA is the mean of the three points.{curve}",
-        alt=f"Accuracy {_listed((f'within {d:g} m', x.accuracy) for d, x in result.within.items())}.",
+        alt=f"Accuracy {listed((f'within {d:g} m', x.accuracy) for d, x in result.within.items())}.",
         draw=partial(accident.render_accuracy, evaluator),
     )
     if not accident.has_alarms(evaluator):
@@ -158,7 +161,7 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
         yield RunFigure(
             name="alarms",
             caption="Precision over recall of the alarms, beginning with the surest alarm.",
-            alt=f"Precision over recall of alarms; {_listed([('average precision', result.average_precision)])}.",
+            alt=f"Precision over recall of alarms; {listed([('average precision', result.average_precision)])}.",
             draw=partial(accident.render_alarms, evaluator),
         )
 
@@ -176,7 +179,7 @@ def _detection(run: EvaluationRun) -> Iterator[RunFigure]:
         yield RunFigure(
             name=f"precision_recall_{name}" + f"_{low:g}_{high:g}m" * several,
             caption=f"Precision over recall: {name}{where}, one line for each threshold ({unit}).",
-            alt=f"{name}{where}, average precision in percent: {_listed((f'{t:g}', x) for t, x in limits)}.",
+            alt=f"{name}{where}, average precision in percent: {listed((f'{t:g}', x) for t, x in limits)}.",
             draw=partial(detection.render_precision_recall, result, name, ring=ring),
         )
 
@@ -203,16 +206,6 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
             alt="Chance that an accident's score is above another recording's at the same moment, by predictor.",
             draw=partial(warning.render_predictors, result),
         )
-    for group in () if run.prevented is None else run.prevented.groups:
-        result = group.result
-        for name in result.groups:
-            yield RunFigure(
-                name=f"prevention_{name.replace(', ', '_')}",
-                caption=f"Share of the accidents that braking after the alarm avoids, against the braking for false "
-                f"alarms, as the threshold falls: {name}. The upright line is at one braking second a minute.",
-                alt=f"Share avoided over braking seconds a minute; {_listed([('avoided', result.avoided(name))])}.",
-                draw=partial(warning.render_prevention, result, name),
-            )
 
 
 _FIGURES: Final[dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]]] = {
@@ -246,7 +239,8 @@ def _headline(task: str, result: object, path: str) -> Headline | None:
     return next((each for each in headlines(task, result) if each.path == path), None)
 
 
-def _listed(values: Iterable[tuple[str, float | None]]) -> str:
+def listed(values: Iterable[tuple[str, float | None]]) -> str:
+    """Names with their values, with three digits, as the words of a figure."""
     known = [(name, None if value is None or math.isnan(value) else value) for name, value in values]
     return ", ".join(f"{name} {'–' if value is None else f'{value:.3g}'}" for name, value in known)
 

@@ -16,8 +16,8 @@ from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.numbers import Headline, headlines
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
+from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
-from deepaccident_devkit.evaluation.runs.prevention import prevention_tables
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
 from deepaccident_devkit.evaluation.runs.text import reading_notes
 from deepaccident_devkit.render.colors import page_style
@@ -50,7 +50,6 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
     everything = next((each for each in run.breakdowns if each.by == EVERYTHING), None)
     group = everything.groups[0] if everything is not None and everything.groups else None
     percent = "" if everything is None else f"{100 * everything.resampling.confidence:g} % "
-    prevented = summary.get("prevented")
     same = {each.by: each.groups[0].value or UNKNOWN for each in run.breakdowns if len(each.groups) == 1}
     return {
         "title": f"{run.setup.task.capitalize()}, protocol {run.setup.protocol}",
@@ -63,8 +62,10 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
         "interval": f"{percent}interval",
         "interval_notes": () if group is None else group.notes,
         "predictors": predictor_tables(told),
-        "prevention": [] if prevented is None else prevention_tables(prevented),
-        "prevention_notes": [] if prevented is None else [*prevented["notes"], *prevented["interval_notes"]],
+        "further": {
+            each.title.capitalize(): (each.tables(part), [*part["notes"], *part["interval_notes"]])
+            for each, part in further_results(summary)
+        },
         "whole_numbers": {name: result_text(value) for name, value in told.items() if isinstance(value, int)},
         "said": [*(told.get("notes") or ()), *reading_notes(summary)],
         "counts": _counts(run.result, told),

@@ -1,0 +1,54 @@
+"""What the rooms of the ring add to the core, named in one place.
+
+The core imports none of them: it asks for what they add by kind and name, so that it works where a room is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Final
+
+from deepaccident_devkit.errors import MissingRoomError
+
+_RESULT: Final = "safety.prevention_result"
+ADDED: Final[Mapping[str, Mapping[str, str]]] = {
+    "result": {"prevented": "safety.prevention:PREVENTED"},
+    "name": {
+        "evaluation.runs.prevented_accidents": "safety.prevention:prevented_accidents",
+        "evaluation.runs.with_prevented": "safety.prevention:with_prevented",
+        "evaluation.warning.AccidentOutcomes": f"{_RESULT}:AccidentOutcomes",
+        "evaluation.warning.OutcomeTable": f"{_RESULT}:OutcomeTable",
+        "evaluation.warning.PreventedEvaluator": "safety.prevention:PreventedEvaluator",
+        "evaluation.warning.PreventedResult": f"{_RESULT}:PreventedResult",
+        "evaluation.warning.PreventionCurve": f"{_RESULT}:PreventionCurve",
+        "evaluation.warning.PreventionFigures": f"{_RESULT}:PreventionFigures",
+        "render.evaluation.render_prevention": "safety.prevention_figures:render_prevention",
+    },
+}
+"""Kind → name → where it is: `result` (of evaluations, beside their own), `name` (public names of the core)."""
+
+
+def added(kind: str, name: str) -> Any:
+    """What a room adds under a name, imported now; raises MissingRoomError."""
+    module, _, attribute = ADDED[kind][name].partition(":")
+    need_room(module.partition(".")[0], name)
+    return getattr(import_module(f"{__package__}.{module}"), attribute)
+
+
+def added_name(module: str, name: str) -> Any:
+    """For a module's `__getattr__`: a public name of it that lies in a room; raises AttributeError for others."""
+    own = f"{module.removeprefix(f'{__package__}.')}.{name}"
+    if own not in ADDED["name"]:
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+    return added("name", own)
+
+
+def need_room(room: str, what: str) -> None:
+    """Raise MissingRoomError, which says what asks for it, if a room is not installed."""
+    spec = find_spec(f"{__package__}.{room}")
+    if spec is None or spec.origin is None:  # without one: a folder that an uninstalled room left
+        raise MissingRoomError(
+            f"{what}: needs the room `{room}`, which this installation lacks; install the whole devkit"
+        )
