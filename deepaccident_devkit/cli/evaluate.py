@@ -47,8 +47,8 @@ from deepaccident_devkit.evaluation.runs import (
     save_run,
     summary_text,
 )
+from deepaccident_devkit.evaluation.runs.bundles import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.further import with_further
-from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName

@@ -19,7 +19,7 @@ from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import FurtherResult, with_further
-from deepaccident_devkit.evaluation.runs.predictors import number_text
+from deepaccident_devkit.evaluation.runs.text import number_text
 from deepaccident_devkit.evaluation.warning import CleanWarnings, WarningEvaluator
 from deepaccident_devkit.evaluation.warning.anticipation import LATENCIES, draws_of, mean_of, reference_threshold
 from deepaccident_devkit.evaluation.warning.recordings import (
@@ -150,14 +150,7 @@ def accident_outcomes(
 ) -> AccidentOutcomes:
     """How accidents end, for each frame at which an agent can raise its first alarm; any workers give the same bits.
 
-    Args:
-        dataset: the release.
-        frames: scenario → agents whose alarms are judged → frame numbers of their samples.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
-
-    Raises:
-        TokenError: no such scenario.
-        WorkerError: a worker was killed, or cannot do the work.
+    Frames are those of the samples of each scenario's agents whose alarms are judged. Raises TokenError, WorkerError.
     """
     found = in_order(
         run_unordered(
@@ -402,11 +395,7 @@ def _mean(drawn: Sequence[PreventionFigures]) -> PreventionFigures:
 
 
 def prevention_tables(prevented: Json) -> list[Table]:
-    """Two tables for each group of recordings: predictors at the nominal setting, and the predictions at all settings.
-
-    Args:
-        prevented: of a summary: a `PreventedResult` as JSON holds it, with `intervals` of its numbers.
-    """
+    """Two tables for each group of recordings: predictors at the nominal setting, and predictions at all settings."""
     tables = []
     for group, given in prevented["groups"].items():
         everyone = {GIVEN: given, **{name: each[group] for name, each in prevented["references"].items()}}

@@ -7,7 +7,7 @@ says which differences of two are real.
 from typing import Any
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
-from deepaccident_devkit.evaluation.runs.compare import ComparedNumber, Comparison, compare_bundles
+from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison, compare_bundles
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
     BREAKDOWNS,
     EvaluationRun,

@@ -108,12 +108,9 @@ _VALUE_BYTES: Final = 32
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:
-    """Write rows; columns are those of any row, in the order met, null where a row has none.
+    """Write rows (texts, numbers, booleans or None, of one kind in a column), with a stamp for the metadata.
 
-    Args:
-        path: of the file.
-        rows: names → texts, numbers, booleans or None; of one kind in a column.
-        stamp: for the metadata.
+    Columns are those of any row, in the order met, null where a row has none.
     """
     import pyarrow as pa
     from pyarrow import parquet

@@ -69,11 +69,7 @@ def differing(
 ) -> Iterator[tuple[str, Any, Any]]:
     """The paths at which two values differ that JSON can hold, and what is there; numbers must be exactly equal.
 
-    Args:
-        stored: one of them.
-        found: the other.
-        without: paths that do not count, with all below them.
-        path: of both.
+    `without` are paths that do not count, with all below them; `path` is that of both values.
     """
     if path in without:
         return

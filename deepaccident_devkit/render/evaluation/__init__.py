@@ -2,17 +2,17 @@
 
 from typing import Any
 
-from deepaccident_devkit.render.evaluation.accident import (
+from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
+from deepaccident_devkit.render.evaluation.panels import render_breakdown, render_comparison
+from deepaccident_devkit.render.evaluation.report import save_report
+from deepaccident_devkit.render.evaluation.tasks import (
     render_accuracy,
     render_alarms,
     render_errors,
+    render_precision_recall,
+    render_predictors,
+    render_quality_by_time,
 )
-from deepaccident_devkit.render.evaluation.detection import render_precision_recall
-from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
-from deepaccident_devkit.render.evaluation.motion import render_quality_by_time
-from deepaccident_devkit.render.evaluation.panels import render_breakdown, render_comparison
-from deepaccident_devkit.render.evaluation.report import save_report
-from deepaccident_devkit.render.evaluation.warning import render_predictors
 from deepaccident_devkit.rooms import added_name
 
 __all__ = [

@@ -17,9 +17,8 @@ from deepaccident_devkit.evaluation.numbers import Headline, headlines
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import further_results
-from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
-from deepaccident_devkit.evaluation.runs.text import reading_notes
+from deepaccident_devkit.evaluation.runs.text import predictor_tables, reading_notes
 from deepaccident_devkit.render.colors import page_style
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, sample_figures, save_figure
 from deepaccident_devkit.render.evaluation.panels import UNKNOWN
@@ -210,11 +209,6 @@ def save_report(
 
 
 def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -> str:
-    """The complete page.
-
-    Args:
-        run: of `evaluate_results`.
-        figures: with their PNG files, which become part of the page.
-    """
+    """The complete page, of which the figures' PNG files become part."""
     pictures = [(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures]
     return document("evaluation_report.html", style=page_style(), pictures=pictures, **report_context(run))
