@@ -5,7 +5,8 @@ The core imports none of them: it asks for what they add by kind and name, so th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Final
@@ -37,12 +38,16 @@ def added(kind: str, name: str) -> Any:
     return getattr(import_module(f"{__package__}.{module}"), attribute)
 
 
-def added_name(module: str, name: str) -> Any:
-    """For a module's `__getattr__`: a public name of it that lies in a room; raises AttributeError for others."""
-    own = f"{module.removeprefix(f'{__package__}.')}.{name}"
-    if own not in ADDED["name"]:
-        raise AttributeError(f"module {module!r} has no attribute {name!r}")
-    return added("name", own)
+def names_of(module: str, public: Iterable[str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a module of which some public names lie in a room: imported when asked for."""
+    place = module.removeprefix(f"{__package__}.")
+
+    def found(name: str) -> Any:
+        if f"{place}.{name}" not in ADDED["name"]:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        return added("name", f"{place}.{name}")
+
+    return found, lambda: sorted({*vars(sys.modules[module]), *public})
 
 
 def need_room(room: str, what: str) -> None:

@@ -9,6 +9,7 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -152,49 +153,34 @@ def accident_outcomes(
 
     Frames are those of the samples of each scenario's agents whose alarms are judged. Raises TokenError, WorkerError.
     """
-    found = in_order(
-        run_unordered(
-            partial(_tables_of, dataset),
-            sorted(frames.items()),
-            label="braking",
-            places=Places(reads=dataset.places),
-            **how,
-        )
+    work = partial(_outcomes_of, dataset)
+    places = Places(reads=dataset.places)
+    parts = list(in_order(run_unordered(work, sorted(frames.items()), label="braking", places=places, **how)))
+    return AccidentOutcomes(
+        tables={name: table for each in parts for name, table in each.tables.items()},
+        dropped=tuple(chain.from_iterable(each.dropped for each in parts)),
+        skipped=tuple(chain.from_iterable(each.skipped for each in parts)),
     )
-    tables: dict[str, OutcomeTable] = {}
-    left_out: dict[bool, list[Skipped]] = {True: [], False: []}
-    for each in found:
-        if isinstance(each, dict):
-            tables.update(each)
-        else:
-            known, reason = each
-            left_out[known].append(reason)
-    return AccidentOutcomes(tables=tables, dropped=tuple(left_out[True]), skipped=tuple(left_out[False]))
 
 
-def _tables_of(dataset: Dataset, item: tuple[str, Frames]) -> dict[str, OutcomeTable] | tuple[bool, Skipped]:
-    """Recording → table, of one scenario; else whether its motion is known, and why there is none."""
+def _outcomes_of(dataset: Dataset, item: tuple[str, Frames]) -> AccidentOutcomes:
+    """Of one scenario."""
     scenario, agents = item
     try:
         accident = accident_of(dataset, scenario)
     except NotAvailableError as error:
-        return False, Skipped(scenario=scenario, reason=str(error))
+        return AccidentOutcomes(skipped=(Skipped(scenario=scenario, reason=str(error)),))
     if accident is None:
-        return False, Skipped(scenario=scenario, reason="its meta file names no collision")
+        return AccidentOutcomes(skipped=(Skipped(scenario=scenario, reason="its meta file names no collision"),))
     check = undisturbed(accident)
     if not check.usable:
         found = f"{check.margin:.2f} m between the two at its last frame" if check.collides else "no contact"
         reason = f"the recording does not show the impact: {found}, though nobody brakes"
-        return True, Skipped(scenario=scenario, reason=reason)
+        return AccidentOutcomes(dropped=(Skipped(scenario=scenario, reason=reason),))
     frame = np.unique(np.concatenate([np.array(those, dtype=np.int64) for those in agents.values()]))
-    made: dict[tuple[bool, bool], OutcomeTable] = {}
-    tables: dict[str, OutcomeTable] = {}
-    for agent in sorted(agents):
-        own = accident.agents[0] == agent, accident.agents[1] == agent
-        if own not in made:
-            made[own] = _table(accident, own, frame)
-        tables[f"{scenario}/{agent}"] = made[own]
-    return tables
+    own = {agent: (accident.agents[0] == agent, accident.agents[1] == agent) for agent in sorted(agents)}
+    made = {each: _table(accident, each, frame) for each in dict.fromkeys(own.values())}
+    return AccidentOutcomes(tables={f"{scenario}/{agent}": made[each] for agent, each in own.items()})
 
 
 def _table(accident: Accident, own: tuple[bool, bool], frame: IntArray) -> OutcomeTable:

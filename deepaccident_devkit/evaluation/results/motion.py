@@ -126,13 +126,7 @@ class MotionForm:
 
 
 class MotionContents:
-    """Motion, in the shards of a folder.
-
-    Attributes:
-        meta: the notes of the file's author.
-        form: how predictions are stored.
-        tokens: the samples, in the order of the shards.
-    """
+    """Motion, in the shards of a folder, as `reader.EntryContents` has other predictions."""
 
     task: ResultsTask = "motion"
 
@@ -277,11 +271,7 @@ def stored_output(archive: zipfile.ZipFile, token: str, form: MotionForm) -> Mot
 
 
 def take_array(archive: zipfile.ZipFile, member: str, shape: Sequence[int], kinds: str) -> AnyArray:
-    """An array of an archive, its first axis at most as long as the shape's; what is larger is not decompressed.
-
-    Raises:
-        ContentError: says what is wrong with it.
-    """
+    """An array of an archive, as long as the shape or shorter, else it is not decompressed; raises ContentError."""
     try:
         entry = archive.getinfo(member)
     except KeyError:

@@ -181,14 +181,7 @@ def _file_of(path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EntryContents:
-    """Accidents or detected boxes, all of them in memory and checked.
-
-    Attributes:
-        task: what they are of.
-        meta: the notes of the file's author.
-        tokens: the samples.
-        prediction: of a sample, by its token.
-    """
+    """Accidents or detected boxes, all of them in memory and checked; `prediction` gives those of a token."""
 
     task: ResultsTask
     meta: Mapping[str, Any]
@@ -206,12 +199,8 @@ kept: Final[dict[tuple[Path, str], Contents]] = {}
 def contents_of(path: Path, fingerprint: str = "") -> tuple[Contents, str]:
     """The contents of a file, which a process parses once for all copies of `Results`, and its fingerprint.
 
-    Args:
-        path: of the file.
-        fingerprint: of the bytes that it must have, which are not read again if they were parsed; empty for any.
-
-    Raises:
-        ResultsError: it cannot be read, is not as its format says, or has other bytes now.
+    A fingerprint that is given is of the bytes that it must have, not read again if they were parsed. Raises
+    ResultsError: it cannot be read, is not as its format says, or has other bytes now.
     """
     contents = kept.get((path, fingerprint))
     if contents is not None:
@@ -244,11 +233,11 @@ def _parsed(content: bytes, path: Path) -> Contents:
         document, meta = read_document(content, path)
         if isinstance(document, MotionFile):
             return MotionContents(path, meta, document)
-        kind = ENTRIES[document.task]
-        entries = Entries.read(document.results, kind.columns)
+        columns, prediction = ENTRIES[document.task]
+        entries = Entries.read(document.results, columns)
     except (ContentError, OSError) as error:
         raise fault_of(path, error) from error
-    return EntryContents(document.task, meta, entries.number.keys(), partial(kind.prediction, entries))
+    return EntryContents(document.task, meta, entries.number.keys(), partial(prediction, entries))
 
 
 @contextmanager
@@ -294,11 +283,7 @@ class Entries:
 
 
 def accident_columns(results: Mapping[str, Sequence[AccidentEntry]]) -> Columns:
-    """The columns of N accidents.
-
-    Returns:
-        positions (N, 2, 2) metres, time (N,) seconds, score (N,), ids (N, 2), identified (N,) bool.
-    """
+    """Of N accidents positions (N, 2, 2) metres, time (N,) seconds, score (N,), ids (N, 2), identified (N,) bool."""
     accidents = list(chain.from_iterable(results.values()))
     return {
         "positions": _floats([(*one, *other) for one, other in (each.positions for each in accidents)], 2, 2),
@@ -325,14 +310,10 @@ def accidents_at(entries: Entries, token: str) -> list[Accident]:
 
 
 def detection_columns(results: Mapping[str, Sequence[BoxEntry]]) -> Columns:
-    """The columns of N boxes.
+    """Of N boxes `center` (N, 3) metres, rotation (N, 4) unit quaternions w, x, y, z, both in the world, and others.
 
-    Returns:
-        `center` (N, 3) metres and rotation (N, 4) unit quaternions w, x, y, z in the world, size (N, 3) length, width,
-        height, velocity (N, 3) m/s, NaN where unknown, category (N,), score (N,).
-
-    Raises:
-        ContentError: a box names another sample, or its quaternion has another length than 1.
+    These are size (N, 3) length, width, height, velocity (N, 3) m/s, NaN where unknown, category (N,), score (N,).
+    Raises ContentError: a box names another sample, or its quaternion has another length than 1.
     """
     for token, given in results.items():
         others = [number for number, box in enumerate(given) if box.sample_token != token]
@@ -383,21 +364,8 @@ def _floats(values: Sequence[Iterable[float]], *shape: int) -> FloatArray:
     return flat.reshape(len(values), *shape)
 
 
-@dataclass(frozen=True, slots=True)
-class EntryKind:
-    """What a task's entries are.
-
-    Attributes:
-        columns: makes the columns of the records by token.
-        prediction: of a sample, from the columns.
-    """
-
-    columns: Callable[[Mapping[str, Any]], Columns]
-    prediction: Callable[[Entries, str], list[Accident] | DetectedBoxes]
-
-
-ENTRIES: Final[Mapping[str, EntryKind]] = {
-    "accident": EntryKind(accident_columns, accidents_at),
-    "detection": EntryKind(detection_columns, boxes_at),
+ENTRIES: Final[Mapping[str, tuple[Callable[..., Columns], Callable[[Entries, str], Any]]]] = {
+    "accident": (accident_columns, accidents_at),
+    "detection": (detection_columns, boxes_at),
 }
-"""By task."""
+"""Task → what makes the columns of its records by token, and of the columns a sample's prediction."""

@@ -313,12 +313,7 @@ class _Texts(msgspec.Struct):
 
 
 def read_document(content: bytes, path: Path) -> tuple[ResultsFile, dict[str, Any]]:
-    """The records of a results file, and its meta.
-
-    Raises:
-        ContentError: it is no JSON, or is not as its format says; names the token and the field.
-        ResultsError: it is of another version.
-    """
+    """The records of a results file, and its meta; raises ContentError that names token and field, or ResultsError."""
     try:
         document: ResultsFile = decoded(content, ResultsFile)  # type: ignore[arg-type]  # a union is a kind too
     except ContentError:

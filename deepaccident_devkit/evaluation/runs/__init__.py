@@ -4,8 +4,6 @@
 says which differences of two are real.
 """
 
-from typing import Any
-
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison, compare_bundles
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
@@ -24,7 +22,7 @@ from deepaccident_devkit.evaluation.runs.selection import Coverage, SampleSelect
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
 from deepaccident_devkit.evaluation.runs.verification import Difference, Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes
-from deepaccident_devkit.rooms import added_name
+from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "BREAKDOWNS",
@@ -59,11 +57,4 @@ __all__ = [
     "with_prevented",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """What the room `safety` adds, imported when it is asked for."""
-    return added_name(__name__, name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

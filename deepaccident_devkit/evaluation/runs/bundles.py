@@ -129,8 +129,7 @@ class Bundle(ShortRepr):
     @property
     def release_version(self) -> str:
         """`v1` or `v1-mini`."""
-        version: str = self.summary["release"]["version"]
-        return version
+        return str(self.summary["release"]["version"])
 
     @property
     def results_path(self) -> Path:

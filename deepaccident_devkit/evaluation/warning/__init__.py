@@ -1,7 +1,5 @@
 """How early an accident is warned of, and how often an alarm is false."""
 
-from typing import Any
-
 from deepaccident_devkit.evaluation.warning.anticipation import AnticipationFigures, AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
@@ -13,7 +11,7 @@ from deepaccident_devkit.evaluation.warning.field import (
     printed_figures,
 )
 from deepaccident_devkit.evaluation.warning.recordings import ScoreSeries
-from deepaccident_devkit.rooms import added_name
+from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "WARNING_PROTOCOLS",
@@ -37,11 +35,4 @@ __all__ = [
     "printed_figures",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """What the room `safety` adds, imported when it is asked for."""
-    return added_name(__name__, name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

@@ -1,7 +1,5 @@
 """Figures of an evaluation, and the report with all of them. A panel's function takes `ax=` and returns the Axes."""
 
-from typing import Any
-
 from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
 from deepaccident_devkit.render.evaluation.panels import render_breakdown, render_comparison
 from deepaccident_devkit.render.evaluation.report import save_report
@@ -13,7 +11,7 @@ from deepaccident_devkit.render.evaluation.tasks import (
     render_predictors,
     render_quality_by_time,
 )
-from deepaccident_devkit.rooms import added_name
+from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "draw_motion_outcome",
@@ -29,11 +27,4 @@ __all__ = [
     "save_report",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """What the room `safety` adds, imported when it is asked for."""
-    return added_name(__name__, name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

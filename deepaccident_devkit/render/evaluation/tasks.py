@@ -169,8 +169,7 @@ def accuracy_by_distance(evaluator: AccidentEvaluator, distances: FloatArray) ->
 
     At the official ones it is the result's. None if the protocol's counts do not hold how far off each alarm is.
     """
-    protocol = evaluator.protocol
-    if not isinstance(protocol, BoxAccidents | PaperAccidents):
+    if not has_alarms(evaluator):
         return None
     samples = _samples(evaluator)
     accuracy = []
