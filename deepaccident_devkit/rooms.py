@@ -16,6 +16,7 @@ from deepaccident_devkit.errors import MissingRoomError
 _RESULT: Final = "safety.prevention_result"
 ADDED: Final[Mapping[str, Mapping[str, str]]] = {
     "result": {"prevented": "safety.prevention:PREVENTED"},
+    "figures": {"prevented": "safety.prevention_figures:prevention_figures"},
     "name": {
         "evaluation.runs.prevented_accidents": "safety.prevention:prevented_accidents",
         "evaluation.runs.with_prevented": "safety.prevention:with_prevented",
@@ -28,7 +29,7 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "render.evaluation.render_prevention": "safety.prevention_figures:render_prevention",
     },
 }
-"""Kind → name → where it is: `result` (of evaluations, beside their own), `name` (public names of the core)."""
+"""Kind → name → where it is: `result` (of evaluations, beside their own) and its `figures`, `name` (of the core)."""
 
 
 def added(kind: str, name: str) -> Any:

@@ -220,7 +220,9 @@ def _written(
         run = with_further(run, "prevented", dataset, resampling, progress=True, **engine)
     text = ""
     if options["sanity"]:
-        run, text = _with_sanity(run, dataset, results, options)
+        sanity = check_sanity(dataset, results, run.setup, sorted(run.evaluator.tokens), **engine)
+        text = "" if run.partial is None else f"{run.partial.text()}\n"
+        run, text = replace(run, sanity=sanity.as_dict()), f"{text}{sanity.to_text()}"
     if options["out"] is not None:
         from deepaccident_devkit.render.evaluation import save_report
 
@@ -247,15 +249,6 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
     if setup.task == "detection" and options["samples"] == "all":
         refuse_unused("with --samples all: detections are of the present", "horizon")
-
-
-def _with_sanity(
-    run: EvaluationRun, dataset: DeepAccident, results: Results, options: dict[str, Any]
-) -> tuple[EvaluationRun, str]:
-    """The run with its sanity check, and the check's text."""
-    report = check_sanity(dataset, results, run.setup, sorted(run.evaluator.tokens), **engine_of(options))
-    mark = "" if run.partial is None else f"{run.partial.text()}\n"
-    return replace(run, sanity=report.as_dict()), f"{mark}{report.to_text()}"
 
 
 def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:

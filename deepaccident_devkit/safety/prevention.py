@@ -71,7 +71,7 @@ _ALARMS: Final[Mapping[str, tuple[str, ScoresOf]]] = {
 _AT_ONCE: Final = "0"
 """Name of no latency, as JSON has it."""
 _PEDESTRIAN: Final = "pedestrian"
-Frames = Mapping[str, tuple[int, ...]]
+Frames = Mapping[str, Sequence[int]]
 """Agent → frame numbers of its samples."""
 
 
@@ -133,12 +133,7 @@ def prevention_evaluator(dataset: Dataset, evaluator: Evaluator[Any], **how: Unp
         if each["kind"] in ("accident", UNPLACED):  # of the latter it is told why nothing is judged
             scenario, _, agent = each["recording"].rpartition("/")
             frames.setdefault(scenario, {}).setdefault(agent, []).append(each["frame"])
-    wanted = {
-        scenario: {agent: tuple(sorted(those)) for agent, those in agents.items()}
-        for scenario, agents in frames.items()
-    }
-    outcomes = accident_outcomes(dataset, wanted, **how)
-    made = PreventedEvaluator(outcomes, protocol)
+    made = PreventedEvaluator(accident_outcomes(dataset, frames, **how), protocol)
     for token in evaluator.tokens:
         made.add(token, counts[token])
     return made
@@ -435,13 +430,4 @@ def _notes(prevented: Json, group: str, given: Json) -> Iterator[str]:
     )
 
 
-def _drawn(result: PreventedResult) -> Iterator[Any]:
-    """Its figures, whose module is imported with pictures alone."""
-    from deepaccident_devkit.safety.prevention_figures import prevention_figures
-
-    return prevention_figures(result)
-
-
-PREVENTED: Final = FurtherResult(
-    title="prevented accidents", evaluator=prevention_evaluator, tables=prevention_tables, figures=_drawn
-)
+PREVENTED: Final = FurtherResult(title="prevented accidents", evaluator=prevention_evaluator, tables=prevention_tables)

@@ -429,9 +429,7 @@ def _moved_aside(target: Path) -> Path | None:
     """Where an earlier bundle now lies, beside its place; None if there is none."""
     if not target.is_dir() or not any(target.iterdir()):
         return None
-    aside = temporary_path(target)
-    target.rename(aside)
-    return aside
+    return target.rename(temporary_path(target))
 
 
 def _write(run: EvaluationRun, folder: Path, *, include_results: bool) -> None:

@@ -24,19 +24,17 @@ Json = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FurtherResult:
-    """What a room adds to runs, by its name in `rooms.ADDED["result"]` and in summaries.
+    """What a room adds to runs, by its name in `rooms.ADDED["result"]` (pictures: `"figures"`) and in summaries.
 
     Attributes:
         title: heading of its numbers.
         evaluator: what computes them: of a dataset, a run's evaluator, and `parallel.Engine`.
         tables: of the numbers as a summary holds them.
-        figures: of the result, as `render.evaluation.figures.RunFigure`.
     """
 
     title: str
     evaluator: Callable[..., Evaluator[Any]]
     tables: Callable[[Json], list[Table]]
-    figures: Callable[[Any], Iterator[Any]]
 
     def text(self, told: Json) -> str:
         """All tables and the notes of what a summary holds, as aligned lines."""

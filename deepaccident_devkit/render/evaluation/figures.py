@@ -113,7 +113,7 @@ def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
     """All figures of a run: of its task, of further results, and of breakdowns with several groups and a number."""
     own = [*_FIGURES[run.setup.task](run)]
     for name, told in run.further.items():
-        own += added("result", name).figures(told.groups[0].result)
+        own += added("figures", name)(told.groups[0].result)
     left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.setup.task == "warning" else ()))
     broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
     numbers = [path for path in MAIN_NUMBERS[run.setup.task] if _headline(run.setup.task, run.result, path) is not None]
