@@ -56,6 +56,7 @@ from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.taxonomy import AGENTS
 
 _FINDINGS_STATUS = 1
@@ -245,6 +246,8 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
             f"--prevented needs the scores of whole recordings, which --protocol {setup.protocol} does not have; give "
             "--protocol clean"
         )
+    if options.get("prevented"):
+        added("result", "prevented")  # before long work, as its room may be missing
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
     if setup.task == "detection" and options["samples"] == "all":

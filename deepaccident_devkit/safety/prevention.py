@@ -381,10 +381,11 @@ def prevention_tables(prevented: Json) -> list[Table]:
     for group, given in prevented["groups"].items():
         everyone = {GIVEN: given, **{name: each[group] for name, each in prevented["references"].items()}}
         head = (f"{group}, {NOMINAL}", *_COLUMNS)
-        notes = tuple(_notes(prevented, group, given))
-        tables.append(Table(rows=(head, *_predictors(prevented["alarms"], everyone)), notes=notes))
         rows = tuple((name, *_cells(given, prevented["alarms"], setting=name)) for name in SETTINGS)
-        tables.append(Table(rows=((f"{group}, {GIVEN}", *_COLUMNS), *rows), notes=()))
+        tables += [
+            Table((head, *_predictors(prevented["alarms"], everyone)), tuple(_notes(prevented, group, given))),
+            Table(((f"{group}, {GIVEN}", *_COLUMNS), *rows)),
+        ]
     return tables
 
 
