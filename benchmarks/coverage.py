@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.coverage_data import Sums, differences, means, middle, old_interval, ratios, shares, two_runs
 from benchmarks.measure import Figure
 from deepaccident_devkit.evaluation.intervals import Resampling, interval_ends
-from deepaccident_devkit.evaluation.runs.paired import p_values, swaps_of
+from deepaccident_devkit.evaluation.runs.comparison import p_values, swaps_of
 from deepaccident_devkit.support.arrays import FloatArray
 
 DRAWS, CONFIDENCE = 4000, 0.95

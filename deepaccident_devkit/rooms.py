@@ -5,7 +5,8 @@ The core imports none of them: it asks for what they add by kind and name, so th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Final
@@ -18,13 +19,26 @@ NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "synth.demo": ("baselines",),
 }
 """A room, or a module of one → the other rooms that it stands on; pyproject.toml holds all others to none."""
+_RESULT: Final = "safety.prevention_result"
 ADDED: Final[Mapping[str, Mapping[str, str]]] = {
     "field": dict.fromkeys(("min_ttc", "min_pet", "min_gap", "max_drac"), "interactions.scenario:each_of_moving_pairs"),
+    "figures": {"prevented": "safety.prevention_figures:prevention_figures"},
     "method": {
         "describe": "safety.stories:describe",
         "interactions": "interactions.scenario:interactions",
         "render_town_map": "maps.pictures:render_town_map",
         "town_map": "maps.making:town_map",
+    },
+    "name": {
+        "evaluation.runs.prevented_accidents": "safety.prevention:prevented_accidents",
+        "evaluation.runs.with_prevented": "safety.prevention:with_prevented",
+        "evaluation.warning.AccidentOutcomes": f"{_RESULT}:AccidentOutcomes",
+        "evaluation.warning.OutcomeTable": f"{_RESULT}:OutcomeTable",
+        "evaluation.warning.PreventedEvaluator": "safety.prevention:PreventedEvaluator",
+        "evaluation.warning.PreventedResult": f"{_RESULT}:PreventedResult",
+        "evaluation.warning.PreventionCurve": f"{_RESULT}:PreventionCurve",
+        "evaluation.warning.PreventionFigures": f"{_RESULT}:PreventionFigures",
+        "render.evaluation.render_prevention": "safety.prevention_figures:render_prevention",
     },
     "picture": {
         "draw_town_map": "maps.pictures:draw_town_map",
@@ -35,6 +49,7 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "render_town_map": "maps.pictures:render_town_map",
         "save_safety_report": "safety.page:save_safety_report",
     },
+    "result": {"prevented": "safety.prevention:PREVENTED"},
     "table": {"interactions": "interactions.scenario:least_times"},
     "verb": {
         "demo": "synth.demo:demo",
@@ -46,8 +61,9 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "train": "model.cli:train",
     },
 }
-"""Kind → name → where it is. `field`: of queries; `method`: of the facade; `picture`: of `render`; `table`: of
-`statistics`; `verb`: of the command line."""
+"""Kind → name → where it is. `field`: of queries; `result`: of evaluations, beside their own, with its `figures`;
+`method`: of the facade; `name`: of a core module; `picture`: of `render`; `table`: of `statistics`; `verb`: of the
+command line."""
 
 
 def added(kind: str, name: str) -> Any:
@@ -57,6 +73,18 @@ def added(kind: str, name: str) -> Any:
     for each in (room, *NEEDS.get(room, ()), *NEEDS.get(module, ())):
         need_room(each, name)
     return getattr(import_module(f"{__package__}.{module}"), attribute)
+
+
+def names_of(module: str, public: Iterable[str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a module of which some public names lie in a room: imported when asked for."""
+    place = module.removeprefix(f"{__package__}.")
+
+    def found(name: str) -> Any:
+        if f"{place}.{name}" not in ADDED["name"]:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        return added("name", f"{place}.{name}")
+
+    return found, lambda: sorted({*vars(sys.modules[module]), *public})
 
 
 def need_room(room: str, what: str) -> None:

@@ -19,7 +19,7 @@ from deepaccident_devkit.baselines import outlook
 from deepaccident_devkit.baselines.predict import accidents_ahead
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, WarningEvaluator
 from deepaccident_devkit.evaluation.accident import AccidentContext, accident_context
-from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
+from deepaccident_devkit.evaluation.runs.text import predictor_tables
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
 from deepaccident_devkit.synth import SynthConfig, make_release
 

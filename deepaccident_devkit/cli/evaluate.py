@@ -46,9 +46,9 @@ from deepaccident_devkit.evaluation.runs import (
     results_text,
     save_run,
     summary_text,
-    with_prevented,
 )
-from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_threshold
+from deepaccident_devkit.evaluation.runs.bundles import Chooser, chosen_threshold
+from deepaccident_devkit.evaluation.runs.further import with_further
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
@@ -56,6 +56,7 @@ from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.taxonomy import AGENTS
 
 _FINDINGS_STATUS = 1
@@ -217,10 +218,12 @@ def _written(
     resampling = Resampling(resamples=options["resamples"])
     run = run.broken_down((EVERYTHING, *(by or breakdowns_of(run.setup.task))), resampling, **engine)
     if options.get("prevented"):
-        run = with_prevented(run, dataset, resampling, progress=True, **engine)
+        run = with_further(run, "prevented", dataset, resampling, progress=True, **engine)
     text = ""
     if options["sanity"]:
-        run, text = _with_sanity(run, dataset, results, options)
+        sanity = check_sanity(dataset, results, run.setup, sorted(run.evaluator.tokens), **engine)
+        text = "" if run.partial is None else f"{run.partial.text()}\n"
+        run, text = replace(run, sanity=sanity.as_dict()), f"{text}{sanity.to_text()}"
     if options["out"] is not None:
         from deepaccident_devkit.render.evaluation import save_report
 
@@ -243,19 +246,12 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
             f"--prevented needs the scores of whole recordings, which --protocol {setup.protocol} does not have; give "
             "--protocol clean"
         )
+    if options.get("prevented"):
+        added("result", "prevented")  # before long work, as its room may be missing
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
     if setup.task == "detection" and options["samples"] == "all":
         refuse_unused("with --samples all: detections are of the present", "horizon")
-
-
-def _with_sanity(
-    run: EvaluationRun, dataset: DeepAccident, results: Results, options: dict[str, Any]
-) -> tuple[EvaluationRun, str]:
-    """The run with its sanity check, and the check's text."""
-    report = check_sanity(dataset, results, run.setup, sorted(run.evaluator.tokens), **engine_of(options))
-    mark = "" if run.partial is None else f"{run.partial.text()}\n"
-    return replace(run, sanity=report.as_dict()), f"{mark}{report.to_text()}"
 
 
 def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:

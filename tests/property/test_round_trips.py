@@ -13,7 +13,7 @@ from strategies import boxes, calibs, clouds, labels, metas
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import DetectedBoxes
-from deepaccident_devkit.evaluation.results.entries import detection_entries
+from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.export.nuscenes.detections import results_from_nuscenes
 from deepaccident_devkit.export.nuscenes.scenes import token
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud, quaternions

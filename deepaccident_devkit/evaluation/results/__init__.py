@@ -3,9 +3,15 @@
 schema/results/README.md describes them; `ResultsWriter` writes, `read_results` reads.
 """
 
-from deepaccident_devkit.evaluation.results.header import RESULTS_NAMES, MotionForm
+from deepaccident_devkit.evaluation.results.motion import MotionForm
 from deepaccident_devkit.evaluation.results.reader import Prediction, Results, read_results
-from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, RESULT_SCHEMAS, ResultsTask
+from deepaccident_devkit.evaluation.results.records import (
+    FORMAT,
+    FORMAT_VERSION,
+    RESULT_SCHEMAS,
+    RESULTS_NAMES,
+    ResultsTask,
+)
 from deepaccident_devkit.evaluation.results.writer import ResultsWriter
 
 __all__ = [

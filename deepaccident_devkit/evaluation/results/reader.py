@@ -1,246 +1,63 @@
-"""`Results`: a model's predictions of many samples, read strictly from a results file."""
+"""`Results`: a model's predictions of many samples, read strictly from a results file.
+
+Accidents and detected boxes are read as columns over all entries; motion stays in its shards.
+"""
 
 from __future__ import annotations
 
 import copy
 import gc
 import hashlib
+import math
 import os
-from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
 import numpy as np
 
-from deepaccident_devkit.errors import ResultsError, TokenError
+from deepaccident_devkit.errors import ResultsError, TokenError, shortened
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results.entries import ENTRIES, Entries, entry_place, read_entries
-from deepaccident_devkit.evaluation.results.header import (
-    RESULTS_FILE,
-    ContentError,
+from deepaccident_devkit.evaluation.results.motion import (
+    MotionContents,
     MotionForm,
-    at,
-    decoded,
-    json_meta,
-    parsed_json,
-    shown,
-    told_of,
 )
-from deepaccident_devkit.evaluation.results.motion_arrays import stored_output
-from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, MotionFile, ResultsFile, ResultsTask
-from deepaccident_devkit.evaluation.results.shards import check_shard, read_manifest, shared_archive
-from deepaccident_devkit.parallel import Places, run_batch
+from deepaccident_devkit.evaluation.results.records import (
+    LENGTH_FIRST,
+    RESULTS_FILE,
+    AccidentEntry,
+    BoxEntry,
+    ContentError,
+    MotionFile,
+    ResultsTask,
+    at,
+    check_token,
+    entry_place,
+    fault_of,
+    read_document,
+)
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.support.reading import NO_NAME, fault_text, irregular_text, read_bytes
 from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.taxonomy import CATEGORIES, UNTRACKED_ID
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from deepaccident_devkit.parallel import Engine
 
-
-class _Texts(msgspec.Struct):
-    """The entries of each sample, not yet read."""
-
-    results: dict[str, msgspec.Raw]
-
-
-def read_document(content: bytes, path: Path) -> tuple[ResultsFile, dict[str, Any]]:
-    """The records of a results file, and its meta.
-
-    Args:
-        content: the file's bytes.
-        path: its path, for errors.
-
-    Raises:
-        ContentError: it is no JSON, or is not as its format says; names the token and the field.
-        ResultsError: it is of another version.
-    """
-    try:
-        document: ResultsFile = decoded(content, ResultsFile)  # type: ignore[arg-type]  # a union is a kind too
-    except ContentError:
-        _tell(content, path)
-        raise
-    return document, json_meta(_strict_meta(content, document))
-
-
-def _strict_meta(content: bytes, document: ResultsFile) -> object:
-    """The meta of a document, where no name stands twice, and all that was not read is JSON as `parsed_json` has it.
-
-    The records have as many names as the text has colons outside texts. Where it has more, the strict reader says why;
-    it takes four times as long.
-    """
-    if not isinstance(document, MotionFile):
-        record = ENTRIES[document.task].record
-        entries = list(chain.from_iterable(document.results.values()))
-        optional = record.__struct_fields__[-len(record.__struct_defaults__) :]
-        kinds = Counter(chain.from_iterable(map(type, map(attrgetter(name), entries)) for name in optional))
-        ignored = [getattr(each, name) for each in entries for name in optional] if kinds[msgspec.Raw] else []
-        unread = b"[%s]" % b",".join([document.meta, *(each for each in ignored if isinstance(each, msgspec.Raw))])
-        # the file's own names, the task among them, those of samples, and those of entries
-        names = (
-            len(document.__struct_fields__) + 1 + len(document.results) + len(entries) * len(record.__struct_fields__)
-        )
-        colons = np.count_nonzero(np.frombuffer(content, np.uint8) == ord(":"))
-        with suppress(ContentError):
-            meta, *_ = parsed_json(unread)
-            if names - kinds[msgspec.UnsetType] + unread.count(b":") == colons:
-                return meta
-    return parsed_json(content)["meta"]
-
-
-def _tell(content: bytes, path: Path) -> None:
-    """Say what is wrong with a results file, by its token or with its remedy, where that is known; raises."""
-    told = parsed_json(content)
-    if not isinstance(told, dict):
-        raise ContentError(f"expected a JSON object, found {shown(told)}")
-    if "format" not in told and "results" in told:
-        raise ContentError(
-            f'has no "format" (a nuScenes results file?); put "format": "{FORMAT}", "version": {FORMAT_VERSION} and '
-            '"task": "detection" before its "meta" and "results"'
-        )
-    version = told.get("version")
-    if told.get("format") == FORMAT and type(version) is int and version != FORMAT_VERSION:
-        age, remedy = ("a newer", "update the devkit") if version > FORMAT_VERSION else ("an older", "write it again")
-        raise ResultsError(
-            f"{path}: version: {age} results format ({shown(version)}, this devkit's is {FORMAT_VERSION}); {remedy}"
-        )
-    kind = ENTRIES.get(str(told.get("task")))
-    if kind is not None and isinstance(told.get("results"), dict):
-        for token, entries in decoded(content, _Texts).results.items():
-            with at(entry_place(token)):
-                read_entries(bytes(entries), kind.record)
-
-
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
-
-
-class EntryContents:
-    """Accidents or detected boxes, all of them in memory and checked."""
-
-    form: MotionForm | None = None
-
-    def __init__(self, task: ResultsTask, meta: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-        """Check what records cannot say; raises ContentError."""
-        self.task, self.meta = task, meta
-        self._kind = ENTRIES[task]
-        self._entries = Entries.read(results, self._kind.columns)
-
-    @property
-    def tokens(self) -> Collection[str]:
-        """The samples."""
-        return self._entries.number.keys()
-
-    def prediction(self, token: str) -> Prediction:
-        """The entries of a sample."""
-        return self._kind.prediction(self._entries, token)
-
-    def check(self, **_how: Any) -> None:
-        """Nothing to do: all was checked when it was read."""
-
-
-class MotionContents:
-    """Motion, in the shards of a folder."""
-
-    task: ResultsTask = "motion"
-
-    def __init__(self, path: Path, meta: Mapping[str, Any], document: MotionFile) -> None:
-        """Check the manifest; raises ContentError."""
-        self._path, self._root = path, path.parent
-        self.meta = meta
-        self._shards = document.shards
-        self.form, self._shard_of = read_manifest(document, self._root)
-
-    @property
-    def tokens(self) -> Collection[str]:
-        """The samples."""
-        return self._shard_of.keys()
-
-    def prediction(self, token: str) -> MotionOutput:
-        """The prediction of a sample; raises ResultsError."""
-        shard = self._shard_of[token]
-        with told_of(self._path), at(shard.file):
-            archive = shared_archive(self._root, shard, os.getpid())
-            with at(token):
-                return stored_output(archive, token, self.form)
-
-    def check(self, **how: Any) -> None:
-        """Read every array, as `run_batch` is told.
-
-        Raises:
-            ResultsError: names shard, token and array.
-        """
-        check = partial(check_shard, self._root, self.form)
-        run_batch(check, self._shards, label="shards", places=Places(reads=(self._root,)), **how)
-
-
-Contents = EntryContents | MotionContents
-"""The content of a file; callers ask only for tokens that it has."""
-kept: Final[dict[tuple[Path, str], Contents]] = {}
-"""Path and fingerprint → contents of the files that this process parsed last."""
+Columns = dict[str, AnyArray]
+_UNIT_TOLERANCE: Final = 1e-3
+"""How far from 1 a quaternion's norm may be; `Boxes` brings it there."""
+_UNKNOWN: Final = (math.nan, math.nan)
 _MOST_KEPT: Final = 4
-
-
-def contents_of(path: Path, fingerprint: str = "") -> tuple[Contents, str]:
-    """The contents of a file; a process parses it once, however many copies of `Results` it gets.
-
-    Args:
-        path: of the file.
-        fingerprint: of the bytes that it must have, which are not read again if they were parsed; empty for any.
-
-    Returns:
-        The contents, and the fingerprint of the file's bytes.
-
-    Raises:
-        ResultsError: it cannot be read, is not as its format says, or has other bytes now.
-    """
-    contents = kept.get((path, fingerprint))
-    if contents is not None:
-        return contents, fingerprint
-    with told_of(path):
-        content = read_bytes(path, "results")
-    found = content_fingerprint(content)
-    if fingerprint not in ("", found):
-        raise ResultsError(f"{path}: was changed after it was opened; open it again")
-    contents = kept.get((path, found))
-    if contents is None:
-        with told_of(path), _collector_paused():
-            contents = _parsed(content, path)
-        while len(kept) >= _MOST_KEPT:
-            kept.pop(next(iter(kept)), None)
-        kept[path, found] = contents
-    return contents, found
-
-
-def _parsed(content: bytes, path: Path) -> Contents:
-    document, meta = read_document(content, path)
-    if isinstance(document, MotionFile):
-        return MotionContents(path, meta, document)
-    return EntryContents(document.task, meta, document.results)
-
-
-@contextmanager
-def _collector_paused() -> Iterator[None]:
-    """Parsing makes millions of objects, none in a cycle; to look through them again and again doubles the time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-def content_fingerprint(content: bytes) -> str:
-    """The hash of a file's bytes, 32 hexadecimal digits."""
-    return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
 class Results:
@@ -259,6 +76,7 @@ class Results:
         self.path = path
         self.task = task
         self.fingerprint = fingerprint
+        self._file = path / RESULTS_FILE if task == "motion" else path
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle without the contents."""
@@ -319,16 +137,10 @@ class Results:
             ResultsError: names the shard, the token and the array of the first fault, or the file was changed.
             WorkerError: a worker was killed, or does not see the results.
         """
-        with told_of(self._file):
-            now = content_fingerprint(read_bytes(self._file, "results"))
-        if now != self.fingerprint:
-            raise ResultsError(f"{self._file}: was changed after it was opened; open it again")
-        how = {"workers": 1, **how}
-        self._contents.check(**how)
-
-    @property
-    def _file(self) -> Path:
-        return self.path / RESULTS_FILE if self.task == "motion" else self.path
+        _content(self._file, self.fingerprint)
+        contents = self._contents
+        if isinstance(contents, MotionContents):  # all others were checked when they were read
+            contents.check(**{"workers": 1, **how})
 
     @property
     def _contents(self) -> Contents:
@@ -368,3 +180,195 @@ def _file_of(path: Path) -> Path:
     if irregular:
         raise ResultsError(f"{file}: {irregular}; give a results file")
     return file
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EntryContents:
+    """Accidents or detected boxes, all of them in memory and checked; `prediction` gives those of a token."""
+
+    task: ResultsTask
+    meta: Mapping[str, Any]
+    tokens: Collection[str]
+    prediction: Callable[[str], Prediction]
+    form: MotionForm | None = None
+
+
+Contents = EntryContents | MotionContents
+"""The content of a file; callers ask only for tokens that it has."""
+kept: Final[dict[tuple[Path, str], Contents]] = {}
+"""Path and fingerprint → contents of the files that this process parsed last."""
+
+
+def contents_of(path: Path, fingerprint: str = "") -> tuple[Contents, str]:
+    """The contents of a file, which a process parses once for all copies of `Results`, and its fingerprint.
+
+    A fingerprint that is given is of the bytes that it must have, not read again if they were parsed. Raises
+    ResultsError: it cannot be read, is not as its format says, or has other bytes now.
+    """
+    contents = kept.get((path, fingerprint))
+    if contents is not None:
+        return contents, fingerprint
+    content, found = _content(path, fingerprint)
+    contents = kept.get((path, found))
+    if contents is None:
+        with _collector_paused():
+            contents = _parsed(content, path)
+        while len(kept) >= _MOST_KEPT:
+            kept.pop(next(iter(kept)), None)
+        kept[path, found] = contents
+    return contents, found
+
+
+def _content(path: Path, fingerprint: str) -> tuple[bytes, str]:
+    """A file's bytes, and their hash, 32 hexadecimal digits; raises ResultsError if it was to be another."""
+    try:
+        content = read_bytes(path, "results")
+    except OSError as error:
+        raise fault_of(path, error) from error
+    found = hashlib.blake2b(content, digest_size=16).hexdigest()
+    if fingerprint not in ("", found):
+        raise ResultsError(f"{path}: was changed after it was opened; open it again")
+    return content, found
+
+
+def _parsed(content: bytes, path: Path) -> Contents:
+    try:
+        document, meta = read_document(content, path)
+        if isinstance(document, MotionFile):
+            return MotionContents(path, meta, document)
+        columns, prediction = ENTRIES[document.task]
+        entries = Entries.read(document.results, columns)
+    except (ContentError, OSError) as error:
+        raise fault_of(path, error) from error
+    return EntryContents(document.task, meta, entries.number.keys(), partial(prediction, entries))
+
+
+@contextmanager
+def _collector_paused() -> Iterator[None]:
+    """Parsing makes millions of objects, none in a cycle; to look through them again and again doubles the time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Entries:
+    """All entries of a results file.
+
+    Attributes:
+        number: token → number of the sample, in the file's order; S of them.
+        first: (S + 1,) row of each sample's first entry, and the number of entries, N.
+        columns: field → (N, …).
+    """
+
+    number: Mapping[str, int]
+    first: IntArray
+    columns: Columns
+
+    @classmethod
+    def read(cls, results: Mapping[str, Sequence[Any]], columns: Callable[[Mapping[str, Any]], Columns]) -> Entries:
+        """The entries by token; raises ContentError that names the token, the entry (from 0), and the field."""
+        with at("results"):
+            for token in results:
+                check_token(token)
+        first = np.concatenate([[0], np.cumsum([len(given) for given in results.values()])])
+        return cls({token: number for number, token in enumerate(results)}, first, columns(results))
+
+    def of(self, token: str) -> Columns:
+        """The columns of a sample's entries; KeyError for a sample that is not here."""
+        number = self.number[token]
+        rows = slice(self.first[number], self.first[number + 1])
+        return {name: column[rows] for name, column in self.columns.items()}
+
+
+def accident_columns(results: Mapping[str, Sequence[AccidentEntry]]) -> Columns:
+    """Of N accidents positions (N, 2, 2) metres, time (N,) seconds, score (N,), ids (N, 2), identified (N,) bool."""
+    accidents = list(chain.from_iterable(results.values()))
+    return {
+        "positions": _floats([(*one, *other) for one, other in (each.positions for each in accidents)], 2, 2),
+        "time": np.array([each.time for each in accidents], dtype=np.float64),
+        "score": np.array([each.score for each in accidents], dtype=np.float64),
+        "ids": np.array([each.ids or (0, 0) for each in accidents], dtype=np.int64).reshape(-1, 2),
+        "identified": np.array([bool(each.ids) for each in accidents], dtype=bool),
+    }
+
+
+def accidents_at(entries: Entries, token: str) -> list[Accident]:
+    """The accidents of a sample; KeyError for one that is not here."""
+    columns = entries.of(token)
+    identified, ids = columns["identified"].tolist(), columns["ids"].tolist()
+    return [
+        Accident(
+            positions=columns["positions"][row],
+            time=float(columns["time"][row]),
+            score=float(columns["score"][row]),
+            ids=(ids[row][0], ids[row][1]) if identified[row] else None,
+        )
+        for row in range(len(ids))
+    ]
+
+
+def detection_columns(results: Mapping[str, Sequence[BoxEntry]]) -> Columns:
+    """Of N boxes `center` (N, 3) metres, rotation (N, 4) unit quaternions w, x, y, z, both in the world, and others.
+
+    These are size (N, 3) length, width, height, velocity (N, 3) m/s, NaN where unknown, category (N,), score (N,).
+    Raises ContentError: a box names another sample, or its quaternion has another length than 1.
+    """
+    for token, given in results.items():
+        others = [number for number, box in enumerate(given) if box.sample_token != token]
+        if others:
+            place, found = entry_place(token, others[0]), shortened(given[others[0]].sample_token)
+            raise ContentError(f"{place}.sample_token: expected {token}, under which it stands, found {found!r}")
+    boxes = list(chain.from_iterable(results.values()))
+    rotation = _floats([box.rotation for box in boxes], 4)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(rotation, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1) > _UNIT_TOLERANCE)
+    if len(wrong):
+        row = int(wrong[0])
+        places = [entry_place(token, number) for token, given in results.items() for number in range(len(given))]
+        found = f"{list(boxes[row].rotation)}, {length[row]:.3g} long"
+        raise ContentError(f"{places[row]}.rotation: expected a unit quaternion [w, x, y, z], found {found}")
+    velocity = _floats([box.velocity or _UNKNOWN for box in boxes], 2)
+    code = {name: number for number, name in enumerate(CATEGORIES)}
+    return {
+        "center": _floats([box.translation for box in boxes], 3),
+        "size": _floats([box.size for box in boxes], 3)[:, LENGTH_FIRST],
+        "rotation": rotation,
+        "velocity": np.column_stack([velocity, np.where(np.isnan(velocity[:, :1]), np.nan, 0.0)]),
+        "category": np.array([code[box.detection_name] for box in boxes], dtype=np.int8),
+        "score": np.array([box.detection_score for box in boxes], dtype=np.float64),
+    }
+
+
+def boxes_at(entries: Entries, token: str) -> DetectedBoxes:
+    """The boxes of a sample, in the world; KeyError for one that is not here."""
+    columns: dict[str, Any] = entries.of(token)
+    scores = columns.pop("score")
+    count = len(scores)
+    boxes = Boxes(
+        frame="world",
+        **columns,
+        actor_id=np.full(count, UNTRACKED_ID),
+        num_lidar_pts=np.zeros(count, dtype=np.int64),
+        camera_visible=np.zeros(count, dtype=bool),
+        row=np.arange(count),
+    )
+    return DetectedBoxes(boxes=boxes, scores=scores)
+
+
+def _floats(values: Sequence[Iterable[float]], *shape: int) -> FloatArray:
+    """(N, *shape) float64 of N flat tuples."""
+    flat = np.fromiter(chain.from_iterable(values), np.float64, len(values) * math.prod(shape))
+    return flat.reshape(len(values), *shape)
+
+
+ENTRIES: Final[Mapping[str, tuple[Callable[..., Columns], Callable[[Entries, str], Any]]]] = {
+    "accident": (accident_columns, accidents_at),
+    "detection": (detection_columns, boxes_at),
+}
+"""Task → what makes the columns of its records by token, and of the columns a sample's prediction."""

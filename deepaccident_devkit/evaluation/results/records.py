@@ -1,15 +1,27 @@
-"""The records that results files consist of. They check what JSON holds, and schema/results is made of them."""
+"""What results files hold: the records, which schema/results is made of, reading them, and how faults are told."""
 
 from __future__ import annotations
 
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from itertools import chain
+from operator import attrgetter
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args
 
 import msgspec
-from msgspec import UNSET, Meta, UnsetType
+import numpy as np
+from msgspec import UNSET, Meta, UnsetType, inspect
 
+from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
 from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
+from deepaccident_devkit.support import json_text
+from deepaccident_devkit.support.reading import fault_text
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 ResultsTask = Literal["motion", "accident", "detection"]
@@ -19,6 +31,12 @@ Version = Literal[1]
 """Counted up with what files hold."""
 FORMAT: Final = get_args(Format)[0]
 FORMAT_VERSION: Final = get_args(Version)[0]
+RESULTS_NAMES: Final[Mapping[ResultsTask, str]] = MappingProxyType(
+    {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}
+)
+"""Task → the name of its file, of motion a folder, where results of all tasks are written into one folder."""
+RESULTS_FILE: Final = "results.json"
+"""The manifest of motion results, in their folder; results of the other tasks in a folder are called so too."""
 WORDS: Final = r"^[^/\\]+(/[^/\\]+)*$"
 """A regular expression of tokens: words with `/` between."""
 LARGEST: Final = 1e6
@@ -30,6 +48,16 @@ ActorId = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Token = Annotated[str, Meta(extra_json_schema={"pattern": WORDS})]
 Ignored = Annotated[msgspec.Raw | UnsetType, Meta(description="Ignored.")]
 """A further field of the nuScenes devkit; this dataset has no attributes."""
+Kind = TypeVar("Kind")
+Entry = TypeVar("Entry", bound=msgspec.Struct)
+LENGTH_FIRST: Final = [1, 0, 2]
+"""From nuScenes' width, length, height to our length, width, height, and back."""
+_SHOWN: Final = 80
+"""Characters of a wrong value that an error shows."""
+_MOST_LEVELS: Final = 30
+"""The largest depth of nested objects and lists in `meta`, which people and reports read."""
+_LONGEST_TOKEN: Final = 1000
+"""Characters."""
 
 
 class AccidentEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
@@ -73,6 +101,10 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     attribute_name: Ignored = UNSET
     ego_translation: Ignored = UNSET
     num_pts: Ignored = UNSET
+
+
+ENTRY_RECORDS: Final[Mapping[str, type[msgspec.Struct]]] = {"accident": AccidentEntry, "detection": BoxEntry}
+"""Task → record of an entry."""
 
 
 class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -159,3 +191,190 @@ RESULT_SCHEMAS: Final = MappingProxyType(
 
 What a schema cannot say, `read_results` checks too: names that stand twice, NaN, unit quaternions, arrays.
 """
+
+
+class ContentError(ValueError):
+    """What is wrong, as half a sentence; `fault_of` makes a ResultsError of it."""
+
+
+@contextmanager
+def at(place: str) -> Iterator[None]:
+    """Put the place before the message of an error."""
+    try:
+        yield
+    except ContentError as error:
+        raise ContentError(f"{place}: {error}") from error
+
+
+def fault_of(path: Path, error: ContentError | OSError, *places: str) -> ResultsError:
+    """The error for what is found wrong at a place in a file, or for one that cannot be read, with the remedy."""
+    if isinstance(error, ContentError):
+        told = ": ".join(filter(None, (str(path), *places, str(error))))
+        return ResultsError(f"{told}; the format is described in schema/results/README.md")
+    return ResultsError(f"{path}: {fault_text(error)}; give a results file that can be read")
+
+
+def shown(value: object) -> str:
+    """A value of a JSON file as it stands there, cut if it is long."""
+    text = json.dumps(value, ensure_ascii=False, default=repr)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+def parsed_json(content: bytes, levels: int = json_text.MOST_LEVELS) -> Any:
+    """The value of JSON text; raises ContentError that names the place of a fault."""
+    try:
+        return json_text.parsed_json(content, levels=levels)
+    except ValueError as error:
+        raise ContentError(str(error)) from error
+
+
+def decoded(content: bytes, kind: type[Kind]) -> Kind:
+    """The record that JSON text describes; raises ContentError that names the place of a fault, and what it found.
+
+    A name that stands twice in an object is not noticed.
+    """
+    try:
+        return msgspec.json.decode(content, type=kind)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        value = parsed_json(content)  # it says of NaN where it stands
+        said, _, place = str(error).partition(" - at `$")
+        place = place.strip(".`")
+        told = _told(shortened(said[:1].lower() + said[1:], MOST_TOLD), value, inspect.type_info(kind), place)
+        raise ContentError(f"{place}: {told}" if place else told) from error
+
+
+def _told(said: str, value: Any, kind: inspect.Type, place: str) -> str:
+    """What msgspec says of a value, with what it found at the place, and what it expected or means there."""
+    kinds, meaning = _single(kind), ""
+    if isinstance(value, dict):
+        kinds = [each for each in kinds if getattr(each, "tag", None) == value.get("task")] or kinds
+    for part in re.findall(r"\w+|\.\.\.", place):
+        if part == "...":  # a name, which msgspec does not tell
+            return said
+        value = value[int(part) if isinstance(value, list) else part]
+        inner = [each for outer in kinds for each in _inner(outer, part)]
+        kinds = [each for whole in inner for each in _single(whole)]
+        notes = [each.extra_json_schema or {} for each in inner if isinstance(each, inspect.Metadata)]
+        meaning = next((f" ({note['description']})" for note in notes if "description" in note), meaning)
+    if said.startswith("object "):  # lacks a field, or has one too many
+        names = [field.encode_name for each in kinds if isinstance(each, inspect.StructType) for field in each.fields]
+        return f"{said} (expected {', '.join(names)})" if "unknown" in said and names else said
+    choices = [str(word) for each in kinds if isinstance(each, inspect.LiteralType) for word in each.values]
+    if choices:
+        return f"expected {'one of ' * (len(choices) > 1)}{', '.join(choices)}, found {shown(value)}"
+    return f"{said.partition(', got ')[0]}, found {shown(value)}{meaning}"
+
+
+def _inner(kind: inspect.Type, part: str) -> Sequence[inspect.Type]:
+    """The kinds that a field or an entry of a value of a kind may have."""
+    if isinstance(kind, inspect.StructType):
+        return [each.type for each in kind.fields if each.encode_name == part] or [inspect.LiteralType((kind.tag,))]
+    if isinstance(kind, inspect.TupleType):
+        return [kind.item_types[int(part)]]
+    return [kind.item_type] if isinstance(kind, inspect.ListType | inspect.VarTupleType) else []
+
+
+def _single(kind: inspect.Type) -> list[inspect.Type]:
+    """The kinds that a kind joins, without notes on them."""
+    if isinstance(kind, inspect.Metadata):
+        return _single(kind.type)
+    return [part for each in kind.types for part in _single(each)] if isinstance(kind, inspect.UnionType) else [kind]
+
+
+def json_meta(meta: object) -> dict[str, Any]:
+    """A copy of `meta` as JSON holds it; raises ContentError."""
+    if not isinstance(meta, Mapping):
+        raise ContentError(f"meta: expected a mapping of names to what JSON holds, found {type(meta).__name__}")
+    try:
+        text = json.dumps(dict(meta), allow_nan=False)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ContentError(f"meta: cannot be written as JSON ({error})") from error
+    with at("meta"):
+        copied: dict[str, Any] = parsed_json(text.encode(), _MOST_LEVELS)
+    return copied
+
+
+def check_token(token: object) -> str:
+    """A sample's token, if it could be one: words with `/` between; raises ContentError."""
+    if not isinstance(token, str):
+        raise ContentError(f"expected a sample's token, a text, found {shown(token)}")
+    good = len(token) <= _LONGEST_TOKEN and token.isprintable() and re.fullmatch(WORDS, token)
+    if not good or {".", ".."} & set(token.split("/")):
+        raise ContentError(
+            f"expected a sample's token, <scenario_type>/<name>/<agent>/<NNN>, found {shortened(token)!r}"
+        )
+    return token
+
+
+class _Texts(msgspec.Struct):
+    """The entries of each sample, not yet read."""
+
+    results: dict[str, msgspec.Raw]
+
+
+def read_document(content: bytes, path: Path) -> tuple[ResultsFile, dict[str, Any]]:
+    """The records of a results file, and its meta; raises ContentError that names token and field, or ResultsError."""
+    try:
+        document: ResultsFile = decoded(content, ResultsFile)  # type: ignore[arg-type]  # a union is a kind too
+    except ContentError:
+        _tell(content, path)
+        raise
+    return document, json_meta(_strict_meta(content, document))
+
+
+def _strict_meta(content: bytes, document: ResultsFile) -> object:
+    """The meta of a document, where no name stands twice, and all that was not read is JSON as `parsed_json` has it.
+
+    The records have as many names as the text has colons outside texts. Where it has more, the strict reader says why;
+    it takes four times as long.
+    """
+    if not isinstance(document, MotionFile):
+        record = ENTRY_RECORDS[document.task]
+        entries = list(chain.from_iterable(document.results.values()))
+        optional = record.__struct_fields__[-len(record.__struct_defaults__) :]
+        kinds = Counter(chain.from_iterable(map(type, map(attrgetter(name), entries)) for name in optional))
+        ignored = [getattr(each, name) for each in entries for name in optional] if kinds[msgspec.Raw] else []
+        unread = b"[%s]" % b",".join([document.meta, *(each for each in ignored if isinstance(each, msgspec.Raw))])
+        # the file's own names, the task among them, those of samples, and those of entries
+        names = (
+            len(document.__struct_fields__) + 1 + len(document.results) + len(entries) * len(record.__struct_fields__)
+        )
+        colons = np.count_nonzero(np.frombuffer(content, np.uint8) == ord(":"))
+        with suppress(ContentError):
+            meta, *_ = parsed_json(unread)
+            if names - kinds[msgspec.UnsetType] + unread.count(b":") == colons:
+                return meta
+    return parsed_json(content)["meta"]
+
+
+def _tell(content: bytes, path: Path) -> None:
+    """Say what is wrong with a results file, by its token or with its remedy, where that is known; raises."""
+    told = parsed_json(content)
+    if not isinstance(told, dict):
+        raise ContentError(f"expected a JSON object, found {shown(told)}")
+    if "format" not in told and "results" in told:
+        raise ContentError(
+            f'has no "format" (a nuScenes results file?); put "format": "{FORMAT}", "version": {FORMAT_VERSION} and '
+            '"task": "detection" before its "meta" and "results"'
+        )
+    version = told.get("version")
+    if told.get("format") == FORMAT and type(version) is int and version != FORMAT_VERSION:
+        age, remedy = ("a newer", "update the devkit") if version > FORMAT_VERSION else ("an older", "write it again")
+        raise ResultsError(
+            f"{path}: version: {age} results format ({shown(version)}, this devkit's is {FORMAT_VERSION}); {remedy}"
+        )
+    record = ENTRY_RECORDS.get(str(told.get("task")))
+    if record is not None and isinstance(told.get("results"), dict):
+        for token, entries in decoded(content, _Texts).results.items():
+            with at(entry_place(token)):
+                read_entries(bytes(entries), record)
+
+
+def read_entries(content: bytes, record: type[Entry]) -> list[Entry]:
+    """A sample's entries; raises ContentError that names the number of the entry and the field."""
+    return decoded(content, list[record])  # type: ignore[valid-type]  # msgspec wants it so at run time
+
+
+def entry_place(token: str, number: int | None = None) -> str:
+    """How errors name a sample's entries, or one of them."""
+    return f"results of {shortened(token)!r}" + ("" if number is None else f": [{number}]")

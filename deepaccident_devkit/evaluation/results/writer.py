@@ -2,23 +2,49 @@
 
 from __future__ import annotations
 
+import io
+import json
+import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, get_args
+from typing import Any, Final, get_args
 
-from deepaccident_devkit.errors import ResultsError
+import msgspec
+import numpy as np
+
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results.entries import EntryWriter
-from deepaccident_devkit.evaluation.results.header import ContentError, MotionForm, check_token, json_meta
-from deepaccident_devkit.evaluation.results.records import FORMAT, FORMAT_VERSION, ResultsTask, Stored
-from deepaccident_devkit.evaluation.results.shards import ShardWriter
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, checked_prediction
+from deepaccident_devkit.evaluation.results.motion import HEADS, MEMBER, MotionForm
+from deepaccident_devkit.evaluation.results.records import (
+    ENTRY_RECORDS,
+    FORMAT,
+    FORMAT_VERSION,
+    LENGTH_FIRST,
+    RESULTS_FILE,
+    ContentError,
+    ResultsTask,
+    Shard,
+    Stored,
+    check_token,
+    json_meta,
+    read_entries,
+)
 from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import predict_instances
+from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing, replacing_folder
+from deepaccident_devkit.support.reading import file_checksum
 from deepaccident_devkit.support.text import choice, path_of
+from deepaccident_devkit.taxonomy import CATEGORIES
+
+_FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
+_MOST_SAMPLES: Final = 64
+_MOST_BYTES: Final = 32 * 2**20
 
 
 class ResultsWriter:
@@ -153,3 +179,242 @@ def _told(path: Path) -> Iterator[None]:
 
 def _unwritten(path: Path, error: OSError) -> ResultsError:
     return ResultsError(f"{path}: results cannot be written ({error}); make room there, or choose another path")
+
+
+class EntryWriter:
+    """Writes the file of accident or detection results from its header to its last sample."""
+
+    def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
+        """Begin a new file."""
+        self._entries, self._record = _ENTRIES[header["task"]], ENTRY_RECORDS[header["task"]]
+        self._count = 0
+        self._file = path.open("w", encoding="utf-8", newline="\n")
+        for name, value in header.items():
+            self._file.write(f"{',' if self._file.tell() else '{'}\n{json.dumps(name)}: {json.dumps(value)}")
+        self._file.write(',\n"results": {')
+
+    def add(self, token: str, prediction: object) -> None:
+        """Write the entries of a sample; raises ResultsError or ContentError, and nothing of it is written then."""
+        entries = json.dumps(self._entries(token, prediction))
+        read_entries(entries.encode(), self._record)
+        self._file.write(f"{',' if self._count else ''}\n{json.dumps(token)}: {entries}")
+        self._count += 1
+
+    def finish(self) -> None:
+        """Write the end; raises ResultsError if nothing was added."""
+        if not self._count:
+            raise ResultsError("no prediction was added; results of no sample cannot be read")
+        self._file.write("\n}\n}\n")
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _accidents(token: str, prediction: object) -> list[dict[str, Any]]:
+    del token
+    try:
+        accidents = checked_prediction(prediction)
+    except EvaluationError as error:
+        raise ResultsError(str(error)) from error
+    if isinstance(accidents, MotionOutput):
+        raise ResultsError("expected a list of Accidents, found a MotionOutput; write that to results of task 'motion'")
+    return [
+        {
+            "positions": each.positions.tolist(),
+            "time": each.time,
+            "score": each.score,
+            "ids": None if each.ids is None else list(each.ids),
+        }
+        for each in accidents
+    ]
+
+
+def _boxes(token: str, prediction: object) -> list[dict[str, Any]]:
+    if not isinstance(prediction, DetectedBoxes):
+        raise ResultsError(
+            f"expected DetectedBoxes, found {type(prediction).__name__}; make them with "
+            "DetectedBoxes.from_arrays(center, size, yaw, scores, frame='world')"
+        )
+    frame = prediction.boxes.frame
+    if frame != "world":
+        raise ResultsError(
+            f"expected boxes in the world frame, found {frame}; give "
+            f"detected.transform(dataset.world_from(token, {frame!r}), 'world')"
+        )
+    return detection_entries(token, prediction)
+
+
+def detection_entries(token: str, detected: DetectedBoxes) -> list[dict[str, Any]]:
+    """A sample's boxes as a file has them; they are in the world frame."""
+    boxes = detected.boxes
+    return [
+        {
+            "sample_token": token,
+            "translation": center,
+            "size": size,
+            "rotation": rotation,
+            "velocity": moving if all(map(math.isfinite, moving)) else None,
+            "detection_name": CATEGORIES[category],
+            "detection_score": score,
+        }
+        for center, size, rotation, moving, category, score in zip(
+            boxes.center.tolist(),
+            boxes.size[:, LENGTH_FIRST].tolist(),
+            boxes.rotation.tolist(),
+            boxes.velocity[:, :2].tolist(),
+            boxes.category.tolist(),
+            detected.scores.tolist(),
+            strict=True,
+        )
+    ]
+
+
+_ENTRIES: Final[Mapping[str, Callable[[str, object], list[dict[str, Any]]]]] = {
+    "accident": _accidents,
+    "detection": _boxes,
+}
+"""Task → the entries of a sample as a file has them, of its token and prediction."""
+
+
+class ShardWriter:
+    """Writes the folder of motion results, the manifest last."""
+
+    def __init__(
+        self,
+        folder: Path,
+        header: Mapping[str, Any],
+        *,
+        grid: BevGrid | None,
+        step: float,
+        labels: str | None,
+        store: Stored,
+    ) -> None:
+        """Write into an empty folder; the other arguments are those of ResultsWriter."""
+        self._folder, self._header = folder, header
+        self._grid, self._step, self._labels, self._store = grid, step, labels, store
+        self._frames = self._predictions = 0
+        self._shards: list[Shard] = []
+        self._archive: zipfile.ZipFile | None = None
+        self._in_shard: list[str] = []
+        (folder / "shards").mkdir()
+
+    def add(self, token: str, prediction: object) -> None:
+        """Write the prediction of a sample; raises ResultsError, and nothing of it is written then."""
+        output = self._checked(prediction)
+        arrays = self._arrays(output)
+        predictions, frames = next(iter(arrays.values())).shape[:2]
+        if self._frames not in (0, frames):
+            raise ResultsError(f"expected {self._frames} frames as of the samples before, found {frames}")
+        self._form(output.grid, predictions, frames)
+        self._grid, self._frames = output.grid, frames
+        self._predictions = max(self._predictions, predictions)
+        if self._archive is None:
+            self._archive = zipfile.ZipFile(self._folder / self._file, "w")
+        for name, array in arrays.items():
+            put_array(self._archive, MEMBER.format(token, name), array)
+        self._in_shard.append(token)
+        written = sum(entry.compress_size for entry in self._archive.infolist())
+        if len(self._in_shard) >= _MOST_SAMPLES or written >= _MOST_BYTES:
+            self._end_shard()
+
+    def finish(self) -> None:
+        """Write the manifest; raises ResultsError if nothing was added."""
+        self._end_shard()
+        if self._grid is None or not self._shards:
+            raise ResultsError("no prediction was added; results of no sample cannot be read")
+        told = {
+            **self._header,
+            "form": self._form(self._grid, self._predictions, self._frames).as_dict(),
+            "shards": msgspec.to_builtins(self._shards),
+        }
+        (self._folder / RESULTS_FILE).write_bytes(f"{json.dumps(told, indent=1)}\n".encode())
+
+    def close(self) -> None:
+        """Close the archive that is being written, if any."""
+        archive, self._archive = self._archive, None
+        if archive is not None:
+            archive.close()
+
+    @property
+    def _file(self) -> str:
+        return f"shards/{len(self._shards):05d}.npz"
+
+    def _form(self, grid: BevGrid, predictions: int, frames: int) -> MotionForm:
+        return MotionForm(
+            stored=self._store,
+            grid=grid,
+            predictions=predictions,
+            frames=frames,
+            step=self._step,
+            labels=self._labels,
+        )
+
+    def _checked(self, prediction: object) -> MotionOutput:
+        if not isinstance(prediction, MotionOutput):
+            raise ResultsError(
+                f"expected a MotionOutput, found {type(prediction).__name__}; make one with "
+                "MotionOutput.from_arrays(…), or of instance maps with instances_of(…)"
+            )
+        if self._grid not in (None, prediction.grid):
+            raise ResultsError(
+                f"expected a prediction on {self._grid}, found one on {prediction.grid}; write others to other results"
+            )
+        return prediction
+
+    def _arrays(self, output: MotionOutput) -> dict[str, AnyArray]:
+        if output.instances is not None and output.instances.min() < 0:
+            raise ResultsError(f"instances: expected ids from 1, and 0 elsewhere, found {output.instances.min()}")
+        if self._store == "instances":
+            return instance_arrays(output)
+        if output.heads is None:
+            raise ResultsError("expected heads, found instance maps; write those with store='instances'")
+        if any(heads.ignore_index is not None for heads in output.heads):
+            raise ResultsError(
+                "expected a model's heads, found those of labels, which hold values to ignore; write them with "
+                "store='instances'"
+            )
+        return head_arrays(output)
+
+    def _end_shard(self) -> None:
+        if self._archive is None:
+            return
+        self.close()
+        path = self._folder / self._file
+        self._shards.append(
+            Shard(
+                file=self._file,
+                tokens=tuple(self._in_shard),
+                bytes=path.stat().st_size,
+                checksum=file_checksum(path),
+            )
+        )
+        self._in_shard = []
+
+
+def head_arrays(output: MotionOutput) -> dict[str, AnyArray]:
+    """The heads of a prediction, each (K, T, channels, H, W) float32."""
+    heads = output.heads or ()
+    return {name: np.stack([getattr(each, name) for each in heads]) for name in HEADS}
+
+
+def instance_arrays(output: MotionOutput) -> dict[str, AnyArray]:
+    """The instance maps of a prediction; heads are post-processed for them."""
+    maps = output.instances
+    if maps is None:
+        maps = np.stack([predict_instances(each, "motion").instance for each in output.heads or ()])
+    highest = int(maps.max(initial=0))
+    dtype = np.uint8 if highest < 2**8 else np.uint16 if highest < 2**16 else np.int32
+    return {"instance": maps.astype(dtype)}
+
+
+def put_array(archive: zipfile.ZipFile, member: str, array: AnyArray) -> None:
+    """Add an array to an archive; the bytes do not depend on the time."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+    entry = zipfile.ZipInfo(member, _FIRST_DATE)
+    entry.external_attr = 0o644 << 16
+    maps_of_floats = array.dtype.kind == "f" and array.ndim > 3  # noise: deflating takes a second and saves nothing
+    way = zipfile.ZIP_STORED if maps_of_floats else zipfile.ZIP_DEFLATED
+    archive.writestr(entry, buffer.getvalue(), way, compresslevel=6)

@@ -5,7 +5,7 @@ says which differences of two are real.
 """
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
-from deepaccident_devkit.evaluation.runs.compare import ComparedNumber, Comparison, compare_bundles
+from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison, compare_bundles
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
     BREAKDOWNS,
     EvaluationRun,
@@ -17,12 +17,12 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     evaluate_results,
 )
 from deepaccident_devkit.evaluation.runs.many_samples import evaluation_store
-from deepaccident_devkit.evaluation.runs.prevention import prevented_accidents, with_prevented
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import Coverage, SampleSelection, coverage
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
 from deepaccident_devkit.evaluation.runs.verification import Difference, Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes
+from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "BREAKDOWNS",
@@ -56,3 +56,5 @@ __all__ = [
     "verify_bundle",
     "with_prevented",
 ]
+
+__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

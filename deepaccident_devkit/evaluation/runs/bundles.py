@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import stat
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
-from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
+from deepaccident_devkit.errors import MOST_TOLD, EvaluationError, ResultsError, shortened
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.results.header import check_token
+from deepaccident_devkit.evaluation.results.records import check_token
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
 from deepaccident_devkit.evaluation.runs.many_samples import remove_checkpoints
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
-from deepaccident_devkit.evaluation.runs.selection import SampleSelection
+from deepaccident_devkit.evaluation.runs.selection import SampleSelection, scenario_of
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.warning.recordings import GROUPS
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.support.json_text import Record, as_record, parsed_json
@@ -44,6 +47,9 @@ Line = Annotated[
     ),
 ]
 """A name, a path, a checksum: what shows in a terminal, in a line."""
+Chooser = Literal["best_f1", "quiet", "braking"]
+"""Which threshold of an evaluation is taken: of the best F1; of at most one second a minute in false alarm; or of at
+most one second a minute of braking for false alarms, which the evaluation of prevented accidents finds."""
 _REMEDY: Final = "give a folder that `deepaccident evaluate … --out` wrote, or evaluate again"
 
 
@@ -124,8 +130,7 @@ class Bundle(ShortRepr):
     @property
     def release_version(self) -> str:
         """`v1` or `v1-mini`."""
-        version: str = self.summary["release"]["version"]
-        return version
+        return str(self.summary["release"]["version"])
 
     @property
     def results_path(self) -> Path:
@@ -226,6 +231,43 @@ def read_bundle(folder: Path) -> Bundle:
     return Bundle(folder=folder, summary=summary, setup=setup, selection=selection)
 
 
+def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:
+    """The threshold for some samples that an evaluation of warnings of another split found best for who is involved.
+
+    A car does not know whether it will be involved, so that there is one threshold for all groups.
+
+    Raises:
+        ResultsError: there is no bundle.
+        EvaluationError: it is of another task or protocol, has a scenario of these samples or its twin, or found no
+            threshold.
+    """
+    bundle = read_bundle(folder)
+    kind = tuple(bundle.summary.get(name) for name in ("task", "protocol"))
+    if kind != ("warning", "clean"):
+        raise EvaluationError(
+            f"{folder}: is an evaluation of {' '.join(map(str, kind))}; expected one of warning, protocol clean"
+        )
+    own = {cluster_of(scenario) for scenario in bundle.scenarios()}
+    shared = sorted({scenario for scenario in map(scenario_of, tokens) if cluster_of(scenario) in own})
+    if shared:
+        raise EvaluationError(
+            f"{folder}: is an evaluation of {shared[0]} or its twin, too; a threshold that is chosen on the recordings "
+            "it is tried on flatters: give one of another split, such as train or val"
+        )
+    try:
+        groups: Mapping[str, Any] = bundle.summary["prevented" if by == "braking" else "metrics"]["groups"]
+        group = next((name for name in GROUPS if name in groups), None)
+        threshold = None if group is None else groups[group]["quiet_braking" if by == "braking" else by]
+    except (LookupError, TypeError) as error:
+        what, how = ("prevented accidents", " with --prevented") if by == "braking" else ("metrics of warnings", "")
+        raise ResultsError(f"{folder}: its summary has no {what}; evaluate again{how}") from error
+    if not isinstance(threshold, float) or not math.isfinite(threshold):
+        raise EvaluationError(
+            f"{folder}: found no threshold by {by}; choose another, or give one with --switch threshold=…"
+        )
+    return threshold
+
+
 def _stated(path: Path, form: str, kind: type[Record]) -> Record:
     """What one of a bundle's JSON files states; raises ResultsError."""
     return _record(path, read_json(path, form), kind)
@@ -290,10 +332,8 @@ def entries_in(folder: Path) -> dict[str, str | None]:
 def checksums_of(folder: Path, listed: Collection[str] | None = None) -> dict[str, str]:
     """File, as of `entries_in` → checksum, of all but the list of files itself.
 
-    Args:
-        folder: of a bundle.
-        listed: the files that are opened; a word stands for the checksum of others, of links, pipes, and of what cannot
-            be read. None for all files, of which there are no others.
+    Listed files are opened, or all if None; a word stands for the checksum of others, links, pipes, and what cannot be
+    read.
     """
     found = {}
     for name, irregular in entries_in(folder).items():
@@ -390,9 +430,7 @@ def _moved_aside(target: Path) -> Path | None:
     """Where an earlier bundle now lies, beside its place; None if there is none."""
     if not target.is_dir() or not any(target.iterdir()):
         return None
-    aside = temporary_path(target)
-    target.rename(aside)
-    return aside
+    return target.rename(temporary_path(target))
 
 
 def _write(run: EvaluationRun, folder: Path, *, include_results: bool) -> None:

@@ -7,7 +7,7 @@ import os
 import platform
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -39,7 +39,6 @@ from deepaccident_devkit.evaluation.runs.selection import (
     scenario_of,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
-from deepaccident_devkit.evaluation.warning import PreventedResult
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -166,8 +165,7 @@ class EvaluationRun:
         release: whose labels are the truth.
         results: whose predictions they are.
         sanity: what the sanity check says, as JSON holds it; None without.
-        prevented: of warnings, the accidents that they would have prevented, as one group `all` with intervals; None
-            without (`prevention.with_prevented`).
+        further: name → a further result (`further.with_further`), as one group `all` with intervals.
     """
 
     setup: EvaluationSetup
@@ -182,12 +180,17 @@ class EvaluationRun:
     results: ResultsInfo
     sanity: Mapping[str, Any] | None = None
     left_out: int = 0
-    prevented: Breakdown[PreventedResult] | None = None
+    further: Mapping[str, Breakdown[Any]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         """Task, protocol, whether it is partial, and the first headlines."""
         mark = "" if self.partial is None else f", {self.partial.text()}"
         return f"EvaluationRun({self.setup.task}, protocol {self.setup.protocol}{mark}: {self.result!r})"
+
+    @property
+    def prevented(self) -> Breakdown[Any] | None:
+        """Of warnings, the accidents that they would have prevented; None without (`with_prevented`)."""
+        return self.further.get("prevented")
 
     @property
     def stamp(self) -> dict[str, Any]:
@@ -256,7 +259,7 @@ class EvaluationRun:
                 **{name: installed_version(name) for name in _LIBRARIES},
             },
             "sanity": self.sanity,
-            **({} if self.prevented is None else {"prevented": _prevented(self.prevented)}),
+            **{name: _further(each) for name, each in self.further.items()},
         }
         plain_form: dict[str, Any] = json.loads(json.dumps(plain(made)))
         return plain_form
@@ -284,7 +287,7 @@ class EvaluationRun:
         ]
 
 
-def _prevented(given: Breakdown[PreventedResult]) -> dict[str, Any]:
+def _further(given: Breakdown[Any]) -> dict[str, Any]:
     (group,) = given.groups
     return {
         **group.result.as_dict(),

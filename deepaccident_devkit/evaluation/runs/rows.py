@@ -108,12 +108,9 @@ _VALUE_BYTES: Final = 32
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:
-    """Write rows; columns are those of any row, in the order met, null where a row has none.
+    """Write rows (texts, numbers, booleans or None, of one kind in a column), with a stamp for the metadata.
 
-    Args:
-        path: of the file.
-        rows: names → texts, numbers, booleans or None; of one kind in a column.
-        stamp: for the metadata.
+    Columns are those of any row, in the order met, null where a row has none.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -142,13 +139,10 @@ def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 def _table(content: bytes) -> Any:
     """The Arrow table in a Parquet file, whose values take no more memory than such a file may.
 
-    Texts stay in dictionaries until their lengths in all rows are known: a few bytes can stand for a long text in
-    millions of rows.
-
-    Raises:
-        OSError: it would take more.
-        ValueError: a column is of another kind than `write_rows` writes.
-        ArrowException: it is damaged.
+       Texts stay in dictionaries until their lengths in all rows are known: a few bytes can stand for a long text in
+       millions of rows.
+    Raises OSError (it would take more), ValueError (a column is of another kind than
+       `write_rows` writes) or ArrowException (it is damaged).
     """
     import pyarrow as pa
     import pyarrow.compute as pc

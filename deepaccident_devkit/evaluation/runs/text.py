@@ -1,6 +1,7 @@
-"""Texts of runs, bundles and results files; every block of a partial run says that it is partial.
+"""Texts of runs, bundles and results files, and the table of predictors that know nothing, for warnings.
 
-`reading_notes` are what a reader has to know before comparing the numbers with published ones.
+Every block of a partial run says that it is partial. `reading_notes` are what a reader has to know before comparing the
+numbers with published ones.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.runs.predictors import predictors_text
-from deepaccident_devkit.evaluation.runs.prevention import prevention_text
+from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
+from deepaccident_devkit.evaluation.warning.recordings import GIVEN
+from deepaccident_devkit.reports import Table
 from deepaccident_devkit.support.text import columns_text
 
 SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")
@@ -25,6 +27,30 @@ _PUBLISHED_CELLS: Final = [-50.0, 50.0, 0.5]
 _PUBLISHED_PREDICTIONS: Final = 6
 _FEW_PATHS: Final = 0.9
 """Share of true paths with a match below which errors of paths say little of the others."""
+_TOLD: Final = ("best_f1", "quiet")
+"""Thresholds that are told for another split."""
+_CLEAN_COLUMNS: Final[Mapping[str, str]] = {
+    "auc_ahead": "auc_ahead",
+    "twin_wins": "twin_wins",
+    "AP": "average_precision",
+    "mTTA": "mean_time",
+    "precision": "operating/precision",
+    "in alarm": "operating/time_in_alarm",
+    "s/min": "operating/alarm_seconds_per_minute",
+    "runs/min": "operating/episodes_per_minute",
+    "recall": "operating/recall",
+    "tta0": "operating/tta0",
+    "tta_hit": "operating/tta_hit",
+}
+"""Of the protocol `clean`. Recall and seconds never stand without precision and the time in alarm."""
+_PRINTED: Final = {"AP": "average_precision", "mTTA": "mean_time", "TTA@R80": "time_at_r80"}
+_AT_HALF: Final = {"P@0.5": "precision_at_half", "R@0.5": "recall_at_half", "TTA@0.5": "time_at_half"}
+_FIELD_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
+    "ustring": _PRINTED,
+    "dsta": _PRINTED | {"P@R80": "precision_at_r80"},
+    "drive": _PRINTED | _AT_HALF,
+    "dad": _PRINTED,
+}
 Json = Mapping[str, Any]
 
 
@@ -40,7 +66,7 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
         ("evaluated", _head(summary)),
         ("results", _headlines(summary)),
         *((("predictors", table),) if (table := predictors_text(summary["metrics"])) else ()),
-        *((("prevented accidents", prevention_text(part)),) if (part := summary.get("prevented")) else ()),
+        *((each.title, each.text(part)) for each, part in further_results(summary)),
         ("counts", "\n".join(_counts(summary["metrics"]))),
         *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
     ]
@@ -138,6 +164,52 @@ def _indented(text: str) -> str:
     return "\n".join(f"  {line}" for line in text.splitlines())
 
 
+def predictor_tables(metrics: Json) -> list[Table]:
+    """A table for each group of recordings, of the metrics in a summary of warnings; none without references."""
+    references: Mapping[str, Json] | None = metrics.get("references")
+    if not references:
+        return []
+    clean = "groups" in metrics
+    groups: Mapping[str, Json] = metrics["groups" if clean else "figures"]
+    tables = []
+    for group, given in groups.items():
+        everyone = {GIVEN: given, **{name: each[group] for name, each in references.items()}}
+        columns = _CLEAN_COLUMNS if clean else _FIELD_COLUMNS[group.partition(" ")[0]]
+        rows = [(name, *(_cell(figures, path) for path in columns.values())) for name, figures in everyone.items()]
+        notes = tuple(_operating(metrics, given)) if clean else ()
+        tables.append(Table(rows=((group, *columns), *rows), notes=notes))
+    return tables
+
+
+def predictors_text(metrics: Json) -> str:
+    """All tables of `predictor_tables`, as aligned lines; empty without any."""
+    return "\n\n".join(each.to_text() for each in predictor_tables(metrics))
+
+
+def _cell(figures: Json, path: str) -> str:
+    value: Any = figures
+    for name in path.split("/"):
+        value = value[name]
+    return number_text(value)
+
+
+def number_text(value: float | None) -> str:
+    """A number of a table; a dash for none."""
+    return "–" if value is None else f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def _operating(metrics: Json, given: Json) -> Iterator[str]:
+    operating, after = given["operating"], given["tta0_after"]
+    threshold = operating["threshold"]
+    found = "none" if threshold is None else f"{threshold:.4g}"
+    how = "given" if metrics["operating_by"] == "given" else "of recall 0.8, or the highest, on these recordings"
+    others = ", ".join(f"{name} {_cell(given, name)}" for name in _TOLD)
+    yield f"threshold {found} ({how}); for another split: {others}"
+    if after:
+        told = ", ".join(f"{latency} s: {'–' if left is None else f'{left:.3f} s'}" for latency, left in after.items())
+        yield f"tta0 if the two who collide are told after a latency of {told}"
+
+
 def results_text(results: Results) -> str:
     """A few aligned lines: whose predictions, of which samples, in which form."""
     tokens = results.tokens
@@ -160,11 +232,7 @@ def results_text(results: Results) -> str:
 
 
 def reading_notes(summary: Json) -> list[str]:
-    """Sentences on a summary's numbers: cells, frames and predictions that published numbers do not have, and others.
-
-    Args:
-        summary: as `EvaluationRun.summary` makes it and `metrics_summary.json` has it.
-    """
+    """Sentences on a summary's numbers: cells, frames and predictions that published ones do not have, and others."""
     form, metrics = summary["results"]["form"], summary["metrics"]
     notes = [] if form is None else [*_cells(form, metrics.get("ranges") or ()), *_frames(form, summary["horizon"])]
     released = summary["protocol"] == "released"

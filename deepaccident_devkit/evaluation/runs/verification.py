@@ -25,7 +25,7 @@ from deepaccident_devkit.evaluation.runs.bundles import (
     read_bundle,
 )
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, evaluate_results
-from deepaccident_devkit.evaluation.runs.prevention import with_prevented
+from deepaccident_devkit.evaluation.runs.further import further_names, with_further
 from deepaccident_devkit.evaluation.runs.rows import sample_rows
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -69,11 +69,7 @@ def differing(
 ) -> Iterator[tuple[str, Any, Any]]:
     """The paths at which two values differ that JSON can hold, and what is there; numbers must be exactly equal.
 
-    Args:
-        stored: one of them.
-        found: the other.
-        without: paths that do not count, with all below them.
-        path: of both.
+    `without` are paths that do not count, with all below them; `path` is that of both values.
     """
     if path in without:
         return
@@ -225,11 +221,13 @@ def _again(
         selection = replace(selection, split=os.fspath(split))
     partly = summary["partial"] is not None or bool(summary["counts"]["left_out"])
     run = evaluate_results(dataset, results, bundle.setup, selection, allow_partial=partly, **how)
-    breakdowns, prevented = summary["breakdowns"], summary.get("prevented")
+    breakdowns = summary["breakdowns"]
     how = {"workers": None, **how, "progress": False}
     if breakdowns:
         run = run.broken_down(list(breakdowns), _resampling(next(iter(breakdowns.values()))), **how)
-    return run if prevented is None else with_prevented(run, dataset, _resampling(prevented), **how)
+    for name in further_names(summary):
+        run = with_further(run, name, dataset, _resampling(summary[name]), **how)
+    return run
 
 
 def _resampling(part: Any) -> Resampling:

@@ -2,7 +2,7 @@
 
 from deepaccident_devkit.evaluation.warning.anticipation import AnticipationFigures, AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint
-from deepaccident_devkit.evaluation.warning.evaluator import WARNING_PROTOCOLS, PreventedEvaluator, WarningEvaluator
+from deepaccident_devkit.evaluation.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
 from deepaccident_devkit.evaluation.warning.field import (
     FieldFigures,
     FieldResult,
@@ -10,14 +10,8 @@ from deepaccident_devkit.evaluation.warning.field import (
     field_figures,
     printed_figures,
 )
-from deepaccident_devkit.evaluation.warning.prevention import (
-    AccidentOutcomes,
-    OutcomeTable,
-    PreventedResult,
-    PreventionCurve,
-    PreventionFigures,
-)
 from deepaccident_devkit.evaluation.warning.recordings import ScoreSeries
+from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "WARNING_PROTOCOLS",
@@ -40,3 +34,5 @@ __all__ = [
     "field_figures",
     "printed_figures",
 ]
+
+__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

@@ -18,15 +18,16 @@ import numpy as np
 
 from deepaccident_devkit.errors import ResultsError, shortened
 from deepaccident_devkit.evaluation import DetectedBoxes
-from deepaccident_devkit.evaluation.results.entries import (
-    Entries,
-    boxes_at,
-    detection_columns,
+from deepaccident_devkit.evaluation.results.reader import Entries, boxes_at, detection_columns
+from deepaccident_devkit.evaluation.results.records import (
+    FORMAT,
+    BoxEntry,
+    ContentError,
+    at,
     entry_place,
     read_entries,
+    shown,
 )
-from deepaccident_devkit.evaluation.results.header import ContentError, at, shown
-from deepaccident_devkit.evaluation.results.records import FORMAT, BoxEntry
 from deepaccident_devkit.export.frames import KEY_STEP
 from deepaccident_devkit.export.nuscenes.scenes import token
 from deepaccident_devkit.support.json_text import parsed_json

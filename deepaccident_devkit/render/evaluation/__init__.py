@@ -1,16 +1,17 @@
 """Figures of an evaluation, and the report with all of them. A panel's function takes `ax=` and returns the Axes."""
 
-from deepaccident_devkit.render.evaluation.accident import (
+from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
+from deepaccident_devkit.render.evaluation.panels import render_breakdown, render_comparison
+from deepaccident_devkit.render.evaluation.report import save_report
+from deepaccident_devkit.render.evaluation.tasks import (
     render_accuracy,
     render_alarms,
     render_errors,
+    render_precision_recall,
+    render_predictors,
+    render_quality_by_time,
 )
-from deepaccident_devkit.render.evaluation.detection import render_precision_recall
-from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
-from deepaccident_devkit.render.evaluation.motion import render_quality_by_time
-from deepaccident_devkit.render.evaluation.panels import render_breakdown, render_comparison
-from deepaccident_devkit.render.evaluation.report import save_report
-from deepaccident_devkit.render.evaluation.warning import render_predictors, render_prevention
+from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "draw_motion_outcome",
@@ -25,3 +26,5 @@ __all__ = [
     "render_quality_by_time",
     "save_report",
 ]
+
+__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

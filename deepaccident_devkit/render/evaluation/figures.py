@@ -27,11 +27,12 @@ from deepaccident_devkit.evaluation.runs.setups import SampleLoader
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.captions import draw_legend_of_fills, set_scene_title, set_title
-from deepaccident_devkit.render.evaluation import accident, detection, motion, warning
+from deepaccident_devkit.render.evaluation import tasks
 from deepaccident_devkit.render.evaluation.panels import PANEL, UNKNOWN, render_breakdown
 from deepaccident_devkit.render.figures import axes_or_new, detached_figure, titled_from_above, write_figure
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
 from deepaccident_devkit.render.styles import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR, in_own_settings
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -81,16 +82,7 @@ class RunFigure:
 
 
 def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
-    """Render a figure of a run into a PNG file, atomically, over one that is there.
-
-    Args:
-        run: of `evaluate_results`.
-        drawn: one of its figures.
-        folder: where; it is made if it is not there.
-
-    Returns:
-        The file's path.
-    """
+    """Render a figure of a run into a PNG file of a folder, atomically, over one that is there; returns its path."""
     said = {"Title": drawn.name, "Description": " ".join(filter(None, (_mark(run), _made_of(run))))}
     return write_figure(complete_figure(run, drawn), folder / f"{drawn.name}.png", dpi=_DPI, words=said)
 
@@ -115,8 +107,10 @@ def _mark(run: EvaluationRun) -> str:
 
 
 def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
-    """All figures of a run: those of its task, then breakdowns with several groups of which one has a number."""
-    own = _FIGURES[run.setup.task](run)
+    """All figures of a run: of its task, of further results, and of breakdowns with several groups and a number."""
+    own = [*_FIGURES[run.setup.task](run)]
+    for name, told in run.further.items():
+        own += added("figures", name)(told.groups[0].result)
     left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.setup.task == "warning" else ()))
     broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
     numbers = [path for path in MAIN_NUMBERS[run.setup.task] if _headline(run.setup.task, run.result, path) is not None]
@@ -130,33 +124,33 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
     evaluator, result = run.evaluator, run.result
     if not isinstance(evaluator, AccidentEvaluator):
         return
-    curve = "" if accident.has_alarms(evaluator) else " The released protocol counts only at these three distances."
+    curve = "" if tasks.has_alarms(evaluator) else " The released protocol counts only at these three distances."
     yield RunFigure(
         name="accuracy",
         caption=f"Accident prediction accuracy over the allowed distance; APA is the mean of the three points.{curve}",
-        alt=f"Accuracy {_listed((f'within {d:g} m', x.accuracy) for d, x in result.within.items())}.",
-        draw=partial(accident.render_accuracy, evaluator),
+        alt=f"Accuracy {listed((f'within {d:g} m', x.accuracy) for d, x in result.within.items())}.",
+        draw=partial(tasks.render_accuracy, evaluator),
     )
-    if not accident.has_alarms(evaluator):
+    if not tasks.has_alarms(evaluator):
         return
     yield RunFigure(
         name="position_errors",
         caption="Errors of the predicted positions, the sum over the two actors, in samples before an accident.",
         alt="Histogram of position errors in metres.",
-        draw=partial(accident.render_errors, evaluator, "position"),
+        draw=partial(tasks.render_errors, evaluator, "position"),
     )
     yield RunFigure(
         name="time_errors",
         caption="How late the predicted moments are, in samples before an accident.",
         alt="Histogram of time errors in seconds.",
-        draw=partial(accident.render_errors, evaluator, "time"),
+        draw=partial(tasks.render_errors, evaluator, "time"),
     )
     if hasattr(result, "average_precision"):
         yield RunFigure(
             name="alarms",
             caption="Precision over recall of the alarms, beginning with the surest alarm.",
-            alt=f"Precision over recall of alarms; {_listed([('average precision', result.average_precision)])}.",
-            draw=partial(accident.render_alarms, evaluator),
+            alt=f"Precision over recall of alarms; {listed([('average precision', result.average_precision)])}.",
+            draw=partial(tasks.render_alarms, evaluator),
         )
 
 
@@ -173,8 +167,8 @@ def _detection(run: EvaluationRun) -> Iterator[RunFigure]:
         yield RunFigure(
             name=f"precision_recall_{name}" + f"_{low:g}_{high:g}m" * several,
             caption=f"Precision over recall: {name}{where}, one line for each threshold ({unit}).",
-            alt=f"{name}{where}, average precision in percent: {_listed((f'{t:g}', x) for t, x in limits)}.",
-            draw=partial(detection.render_precision_recall, result, name, ring=ring),
+            alt=f"{name}{where}, average precision in percent: {listed((f'{t:g}', x) for t, x in limits)}.",
+            draw=partial(tasks.render_precision_recall, result, name, ring=ring),
         )
 
 
@@ -186,7 +180,7 @@ def _motion(run: EvaluationRun) -> Iterator[RunFigure]:
         name="quality_by_time",
         caption="Panoptic quality frame by frame, from the present to the horizon.",
         alt="Panoptic quality in percent over seconds from the present.",
-        draw=partial(motion.render_quality_by_time, run.evaluator, form.get("step", 0.5)),
+        draw=partial(tasks.render_quality_by_time, run.evaluator, form.get("step", 0.5)),
     )
 
 
@@ -198,18 +192,8 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
             caption="How well accidents are distinguished from other recordings, also by predictors that know nothing "
             "or only the present.",
             alt="Chance that an accident's score is above another recording's at the same moment, by predictor.",
-            draw=partial(warning.render_predictors, result),
+            draw=partial(tasks.render_predictors, result),
         )
-    for group in () if run.prevented is None else run.prevented.groups:
-        result = group.result
-        for name in result.groups:
-            yield RunFigure(
-                name=f"prevention_{name.replace(', ', '_')}",
-                caption=f"Share of the accidents that braking after the alarm avoids, against the braking for false "
-                f"alarms, as the threshold falls: {name}. The upright line is at one braking second a minute.",
-                alt=f"Share avoided over braking seconds a minute; {_listed([('avoided', result.avoided(name))])}.",
-                draw=partial(warning.render_prevention, result, name),
-            )
 
 
 _FIGURES: Final[dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]]] = {
@@ -243,7 +227,8 @@ def _headline(task: str, result: object, path: str) -> Headline | None:
     return next((each for each in headlines(task, result) if each.path == path), None)
 
 
-def _listed(values: Iterable[tuple[str, float | None]]) -> str:
+def listed(values: Iterable[tuple[str, float | None]]) -> str:
+    """Names with their values, with three digits, as the words of a figure."""
     known = [(name, None if value is None or math.isnan(value) else value) for name, value in values]
     return ", ".join(f"{name} {'–' if value is None else f'{value:.3g}'}" for name, value in known)
 
@@ -252,11 +237,6 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
     """The worst and the best samples of a run by its task's main number, the worst first.
 
     Samples with nothing to count are left out. The task `warning` has none, because it is about whole recordings.
-
-    Args:
-        run: of `evaluate_results`.
-        dataset: the release.
-        results: the predictions that were evaluated.
     """
     if run.setup.task == "warning":
         return ()

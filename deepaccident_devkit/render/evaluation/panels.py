@@ -54,16 +54,7 @@ class Bar:
 
 
 def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes:
-    """Render horizontal bars, the first on top, with their intervals as whiskers and their texts to the right.
-
-    Args:
-        bars: an unknown value has a dash in place of a bar.
-        ax: the axes to render on.
-        limit: the largest possible value; None for the largest of the bars.
-
-    Returns:
-        The axes.
-    """
+    """Render bars, the first on top, unknown values as dashes; the limit is the largest possible value, if known."""
     if not bars:
         return draw_nothing(ax)
     ends = [0.0]

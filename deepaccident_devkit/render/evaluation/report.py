@@ -16,10 +16,9 @@ from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.numbers import Headline, headlines
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
-from deepaccident_devkit.evaluation.runs.prevention import prevention_tables
+from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
-from deepaccident_devkit.evaluation.runs.text import reading_notes
+from deepaccident_devkit.evaluation.runs.text import predictor_tables, reading_notes
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, sample_figures, save_figure
 from deepaccident_devkit.render.evaluation.panels import UNKNOWN
 from deepaccident_devkit.render.styles import page_style
@@ -50,7 +49,6 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
     everything = next((each for each in run.breakdowns if each.by == EVERYTHING), None)
     group = everything.groups[0] if everything is not None and everything.groups else None
     percent = "" if everything is None else f"{100 * everything.resampling.confidence:g} % "
-    prevented = summary.get("prevented")
     same = {each.by: each.groups[0].value or UNKNOWN for each in run.breakdowns if len(each.groups) == 1}
     return {
         "title": f"{run.setup.task.capitalize()}, protocol {run.setup.protocol}",
@@ -63,8 +61,10 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
         "interval": f"{percent}interval",
         "interval_notes": () if group is None else group.notes,
         "predictors": predictor_tables(told),
-        "prevention": [] if prevented is None else prevention_tables(prevented),
-        "prevention_notes": [] if prevented is None else [*prevented["notes"], *prevented["interval_notes"]],
+        "further": {
+            each.title.capitalize(): (each.tables(part), [*part["notes"], *part["interval_notes"]])
+            for each, part in further_results(summary)
+        },
         "whole_numbers": {name: result_text(value) for name, value in told.items() if isinstance(value, int)},
         "said": [*(told.get("notes") or ()), *reading_notes(summary)],
         "counts": _counts(run.result, told),
@@ -209,11 +209,6 @@ def save_report(
 
 
 def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -> str:
-    """The complete page.
-
-    Args:
-        run: of `evaluate_results`.
-        figures: with their PNG files, which become part of the page.
-    """
+    """The complete page, of which the figures' PNG files become part."""
     pictures = [(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures]
     return document("evaluation_report.html", style=page_style(), pictures=pictures, **report_context(run))

@@ -14,7 +14,7 @@ from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.evaluation.detection import detection_truth
 from deepaccident_devkit.evaluation.results import read_results
-from deepaccident_devkit.evaluation.results.entries import detection_entries
+from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.export.nuscenes.detections import OTHER_CLASSES, results_from_nuscenes
 from deepaccident_devkit.export.nuscenes.scenes import token
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.results.entries import detection_entries
+from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 FIRST, SECOND, THIRD = plain.TOKENS

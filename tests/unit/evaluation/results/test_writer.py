@@ -58,11 +58,11 @@ class TestWriter:
         def full(*arguments: object, **options: object) -> None:
             raise OSError(28, "No space left on device")
 
-        where = "shards.put_array" if task == "motion" else "entries.EntryWriter.add"
+        where = "put_array" if task == "motion" else "EntryWriter.add"
         writer = ResultsWriter(tmp_path / "x", task)
         with pytest.raises(ResultsError, match="x: a prediction could not be written, so that none is kept"), writer:  # noqa: PT012
             writer.add(FIRST, PREDICTIONS[task]())
-            monkeypatch.setattr(f"deepaccident_devkit.evaluation.results.{where}", full)
+            monkeypatch.setattr(f"deepaccident_devkit.evaluation.results.writer.{where}", full)
             with pytest.raises(ResultsError, match=r"x: results cannot be written \(.*No space left.*make room"):
                 writer.add(SECOND, PREDICTIONS[task]())
             with pytest.raises(ResultsError, match="x: is not open"):

@@ -29,7 +29,7 @@ from deepaccident_devkit.evaluation.runs import (
     evaluate_results,
     save_run,
 )
-from deepaccident_devkit.evaluation.runs.compare import ComparedNumber, _text_row
+from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, _text_row
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 Write = Callable[..., Results]

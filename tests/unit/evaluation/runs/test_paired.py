@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.intervals import Resampling
-from deepaccident_devkit.evaluation.runs.paired import (
+from deepaccident_devkit.evaluation.runs.comparison import (
     PairedTest,
     Swaps,
     holm,

@@ -8,13 +8,9 @@ from typing import Any
 import pytest
 
 from deepaccident_devkit.errors import EvaluationError, ResultsError
-from deepaccident_devkit.evaluation.runs import predictors
-from deepaccident_devkit.evaluation.runs.predictors import (
-    chosen_threshold,
-    number_text,
-    predictor_tables,
-    predictors_text,
-)
+from deepaccident_devkit.evaluation.runs import bundles
+from deepaccident_devkit.evaluation.runs.bundles import chosen_threshold
+from deepaccident_devkit.evaluation.runs.text import number_text, predictor_tables, predictors_text
 
 TRAINED = "type1_subtype1_accident/Town01_000"
 OTHER = "type1_subtype1_normal/Town02_000/ego_vehicle/001"
@@ -94,7 +90,7 @@ def stored(monkeypatch: pytest.MonkeyPatch, **summary: Any) -> None:
     """A bundle with this summary, of one scenario."""
     whole = {"task": "warning", "protocol": "clean", **summary}
     bundle = SimpleNamespace(summary=whole, scenarios=lambda: {TRAINED: "hash"})
-    monkeypatch.setattr(predictors, "read_bundle", lambda _: bundle)
+    monkeypatch.setattr(bundles, "read_bundle", lambda _: bundle)
 
 
 @pytest.mark.parametrize(

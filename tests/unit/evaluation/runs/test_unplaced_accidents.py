@@ -15,12 +15,12 @@ from deepaccident_devkit.evaluation.alarms.truth import UNPLACED_NOTE
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results
-from deepaccident_devkit.evaluation.runs.prevention import prevention_evaluator
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render.outcomes.above import difference_words
 from deepaccident_devkit.render.outcomes.evaluation import sample_verdict
 from deepaccident_devkit.safety import describe
+from deepaccident_devkit.safety.prevention import prevention_evaluator
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x.collisions import default_scenario
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from deepaccident_devkit.evaluation import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.render.evaluation import render_accuracy, render_alarms, render_errors
-from deepaccident_devkit.render.evaluation.accident import accuracy_by_distance, alarm_precision_recall
+from deepaccident_devkit.render.evaluation.tasks import accuracy_by_distance, alarm_precision_recall
 
 LEFT_OUT = {"unjudged": 0, "beyond": 0, "at_impact": False, "unplaced": False}
 

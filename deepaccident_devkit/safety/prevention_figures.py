@@ -1,20 +1,22 @@
-"""Warning results as pictures: how well accidents are distinguished, and what braking after an alarm prevents."""
+"""Prevented accidents as pictures: the share avoided over the braking seconds a minute, group by group."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.warning import AnticipationResult, PreventedResult
-from deepaccident_devkit.evaluation.warning.prevention import BUDGET, NOMINAL, SETTINGS
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
 from deepaccident_devkit.render.captions import draw_legend, set_title
 from deepaccident_devkit.render.chips import place_chips
-from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+from deepaccident_devkit.render.evaluation.figures import RunFigure, listed
+from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
 from deepaccident_devkit.render.figures import axes_or_new, with_light_grid
 from deepaccident_devkit.render.styles import ESTIMATE_COLOR, GRID_COLOR, MUTED_COLOR, TRUE_PLACE_COLOR, in_own_settings
+from deepaccident_devkit.safety.prevention_result import BUDGET, NOMINAL, SETTINGS, PreventedResult
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -24,35 +26,16 @@ _MOST: Final = 60.0
 """Braking seconds a minute."""
 
 
-@in_own_settings
-def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> Axes:
-    """Render how well accidents are distinguished from other recordings before they happen, and reference predictors.
-
-    Args:
-        result: of `WarningEvaluator("clean").compute`.
-        ax: axes to render on; new ones if None.
-
-    Returns:
-        The axes, for the first group of recordings: one bar for each predictor, and a line at 0.5, which is chance.
-    """
-    ax, group = axes_or_new(ax, PANEL), next(iter(result.groups), None)
-    if group is None:
-        return draw_nothing(ax, "no recording")
-    everyone = {"given": result.groups[group], **{name: each[group] for name, each in result.references.items()}}
-    bars = [
-        Bar(
-            label=name,
-            value=None if math.isnan(each.auc_ahead) else each.auc_ahead,
-            text=f"{each.auc_ahead:.3f}",
-            color=ESTIMATE_COLOR if name == "given" else TRUE_PLACE_COLOR,
+def prevention_figures(result: PreventedResult) -> Iterator[RunFigure]:
+    """The figures of a run: one for each group."""
+    for name in result.groups:
+        yield RunFigure(
+            name=f"prevention_{name.replace(', ', '_')}",
+            caption=f"Share of the accidents that braking after the alarm avoids, against the braking for false "
+            f"alarms, as the threshold falls: {name}. The upright line is at one braking second a minute.",
+            alt=f"Share avoided over braking seconds a minute; {listed([('avoided', result.avoided(name))])}.",
+            draw=partial(render_prevention, result, name),
         )
-        for name, each in everyone.items()
-    ]
-    ax = draw_bars(bars, ax, 1.0)
-    ax.axvline(0.5, color="black", linestyle="--", linewidth=1)
-    ax.set(xlabel="chance that an accident's score is above\nanother recording's at the same moment")
-    set_title(ax, f"Accidents distinguished from other recordings\n{group}", fontsize="medium")
-    return ax
 
 
 @in_own_settings

@@ -6,9 +6,9 @@ from drawing import new_axes, words
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation.warning import PreventedResult, PreventionCurve, PreventionFigures
-from deepaccident_devkit.evaluation.warning.prevention import NOMINAL, SETTINGS, OutcomeFigures
 from deepaccident_devkit.render.evaluation import render_prevention
 from deepaccident_devkit.safety import OUTCOMES
+from deepaccident_devkit.safety.prevention_result import NOMINAL, SETTINGS, OutcomeFigures
 
 GROUP = "bystander"
 

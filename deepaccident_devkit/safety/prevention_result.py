@@ -227,15 +227,7 @@ class ScoredEnds:
         outcomes: Mapping[str, OutcomeTable],
         draw: int = 0,
     ) -> None:
-        """Count what figures at any threshold need.
-
-        Args:
-            drives: the recordings.
-            predictor: of `PREDICTORS`.
-            scores_of: whose alarms count where somebody collides.
-            outcomes: recording → how its accident ends; accidents without a table are not judged.
-            draw: of a random predictor.
-        """
+        """Count what figures at any threshold need; accidents without a table are not judged."""
         self._series = series_of(drives, predictor, scores_of, draw)
         self.part = np.array([each.part for each in drives], dtype=np.int64)
         judged = [each.kind == "accident" and each.name in outcomes for each in drives]
@@ -285,12 +277,9 @@ class ScoredEnds:
         return float(self.levels[place]) if place < len(self.levels) else math.inf
 
     def ends(self, threshold: float, weight: FloatArray, *, lasting: bool = False) -> Ends:
-        """Latency → setting → figures at a threshold; all NaN at NaN.
+        """Latency → setting → figures at a threshold, with (N,) weights of the recordings; all NaN at NaN.
 
-        Args:
-            threshold: the lowest score that is an alarm.
-            weight: (N,) how often each recording counts.
-            lasting: whether alarms warn only if they outlast the reaction time.
+        If `lasting`, alarms warn only if they outlast the reaction time.
         """
         unknown = math.isnan(threshold)
         alarms = self._at(math.inf if unknown else threshold)

@@ -23,11 +23,11 @@ from deepaccident_devkit.evaluation import (
     accident_context,
 )
 from deepaccident_devkit.evaluation.runs import prevented_accidents, with_prevented
-from deepaccident_devkit.evaluation.runs.prevention import accident_outcomes, prevention_tables, prevention_text
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.evaluation.warning.prevention import NOMINAL, SETTINGS
 from deepaccident_devkit.evaluation.warning.recordings import REFERENCES
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, accident_of, outcomes_of
+from deepaccident_devkit.safety.prevention import PREVENTED, accident_outcomes, prevention_tables
+from deepaccident_devkit.safety.prevention_result import NOMINAL, SETTINGS
 
 EVERYONE = ("ego_vehicle", "other_vehicle_behind", "infrastructure")
 
@@ -123,7 +123,7 @@ def test_the_tables_say_what_the_result_does(da_motion: DeepAccident, crash: str
     given = result.groups["ego_involved"]
     cells = [*given.right[0.0][NOMINAL].shares.values(), given.lasting[0.0][NOMINAL].shares["avoided"]]
     assert [float(each) for each in tables[0].rows[1][1:7]] == pytest.approx(cells, abs=5e-4)
-    text = prevention_text(told)
+    text = PREVENTED.text(told)
     assert re.search(r"of 1 accidents \(\d\.\d{3} by alarms that outlast the reaction\), for ", text)
     assert "at most 1 braking s/min on these recordings" in text
     assert text.endswith("--threshold-from BUNDLE --threshold-by braking")

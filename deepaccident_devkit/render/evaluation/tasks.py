@@ -1,24 +1,39 @@
-"""Accident results as pictures: accuracy over the allowed distance, errors, and alarms by their score."""
+"""The panels of each task: quality by time, accuracy, errors and alarms, precision over recall, predictors."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
+from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.scoring import DISTANCES, ERRORS_AT, Alarm, hit_of
+from deepaccident_devkit.evaluation.detection import DetectionResult
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.motion.evaluator import RANGES
+from deepaccident_devkit.evaluation.motion.overlaps import panoptic_quality
+from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.render.boxes import write_beside
 from deepaccident_devkit.render.captions import set_title
-from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free
+from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
 from deepaccident_devkit.render.figures import axes_or_new, with_light_grid
-from deepaccident_devkit.render.styles import ESTIMATE_COLOR, GRID_COLOR, in_own_settings
+from deepaccident_devkit.render.styles import (
+    ESTIMATE_COLOR,
+    GRID_COLOR,
+    SERIES_COLORS,
+    TRUE_PLACE_COLOR,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +42,46 @@ _FARTHEST: Final = 20.0
 """Metres: where the axis of the allowed distance ends."""
 _TIME_EDGES: Final = np.arange(-2.25, 2.3, 0.5)
 """Seconds: each bin has half a second, and the middle bin is around no error."""
+_DASHES: Final = ("-", "--", "-.", ":")
+"""Styles that distinguish lines even in print without colours."""
+
+
+@in_own_settings
+def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax: Axes | None = None) -> Axes:
+    """Render the panoptic quality of each future frame, one line for each range.
+
+    Args:
+        evaluator: with samples counted.
+        step: seconds from frame to frame.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes, in percent over seconds from the present. The quality in the result is computed from the sums over
+        all frames.
+    """
+    ax, counts = axes_or_new(ax, PANEL), evaluator.counts.values()
+    set_title(ax, "Panoptic quality by time ahead", fontsize="medium")
+    frames = max((each["frames"] for each in counts), default=0)
+    if not frames:
+        return draw_nothing(ax)
+    given = [each["vpq"] for each in counts]
+    for index, (name, color) in enumerate(zip(RANGES, cycle(SERIES_COLORS[1:]), strict=False)):
+        quality = [_quality([each[index] for each in given], frame) for frame in range(frames)]
+        ax.plot([step * frame for frame in range(frames)], quality, marker="o", color=color, label=f"{name} m")
+    ax.set(xlabel="seconds from the present", ylabel="PQ (%)", ylim=(0, 104))
+    ax.set_xticks([step * frame for frame in range(frames)])
+    ax.legend(fontsize=SMALLEST_TEXT, loc="lower left")
+    return with_light_grid(ax, "y")
+
+
+def _quality(samples: list[list[list[float]]], frame: int) -> float:
+    """PQ in percent of one frame, from the four lists by frame of each sample; NaN without any instance."""
+    there = [[values[frame] for values in each] for each in samples if frame < len(each[0])]
+    overlap, *numbers = (math.fsum(each[kind] for each in there) for kind in range(4))
+    found, false, missed = map(int, numbers)
+    if not found + false + missed:
+        return math.nan
+    return 100 * panoptic_quality(overlap, found, false, missed).pq
 
 
 @in_own_settings
@@ -115,18 +170,11 @@ def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Ax
 
 
 def accuracy_by_distance(evaluator: AccidentEvaluator, distances: FloatArray) -> FloatArray | None:
-    """The accident accuracy at each of some allowed distances; at the official ones it is the result's.
+    """(D,) tp / (tp + fp / 2 + fn / 2) at D allowed distances in metres; NaN if nothing is counted.
 
-    Args:
-        evaluator: with samples counted.
-        distances: (D,) metres.
-
-    Returns:
-        (D,) tp / (tp + fp / 2 + fn / 2), NaN if nothing is counted; None if the protocol's counts do not hold how
-        far off each alarm is.
+    At the official ones it is the result's. None if the protocol's counts do not hold how far off each alarm is.
     """
-    protocol = evaluator.protocol
-    if not isinstance(protocol, BoxAccidents | PaperAccidents):
+    if not has_alarms(evaluator):
         return None
     samples = _samples(evaluator)
     accuracy = []
@@ -147,14 +195,9 @@ def has_alarms(evaluator: AccidentEvaluator) -> bool:
 
 
 def errors_of_first(evaluator: AccidentEvaluator, error: Literal["position", "time"]) -> FloatArray:
-    """How far off the most important alarm of each sample before an accident is, without a limit.
+    """(N,) how far off (metres, or seconds too late) the most important alarm is, of N samples before an accident.
 
-    Args:
-        evaluator: with samples counted.
-        error: of `position`, metres, or of `time`, seconds, positive if the alarm is for later.
-
-    Returns:
-        (N,) in the order of the samples' tokens; samples without an alarm are left out.
+    They are in the order of their tokens; samples without an alarm are left out.
     """
     firsts = [alarms[0][error] for positive, alarms in _samples(evaluator) if positive and alarms]
     return np.array([value for value in firsts if value is not None], dtype=np.float64)
@@ -194,3 +237,80 @@ def _alarms(protocol: Any, sample: Counts) -> Sequence[Alarm]:
         return [compared] if compared else []
     alarms: Sequence[Alarm] = sample["alarms"]
     return alarms
+
+
+@in_own_settings
+def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0, ax: Axes | None = None) -> Axes:
+    """Render precision over recall of one class, one line for each threshold.
+
+    Args:
+        result: of `DetectionEvaluator.compute`.
+        name: one of its classes.
+        ring: which of its ranges.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes; a line ends where the recall does, and its label says the average precision.
+
+    Raises:
+        ChoiceError: no such class, or no such range.
+    """
+    name = choice("name", name, result.classes)
+    if ring not in range(len(result.ranges)):
+        raise ChoiceError(f"ring: expected 0 to {len(result.ranges) - 1}, found {ring!r}")
+    ax, row = axes_or_new(ax, PANEL), result.classes.index(name)
+    truths, found = int(result.truths[row, ring]), int(result.detections[row, ring])
+    set_title(ax, f"{name}: {truths:,} true, {found:,} detected{_ring_text(result, ring)}", fontsize="medium")
+    if not truths:
+        return draw_nothing(ax, "none in the truth")
+    count = result.thresholds.shape[1]
+    styles = zip(cycle(SERIES_COLORS), cycle(_DASHES))
+    for level, (threshold, (color, dash)) in enumerate(zip(result.thresholds[row].tolist(), styles, strict=False)):
+        precision, recall = result.precision[row, ring, level], result.recall[row, ring, level]
+        reached = np.isfinite(recall) & (precision > 0)
+        average = float(result.average_precision[row, ring, level])
+        label = f"{threshold:g}: AP {average:.1f} %" if math.isfinite(average) else f"{threshold:g}: –"
+        width = 1.2 + 0.8 * (count - 1 - level)  # so that all of several equal curves are seen
+        ax.plot(recall[reached], precision[reached], dash, color=color, label=label, linewidth=width)
+    ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
+    ax.legend(title="threshold", fontsize=SMALLEST_TEXT, title_fontsize=SMALLEST_TEXT, loc="best")
+    return with_light_grid(ax, "both")
+
+
+def _ring_text(result: DetectionResult, ring: int) -> str:
+    """Which range it is, where there are several."""
+    if len(result.ranges) == 1:
+        return ""
+    low, high = result.ranges[ring].tolist()
+    return f", {low:g} to {high:g} m"
+
+
+@in_own_settings
+def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> Axes:
+    """Render how well accidents are distinguished from other recordings before they happen, and reference predictors.
+
+    Args:
+        result: of `WarningEvaluator("clean").compute`.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes, for the first group of recordings: one bar for each predictor, and a line at 0.5, which is chance.
+    """
+    ax, group = axes_or_new(ax, PANEL), next(iter(result.groups), None)
+    if group is None:
+        return draw_nothing(ax, "no recording")
+    everyone = {"given": result.groups[group], **{name: each[group] for name, each in result.references.items()}}
+    bars = [
+        Bar(
+            label=name,
+            value=None if math.isnan(each.auc_ahead) else each.auc_ahead,
+            text=f"{each.auc_ahead:.3f}",
+            color=ESTIMATE_COLOR if name == "given" else TRUE_PLACE_COLOR,
+        )
+        for name, each in everyone.items()
+    ]
+    ax = draw_bars(bars, ax, 1.0)
+    ax.axvline(0.5, color="black", linestyle="--", linewidth=1)
+    ax.set(xlabel="chance that an accident's score is above\nanother recording's at the same moment")
+    set_title(ax, f"Accidents distinguished from other recordings\n{group}", fontsize="medium")
+    return ax

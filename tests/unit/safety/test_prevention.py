@@ -20,9 +20,9 @@ from deepaccident_devkit.evaluation.warning import (
     PreventedResult,
     anticipation,
 )
-from deepaccident_devkit.evaluation.warning.prevention import NOMINAL, SETTINGS
 from deepaccident_devkit.evaluation.warning.recordings import REFERENCES, TRIVIAL
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Skipped
+from deepaccident_devkit.safety.prevention_result import NOMINAL, SETTINGS
 
 FRAMES = np.arange(1, 62, 5)
 IMPACT = 61
