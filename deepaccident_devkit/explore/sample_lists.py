@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.evaluation.breakdowns import SampleAttributes, attribute_name, sample_attributes
-from deepaccident_devkit.evaluation.runs.selection import scenario_of
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.choices import MOST_WORD
 from deepaccident_devkit.explore.models import standings_job

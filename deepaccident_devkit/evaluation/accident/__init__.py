@@ -11,9 +11,14 @@ from deepaccident_devkit.evaluation.accident.evaluator import (
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents
 from deepaccident_devkit.evaluation.accident.scoring import DISTANCES, AccidentResult, AccidentsWithin
-from deepaccident_devkit.evaluation.alarms.raised import foreseen_accident
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext, BoxTruth, accident_context, box_truth
+from deepaccident_devkit.evaluation.accident_truth import (
+    AccidentContext,
+    BoxTruth,
+    accident_context,
+    box_truth,
+    foreseen_accident,
+)
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.predictions import Prediction
 
 __all__ = [

@@ -26,10 +26,18 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.alarms.raised import Pair, named_alarms, position_difference, within_horizon
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.alarms.truth import SLACK, UNPLACED_NOTE, AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.accident_truth import (
+    SLACK,
+    UNPLACED_NOTE,
+    AccidentContext,
+    BoxTruth,
+    Pair,
+    named_alarms,
+    position_difference,
+    within_horizon,
+)
 from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 

@@ -14,11 +14,10 @@ from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents, surest_within
 from deepaccident_devkit.evaluation.accident.released import DrawnPaths, ReleasedAccidents, collision, padded_paths
 from deepaccident_devkit.evaluation.accident.scoring import AccidentResult
-from deepaccident_devkit.evaluation.alarms.raised import named_alarms
-from deepaccident_devkit.evaluation.alarms.reading import InstanceAccident, accident_of
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext, checked_facts
-from deepaccident_devkit.evaluation.choices import protocol_of
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext, checked_facts, named_alarms
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.instances import longest
+from deepaccident_devkit.evaluation.map_accidents import InstanceAccident, accident_of
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,
@@ -27,7 +26,7 @@ from deepaccident_devkit.evaluation.predictions import (
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.trajectories import longest
+from deepaccident_devkit.evaluation.task import protocol_of
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.taxonomy import FRAME_PERIOD

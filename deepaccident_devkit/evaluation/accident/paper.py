@@ -21,16 +21,21 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.alarms.raised import MATCH_DISTANCE, by_sureness, nearest_two, position_difference
-from deepaccident_devkit.evaluation.alarms.reading import (
+from deepaccident_devkit.evaluation.accident_truth import (
+    MATCH_DISTANCE,
+    AccidentContext,
+    by_sureness,
+    nearest_two,
+    position_difference,
+)
+from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
     InstanceAccident,
     accident_of,
     instances_of_heads,
     match_tracks,
 )
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,

@@ -26,9 +26,9 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.alarms.raised import position_difference
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext, position_difference
 from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.instances import Paths, instance_paths, longest, match_trajectories, padded
 from deepaccident_devkit.evaluation.predictions import (
     MotionOutput,
     Prediction,
@@ -38,7 +38,6 @@ from deepaccident_devkit.evaluation.predictions import (
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.trajectories import Paths, instance_paths, longest, match_trajectories, padded
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     MotionHeads,

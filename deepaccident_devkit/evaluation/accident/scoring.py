@@ -10,10 +10,10 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.alarms.reading import TIE, even
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
-from deepaccident_devkit.evaluation.numbers import TaskResult
+from deepaccident_devkit.evaluation.map_accidents import TIE, even
+from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.support.arrays import BoolArray, ShortRepr
 
@@ -69,6 +69,18 @@ class AccidentResult(TaskResult):
     """
 
     task: ClassVar[str] = "accident"
+    rows: ClassVar[tuple[Row, ...]] = (
+        Row("apa", "apa", "share", "higher"),
+        Row("precision", "precision", "share", "higher"),
+        Row("recall", "recall", "share", "higher"),
+        Row("false_alarm_rate", "false_alarm_rate", "share"),
+        Row("average_precision", "average_precision", "share", "higher"),
+        Row("within/*/accuracy", "accuracy@*", "share", "higher"),
+        Row("id_error", "id_error", "share"),
+        Row("position_error", "position_error", "m"),
+        Row("time_error", "time_error", "s"),
+        Row("lateness", "lateness", "s", "neither"),
+    )
     within: Mapping[float, AccidentsWithin]
     apa: float
     id_error: float | None

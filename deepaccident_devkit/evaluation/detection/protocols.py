@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.evaluation.choices import as_tuples, protocol_of, switched
+from deepaccident_devkit.evaluation.task import as_tuples, protocol_of, switched
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES, SMALL_CATEGORIES
 

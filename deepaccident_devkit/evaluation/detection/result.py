@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from deepaccident_devkit.evaluation.detection.matching import ERRORS
-from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings, plain
-from deepaccident_devkit.evaluation.numbers import TaskResult
+from deepaccident_devkit.evaluation.task import FrozenMappings, Row, TaskResult, plain
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 
 
@@ -39,6 +38,14 @@ class DetectionResult(TaskResult, FrozenArrays):
     """
 
     task: ClassVar[str] = "detection"
+    rows: ClassVar[tuple[Row, ...]] = (
+        Row("mean_average_precision", "mAP", "%", "higher"),
+        Row("mean_errors/ATE", "mATE", "m"),
+        Row("mean_errors/ASE", "mASE", "1 - overlap"),
+        Row("mean_errors/AOE", "mAOE", "rad"),
+        Row("mean_errors/AVE", "mAVE", "m/s"),
+        Row("class_average_precision/*", "AP *", "%", "higher"),
+    )
     mean_average_precision: float
     class_average_precision: Mapping[str, float]
     mean_errors: Mapping[str, float]

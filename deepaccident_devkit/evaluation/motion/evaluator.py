@@ -8,16 +8,19 @@ from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
-from deepaccident_devkit.evaluation.choices import protocol_of
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
-from deepaccident_devkit.evaluation.motion.overlaps import (
+from deepaccident_devkit.evaluation.instances import (
     SegmentationCounts,
+    instance_paths,
     iou,
+    longest,
     mask_counts,
+    match_trajectories,
+    padded,
     panoptic_quality,
+    trajectory_errors,
     vpq_counts,
 )
-from deepaccident_devkit.evaluation.numbers import TaskResult
 from deepaccident_devkit.evaluation.predictions import (
     MotionOutput,
     cells_within,
@@ -28,13 +31,7 @@ from deepaccident_devkit.evaluation.predictions import (
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.trajectories import (
-    instance_paths,
-    longest,
-    match_trajectories,
-    padded,
-    trajectory_errors,
-)
+from deepaccident_devkit.evaluation.task import Row, TaskResult, protocol_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -131,6 +128,13 @@ class MotionResult(TaskResult):
     """
 
     task: ClassVar[str] = "motion"
+    rows: ClassVar[tuple[Row, ...]] = (
+        Row("ranges/*/iou", "iou *", "%", "higher"),
+        Row("ranges/*/pq", "vpq *", "%", "higher"),
+        Row("min_ade", "min_ade", "m"),
+        Row("min_fde", "min_fde", "m"),
+        Row("miss_rate", "miss_rate", "share"),
+    )
     ranges: Mapping[str, RangeResult]
     min_ade: float
     min_fde: float

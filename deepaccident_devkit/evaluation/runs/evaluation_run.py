@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,25 +24,25 @@ from deepaccident_devkit.evaluation.breakdowns import (
     breakdown,
     sample_attributes,
 )
-from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.frozen_mappings import plain
+from deepaccident_devkit.evaluation.evaluator import Evaluator, evaluate_samples
 from deepaccident_devkit.evaluation.intervals import Resampling
-from deepaccident_devkit.evaluation.numbers import headlines
 from deepaccident_devkit.evaluation.results import Results, read_results
-from deepaccident_devkit.evaluation.runs.many_samples import checkpoint_path, evaluate_samples
-from deepaccident_devkit.evaluation.runs.selection import (
+from deepaccident_devkit.evaluation.runs.setups import (
     Coverage,
+    EvaluationSetup,
     SampleList,
+    SampleLoader,
     SampleSelection,
     ScopeName,
     coverage,
     scenario_of,
 )
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.task import headlines, plain
 from deepaccident_devkit.evaluation.warning import PreventedResult
-from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
+from deepaccident_devkit.parallel import Store, run_batch, unfinished_folder
+from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint, scenario_hashes
 from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import path_of, remove_in
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
@@ -446,3 +446,49 @@ def _partial(covered: Coverage) -> Partial | None:
         expected=covered.expected,
         evaluated=covered.expected - missing,
     )
+
+
+_COUNTS = "counts"
+
+
+def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
+    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
+
+    `command` says which evaluation that is.
+    """
+    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
+
+
+def checkpoint_path(
+    out: str | os.PathLike[str],
+    setup: EvaluationSetup,
+    tokens: Collection[str],
+    fingerprints: Mapping[str, str],
+) -> Path:
+    """The folder beside `out` in which such a run keeps its counts.
+
+    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
+    and another devkit have another folder, and so never go on with these counts.
+
+    Args:
+        out: the folder that the finished evaluation goes to.
+        setup: task and rules.
+        tokens: the samples.
+        fingerprints: of the predictions and of the labels.
+    """
+    name = digest_of(
+        {
+            "devkit": __version__,
+            "setup": setup.as_dict(),
+            "tokens": sorted(tokens),
+            "fingerprints": dict(fingerprints),
+        }
+    )
+    return evaluation_store(out).folder / _COUNTS / name
+
+
+def remove_checkpoints(out: str | os.PathLike[str]) -> None:
+    """Remove all such folders beside `out`, once what they were for is written."""
+    store = evaluation_store(out)
+    remove_in(store.folder, _COUNTS)
+    store.remove()

@@ -16,8 +16,13 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.intervals import Clusters, Resampling, difference_intervals, numbers_of_draws
-from deepaccident_devkit.evaluation.numbers import has_interval
+from deepaccident_devkit.evaluation.intervals import (
+    Clusters,
+    Resampling,
+    difference_intervals,
+    has_interval,
+    numbers_of_draws,
+)
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 
 _ROUNDING: Final = 1e-9

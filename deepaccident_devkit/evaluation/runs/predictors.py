@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.runs.bundles import read_bundle
-from deepaccident_devkit.evaluation.runs.selection import scenario_of
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN, GROUPS
 from deepaccident_devkit.reports import Table
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.predictors import predictors_text
 from deepaccident_devkit.evaluation.runs.prevention import prevention_text
-from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
+from deepaccident_devkit.evaluation.runs.setups import agent_of, scenario_of
 from deepaccident_devkit.support.text import columns_text
 
 SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")

@@ -14,10 +14,10 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext, checked_facts
-from deepaccident_devkit.evaluation.choices import protocol_of
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext, checked_facts
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.predictions import Prediction
+from deepaccident_devkit.evaluation.task import protocol_of
 from deepaccident_devkit.evaluation.warning.anticipation import (
     AnticipationResult,
     CleanWarnings,

@@ -15,7 +15,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import ratio
-from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.task import FrozenMappings
 from deepaccident_devkit.evaluation.warning.recordings import MINUTE, AlarmRuns, Drive, ScoresOf, series_of
 from deepaccident_devkit.safety import BRAKINGS, OUTCOMES, Braking, Skipped
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr

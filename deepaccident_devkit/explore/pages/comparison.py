@@ -13,8 +13,8 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation.numbers import value_text
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison, compare_bundles
+from deepaccident_devkit.evaluation.task import value_text
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.evaluations import Evaluated, evaluated, verdict
 from deepaccident_devkit.explore.models import Model, Score, scores_of, standings

@@ -13,8 +13,7 @@ from starlette.routing import Route
 
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError, TokenError
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
-from deepaccident_devkit.evaluation.runs.setups import SampleLoader
+from deepaccident_devkit.evaluation.runs.setups import SampleLoader, agent_of, scenario_of
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.evaluations import finite, other_values, verdict
 from deepaccident_devkit.explore.explorer import Explorer

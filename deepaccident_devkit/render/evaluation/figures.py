@@ -19,11 +19,11 @@ from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, WITHIN_RECORDI
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
 from deepaccident_devkit.evaluation.motion.evaluator import MotionEvaluator
-from deepaccident_devkit.evaluation.numbers import Headline, headlines
 from deepaccident_devkit.evaluation.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader
+from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axes_or_new, detached_figure, titled_from_above
