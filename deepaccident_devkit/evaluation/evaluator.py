@@ -312,7 +312,8 @@ def evaluate_samples(
         for token, fault in faults.items():
             fault.__cause__ = None if failed else fault.__cause__  # it holds what was being loaded
             failed[token] = fault
-    _check_failed([failed[token] for token in samples if token in failed], len(left))
+    if failed:
+        raise _fault_of_all([failed[token] for token in samples if token in failed], len(left))
     return evaluator
 
 
@@ -372,14 +373,14 @@ def _fault(
     return None
 
 
-def _check_failed(failed: Sequence[EvaluationError], samples: int) -> None:
-    """Raise EvaluationError if samples have failed: that of the only one, or a list of all."""
+def _fault_of_all(failed: Sequence[EvaluationError], samples: int) -> EvaluationError:
+    """The error of the only one that has failed, or of a list of all."""
     if len(failed) == 1:
-        raise failed[0]
-    if failed:
-        cause = next((each.__cause__ for each in failed if each.__cause__ is not None), None)
-        lines = [f"{len(failed)} of {samples} samples cannot be evaluated:", *(f"  {each}" for each in failed)]
-        raise EvaluationError("\n".join(lines)) from cause
+        return failed[0]
+    lines = [f"{len(failed)} of {samples} samples cannot be evaluated:", *(f"  {each}" for each in failed)]
+    fault = EvaluationError("\n".join(lines))
+    fault.__cause__ = next((each.__cause__ for each in failed if each.__cause__ is not None), None)
+    return fault
 
 
 def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:

@@ -128,7 +128,9 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, *, temporally_consistent: 
     alarms = np.count_nonzero(predicted_size[:, 1:], axis=1) - found
     missed = np.count_nonzero(true_size[:, 1:], axis=1) - found
     covered = np.array([math.fsum(overlap[frame == index].tolist()) for index in range(len(true))])
-    beside = _background_overlap(shared[:, 0, 0], true_size[:, 0], predicted_size[:, 0])
+    same = shared[:, 0, 0]  # cells of the background in both, which counts where they are more than half of the union
+    union = np.maximum(true_size[:, 0] + predicted_size[:, 0] - same, 1)
+    beside = np.where(2 * same > union, same / union, 0.0)
     return VpqCounts(
         iou=np.stack([beside, covered], axis=1),
         true_positive=np.stack([beside > 0, found], axis=1),
@@ -218,12 +220,6 @@ def _same_partner(true_id: IntArray, predicted_id: IntArray) -> BoolArray:
     same = np.ones(len(order), dtype=bool)
     same[order[1:]] = ~other
     return same
-
-
-def _background_overlap(inside: IntArray, true_size: IntArray, predicted_size: IntArray) -> FloatArray:
-    """(T,) intersection over union of the background where it is more than a half, else 0."""
-    union = np.maximum(true_size + predicted_size - inside, 1)
-    return np.where(2 * inside > union, inside / union, 0.0)
 
 
 Paths = Mapping[int, FloatArray]

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
@@ -222,6 +223,12 @@ class InstanceAccident:
         if self.contact is None:
             return np.full((2, 2), np.nan)
         return self.tracks.at(self.contact.frame, self.contact.ids)
+
+    def explicit(self, seconds: float) -> Accident | None:
+        """It as an explicit accident without ids, `seconds` from frame to frame; None without a contact."""
+        if self.contact is None:
+            return None
+        return Accident(positions=self.positions, time=self.contact.frame * seconds)
 
 
 def even(length: FloatArray) -> FloatArray:

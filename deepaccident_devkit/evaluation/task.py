@@ -1,16 +1,18 @@
-"""What a task is made of beside its arithmetic: the choices of its protocols, and its results with their headlines."""
+"""`Task`: what is evaluated, from a results file to numbers; the choices of protocols, and results with headlines."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, TypeVar, get_args
 
 import numpy as np
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.support.arrays import ShortRepr, known
 from deepaccident_devkit.support.text import choice, possible_text
@@ -19,6 +21,47 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 TaskName = Literal["motion", "accident", "detection", "warning"]
+
+
+def stored_prediction(results: Any, _dataset: Dataset, token: str, _rules: Any) -> Any:
+    """The prediction of a sample as `Results` hold it."""
+    return results.prediction(token)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """One task, whose five doors lead from a results file to numbers: read → truth → counts → result → summary.
+
+    Attributes:
+        name: of `TaskName`.
+        kinds: the kinds of results that it is evaluated from.
+        protocols: its rules by name.
+        evaluator: of some rules; keeps the counts of each sample between the doors `counts` and `result`.
+        read: results, dataset, token, rules → the prediction of a sample, as the rules count it.
+        truth: dataset, token, rules, how motion is stored (`Results.form`; None for other results), horizon in
+            seconds → all that the prediction is compared with.
+        counts: token, prediction, all that `truth` gave, rules → what the sample adds.
+        result: the counts of samples, rules → their metrics.
+        summary: result → its numbers by name, as JSON holds them.
+        whole_recordings: whether whole recordings are followed, so that attributes within them are of no use.
+        needs_meta: whether the truth is in the scenarios' meta files.
+        looks_ahead: whether predictions have a horizon.
+    """
+
+    name: TaskName
+    kinds: tuple[str, ...]
+    protocols: Mapping[str, Any]
+    evaluator: Callable[[Any], Evaluator[Any]]
+    read: Callable[[Any, Dataset, str, Any], Any] = stored_prediction
+    truth: Callable[[Dataset, str, Any, Any, float], tuple[Any, ...]]
+    counts: Callable[..., Counts]
+    result: Callable[[Collection[Counts], Any], Any]
+    summary: Callable[[Any], dict[str, Any]]
+    whole_recordings: bool = False
+    needs_meta: bool = False
+    looks_ahead: bool = True
+
+
 Kind = TypeVar("Kind")
 Rules = TypeVar("Rules", bound="DataclassInstance")
 _WORDS: Final[Mapping[type | None, str]] = {bool: "true or false", float: "a number", str: "a word", tuple: "a list"}
@@ -49,6 +92,8 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
         ChoiceError: the protocol has no such choice, or it is of another kind: a number for a word.
         DeepAccidentError: it cannot have that value.
     """
+    if not switches:
+        return rules
     changes: dict[str, Any] = {}
     parts: dict[str, dict[str, Any]] = {}
     names = switch_names(rules)

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 from shapely import MultiPoint, get_coordinates
 
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident_truth import AccidentContext
 from deepaccident_devkit.evaluation.map_accidents import (

@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError, TokenError
-from deepaccident_devkit.evaluation.accident import PROTOCOLS as ACCIDENT_PROTOCOLS
-from deepaccident_devkit.evaluation.accident import AccidentEvaluator, ReleasedAccidents, accident_context
-from deepaccident_devkit.evaluation.detection import (
-    DETECTION_PROTOCOLS,
-    DetectedBoxes,
-    DetectionEvaluator,
-    detection_truth,
-)
+from deepaccident_devkit.evaluation.accident import ACCIDENT
+from deepaccident_devkit.evaluation.detection import DETECTION
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator
+from deepaccident_devkit.evaluation.motion import MOTION
+from deepaccident_devkit.evaluation.predictions import compared_labels, label_config
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.task import FrozenDict, switched
-from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, WarningEvaluator
-from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels, samples
+from deepaccident_devkit.evaluation.task import FrozenDict, Task, TaskName, switched
+from deepaccident_devkit.evaluation.warning.evaluator import WARNING
+from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, samples
 from deepaccident_devkit.motion.sample_lists import no_samples_text
 from deepaccident_devkit.parallel import Places
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import choice, settle_choices, spelled
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLITS
+
+__all__ = ["TASKS", "TASK_PROTOCOLS", "TASK_RESULTS", "EvaluationSetup", "SampleLoader", "TaskName"]
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
@@ -211,23 +208,16 @@ def _named(tokens: Sequence[str], what: str) -> str:
     return f"{len(tokens)} {what} ({', '.join(tokens[:_SHOWN])}{more})"
 
 
-TaskName = Literal["motion", "accident", "detection", "warning"]
+TASKS: Final[Mapping[str, Task]] = MappingProxyType(
+    {task.name: task for task in (MOTION, ACCIDENT, DETECTION, WARNING)}
+)
+"""All tasks by name; a new one has a line here, and its name in `TaskName`."""
 TASK_PROTOCOLS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
-    {
-        "motion": MOTION_PROTOCOLS,
-        "accident": ACCIDENT_PROTOCOLS,
-        "detection": DETECTION_PROTOCOLS,
-        "warning": WARNING_PROTOCOLS,
-    }
+    {name: task.protocols for name, task in TASKS.items()}
 )
 """Task → its protocols by name."""
 TASK_RESULTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        "motion": ("motion",),
-        "accident": ("motion", "accident"),
-        "detection": ("detection",),
-        "warning": ("motion", "accident"),
-    }
+    {name: task.kinds for name, task in TASKS.items()}
 )
 """Task → the kinds of results that it is evaluated from."""
 _LONGEST_HORIZON: Final = 100
@@ -252,22 +242,22 @@ class EvaluationSetup:
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
-        settle_choices(self, {"task": get_args(TaskName)})
-        protocol = choice(f"protocol of {self.task}", self.protocol, TASK_PROTOCOLS[self.task])
+        settle_choices(self, {"task": tuple(TASKS)})
+        protocol = choice(f"protocol of {self.task}", self.protocol, TASKS[self.task].protocols)
         object.__setattr__(self, "protocol", protocol)
         if not 0 < self.horizon <= _LONGEST_HORIZON:
             raise ConfigError(f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}")
         object.__setattr__(self, "switches", FrozenDict(self.switches))
-        switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)  # refuses impossible choices
+        switched(TASKS[self.task].protocols[self.protocol], self.switches)  # refuses impossible choices
 
     @property
     def rules(self) -> Any:
         """The protocol itself, with the switches."""
-        return switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)
+        return switched(TASKS[self.task].protocols[self.protocol], self.switches)
 
     def evaluator(self) -> Evaluator[Any]:
         """A new evaluator of these rules."""
-        return _EVALUATORS[self.task](self.rules)
+        return TASKS[self.task].evaluator(self.rules)
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it, with the evaluator's own `settings`: every choice."""
@@ -278,14 +268,6 @@ class EvaluationSetup:
             "horizon": self.horizon,
             "settings": self.evaluator().settings,
         }
-
-
-_EVALUATORS: Final[Mapping[str, Callable[[Any], Evaluator[Any]]]] = {
-    "motion": MotionEvaluator,
-    "accident": AccidentEvaluator,
-    "detection": DetectionEvaluator,
-    "warning": WarningEvaluator,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,13 +286,13 @@ class SampleLoader:
 
     def __post_init__(self) -> None:
         """Check that the results are of a kind that the rules take, and look far enough; raises EvaluationError."""
-        kinds = TASK_RESULTS[self.setup.task]
+        kinds = TASKS[self.setup.task].kinds
         if self.results.task not in kinds:
             raise EvaluationError(
                 f"{self.results.path}: holds {self.results.task} results; {self.setup.task} is evaluated from "
                 f"{' or '.join(kinds)} results"
             )
-        if self.results.task == "accident" and isinstance(self.setup.rules, ReleasedAccidents):
+        if self.results.task == "accident" and getattr(self.setup.rules, "maps_alone", False):
             raise EvaluationError(
                 f"{self.results.path}: holds explicit accidents; the protocol {self.setup.protocol!r} compares motion: "
                 "give motion results, or choose protocol 'paper' or 'boxes'"
@@ -330,38 +312,18 @@ class SampleLoader:
 
     def __call__(self, token: str) -> tuple[Any, ...]:
         """Prediction, truth and other arguments of the evaluator."""
-        prediction, rules = self.results.prediction(token), self.setup.rules
-        if isinstance(prediction, DetectedBoxes):
-            return self.detected(token, prediction, rules.frame), detection_truth(self.dataset, token, rules)
-        if self.setup.task == "motion":
-            return prediction, self.label(token)
-        context = accident_context(self.dataset, token, self.setup.horizon, references=self.setup.task == "warning")
-        return prediction, self.label(token), context
+        rules, form, horizon = self.setup.rules, self.results.form, self.setup.horizon
+        truth = TASKS[self.setup.task].truth(self.dataset, token, rules, form, horizon)
+        return self.prediction(token), *truth
+
+    def prediction(self, token: str) -> Any:
+        """The prediction of a sample, boxes in the protocol's frame."""
+        return TASKS[self.setup.task].read(self.results, self.dataset, token, self.setup.rules)
 
     def label_config(self) -> MotionLabelConfig | None:
-        """What the labels show that motion results are compared with; None for explicit accidents of other setups."""
-        form = self.results.form
-        labels = getattr(self.setup.rules, "labels", None)
-        if form is None:
-            if not hasattr(self.setup.rules, "labels"):
-                return None
-            return _reaching(MotionLabelConfig(protocol=labels or "released"), self.setup.horizon)
-        config = MotionLabelConfig(
-            grid=form.grid, step=round(form.step / FRAME_PERIOD), protocol=labels or form.labels or "clean"
-        )
-        return _reaching(config, self.setup.horizon)
+        """What the labels show that the results are compared with; None for explicit accidents of other setups."""
+        return label_config(self.setup.rules, self.results.form, self.setup.horizon)
 
     def label(self, token: str) -> MotionLabels | None:
         """The sample's motion labels as `label_config` says; None where there is none to compare with."""
-        config = self.label_config()
-        return None if config is None else motion_labels(self.dataset, token, config)
-
-    def detected(self, token: str, prediction: DetectedBoxes, frame: str) -> DetectedBoxes:
-        """A sample's boxes, which results hold in the world, in a frame of its agent."""
-        boxes = prediction.boxes.transform(self.dataset.world_from(token, frame).inverse(), frame)
-        return DetectedBoxes(boxes=boxes, scores=prediction.scores)
-
-
-def _reaching(config: MotionLabelConfig, horizon: float) -> MotionLabelConfig:
-    """Labels that look as far ahead."""
-    return replace(config, future_frames=round(horizon / (config.step * FRAME_PERIOD)))
+        return compared_labels(self.dataset, token, self.setup.rules, self.results.form, self.setup.horizon)

@@ -13,11 +13,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.accident_truth import AccidentContext, checked_facts
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext, accident_context, checked_facts
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.predictions import Prediction
-from deepaccident_devkit.evaluation.task import protocol_of
+from deepaccident_devkit.evaluation.predictions import Prediction, compared_labels
+from deepaccident_devkit.evaluation.task import Task, TaskResult, protocol_of
 from deepaccident_devkit.evaluation.warning.anticipation import (
     AnticipationResult,
     CleanWarnings,
@@ -108,8 +109,7 @@ class WarningEvaluator(Evaluator[Any]):
             EvaluationError: the token is no sample's, the context or something in it is missing, the prediction is
                 neither, or the sample came before with another outcome.
         """
-        checked_facts(label, context)
-        self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
+        self.add(token, _counts(token, prediction, label, context, self.protocol))
 
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""
@@ -118,7 +118,7 @@ class WarningEvaluator(Evaluator[Any]):
     def compute(self, tokens: Iterable[str] | None = None) -> Result:
         """The metrics of all samples, beside those of the reference predictors; or of some, without."""
         if tokens is None:
-            return self.protocol.result(list(self._counts.values()), references=True)
+            return _result(list(self._counts.values()), self.protocol)
         result: Result = super().compute(tokens)
         return result
 
@@ -141,6 +141,38 @@ class WarningEvaluator(Evaluator[Any]):
         return not isinstance(self.protocol, FieldWarnings)
 
 
+def _truth(dataset: Dataset, token: str, rules: Protocol, form: Any, horizon: float) -> tuple[Any, ...]:
+    label = compared_labels(dataset, token, rules, form, horizon)
+    return label, accident_context(dataset, token, horizon, references=True)
+
+
+def _counts(
+    token: str,
+    prediction: Prediction,
+    label: MotionLabels | None,
+    context: AccidentContext | None,
+    _protocol: Protocol,
+) -> Counts:
+    checked_facts(label, context)
+    return sample_counts(token, prediction, label, context or AccidentContext())
+
+
+def _result(counts: Collection[Counts], protocol: Protocol) -> Result:
+    return protocol.result(counts, references=True)
+
+
+WARNING: Final = Task(
+    name="warning",
+    kinds=("motion", "accident"),
+    protocols=WARNING_PROTOCOLS,
+    evaluator=WarningEvaluator,
+    truth=_truth,
+    counts=_counts,
+    result=_result,
+    summary=TaskResult.as_dict,
+    whole_recordings=True,
+    needs_meta=True,
+)
 _WALKING: Final = ", pedestrian"
 _ALARMS: Final[Mapping[str, ScoresOf]] = {"right": "pair", "any_alarm": "recording"}
 """Which alarms warn → the scores that are of them."""

@@ -119,11 +119,9 @@ def _figure(explorer: Explorer, model: Model, token: str, shown: Shown) -> Any:
     if results is None:
         raise NotAvailableError(f"{model.name}: its predictions were not given")
     loader = SampleLoader(explorer.dataset, results, model.setup)
-    prediction, rules = results.prediction(token), model.setup.rules
+    prediction, rules = loader.prediction(token), model.setup.rules
     how: dict[str, Any] = {"task": _task(model), "protocol": None if model.setup.task == "warning" else rules}
-    if isinstance(prediction, DetectedBoxes):
-        prediction = loader.detected(token, prediction, rules.frame)
-    else:
+    if not isinstance(prediction, DetectedBoxes):
         how["label"] = loader.label(token)
     figure = detached_figure(_SIZES[shown.kind, shown.size])
     if shown.kind == "above":

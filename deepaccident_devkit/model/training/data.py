@@ -14,7 +14,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import DetectionEvaluator, MotionEvaluator, detection_truth
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectedBoxes
-from deepaccident_devkit.evaluation.motion.evaluator import MOTION_PROTOCOLS
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, collate_all_egos, merged_evaluator
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.results import PredictConfig, predictions

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.scoring import DISTANCES, ERRORS_AT, Alarm, hit_of
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio

@@ -7,8 +7,7 @@ from itertools import cycle
 from typing import TYPE_CHECKING
 
 from deepaccident_devkit.evaluation.instances import panoptic_quality
-from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.motion.evaluator import RANGES
+from deepaccident_devkit.evaluation.motion import RANGES, MotionEvaluator
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SERIES_COLORS

@@ -19,7 +19,7 @@ from deepaccident_devkit.evaluation.detection import (
     detection_protocol,
 )
 from deepaccident_devkit.evaluation.instances import vpq_matches
-from deepaccident_devkit.evaluation.motion.evaluator import RANGES
+from deepaccident_devkit.evaluation.motion import RANGES
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,

@@ -1,13 +1,15 @@
-"""`MotionEvaluator`: the motion metrics of any number of samples, the counts of each sample, and their protocol."""
+"""How well a model foresees where all actors are: IoU, VPQ, minADE, minFDE, miss rate; the task `MOTION`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.instances import (
     SegmentationCounts,
@@ -24,14 +26,13 @@ from deepaccident_devkit.evaluation.instances import (
 from deepaccident_devkit.evaluation.predictions import (
     MotionOutput,
     cells_within,
-    check_output,
-    check_protocol,
     checked_pair,
+    compared_frames,
+    compared_labels,
     first_frames,
-    frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.task import Row, TaskResult, protocol_of
+from deepaccident_devkit.evaluation.task import Row, Task, TaskResult, protocol_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -43,6 +44,15 @@ from deepaccident_devkit.motion import (
 )
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, ShortRepr
 from deepaccident_devkit.support.text import settle_choices
+
+__all__ = [
+    "MOTION_PROTOCOLS",
+    "MotionEvaluator",
+    "MotionProtocol",
+    "MotionResult",
+    "RangeResult",
+    "motion_counts",
+]
 
 RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
 """Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted."""
@@ -193,7 +203,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
 
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
         """The metrics of some samples' counts, in any order."""
-        return self._result(counts, [each["vpq"] for each in counts])
+        return motion_result(counts, self.protocol)
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """The samples' counts as those of one sample of one frame, which have the same result."""
@@ -227,50 +237,8 @@ class MotionEvaluator(Evaluator[MotionResult]):
             for frame in range(self._counts[token]["frames"])
         ]
         numbers = [number for number, token in enumerate(order) if token in set(selected)]
-        return self._result([self._counts[order[number]] for number in numbers], [frames[number] for number in numbers])
-
-    def _result(self, counts: Collection[Counts], vpq: Sequence[Any]) -> MotionResult:
-        paths = _path_sums(counts)
-        found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
-        samples, number = (sum(each[name] for each in counts) for name in ("samples", "instance_maps"))
-        return MotionResult(
-            ranges={
-                name: self._range_result([each["cells"][index] for each in counts], [each[index] for each in vpq])
-                for index, name in enumerate(RANGES)
-            },
-            min_ade=ratio(paths["ade"], paths["count"]),
-            min_fde=ratio(paths["fde"], paths["count"]),
-            miss_rate=ratio(paths["missed"], paths["count"]),
-            paths=int(paths["count"]),
-            path_accuracy=ratio(found, found + alarms / 2 + lost / 2),
-            path_true_positive=found,
-            path_false_positive=alarms,
-            path_false_negative=lost,
-            samples=samples,
-            frames=sum(each["frames"] for each in counts),
-            notes=(f"{number} of {samples} predictions: {_INSTANCE_MAPS}",) if number else (),
-        )
-
-    def _range_result(self, cells: Sequence[Any], vpq: Sequence[Any]) -> RangeResult:
-        """Of samples' [tp, fp, fn] cells, and of their four lists by frame."""
-        overlap, *numbers = (math.fsum(value for each in vpq for value in each[index]) for index in range(4))
-        found, alarms, missed = (int(number) for number in numbers)
-        quality = panoptic_quality(overlap, found, alarms, missed)
-        absent = 0.0 if self.protocol.nothing_is_zero else math.nan
-        percent = 100.0 if found or alarms or missed or self.protocol.nothing_is_zero else math.nan
-        classes = [
-            SegmentationCounts(true_positive=both, false_positive=mine, false_negative=true)
-            for both, mine, true in cells
-        ]
-        return RangeResult(
-            iou=100 * iou(classes, absent=absent),
-            pq=percent * quality.pq,
-            sq=percent * quality.sq,
-            rq=percent * quality.rq,
-            true_positive=found,
-            false_positive=alarms,
-            false_negative=missed,
-        )
+        chosen = [{**self._counts[order[number]], "vpq": frames[number]} for number in numbers]
+        return motion_result(chosen, self.protocol)
 
 
 def motion_counts(
@@ -289,9 +257,7 @@ def motion_counts(
     """
     rules = protocol or MotionProtocol()
     prediction, label = checked_pair(prediction, label)
-    check_protocol(label, rules.labels)
-    frames = frames_there(label)
-    check_output(prediction, label, frames)
+    frames = compared_frames(prediction, label, rules.labels)
     truth, grid = labels_at_present(label), label.config.grid
     last = _last_maps(prediction, frames)
     actors, instance = (prediction.grid.reorient(maps, grid.orientation) for maps in last)
@@ -349,3 +315,70 @@ def _paths_of(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
 
 def _path_sums(counts: Collection[Counts]) -> dict[str, float]:
     return {name: total((each["paths"] for each in counts if each["paths"]), name) for name in _PATHS}
+
+
+def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> MotionResult:
+    """The metrics of some samples' counts, in any order."""
+    ranges = {
+        name: _range_result(index, counts, nothing_is_zero=protocol.nothing_is_zero)
+        for index, name in enumerate(RANGES)
+    }
+    paths = _path_sums(counts)
+    found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
+    samples, number = (sum(each[name] for each in counts) for name in ("samples", "instance_maps"))
+    return MotionResult(
+        ranges=ranges,
+        min_ade=ratio(paths["ade"], paths["count"]),
+        min_fde=ratio(paths["fde"], paths["count"]),
+        miss_rate=ratio(paths["missed"], paths["count"]),
+        paths=int(paths["count"]),
+        path_accuracy=ratio(found, found + alarms / 2 + lost / 2),
+        path_true_positive=found,
+        path_false_positive=alarms,
+        path_false_negative=lost,
+        samples=samples,
+        frames=sum(each["frames"] for each in counts),
+        notes=(f"{number} of {samples} predictions: {_INSTANCE_MAPS}",) if number else (),
+    )
+
+
+def _range_result(index: int, counts: Collection[Counts], *, nothing_is_zero: bool) -> RangeResult:
+    """Of the samples' [tp, fp, fn] cells, and of their four lists by frame, in one range."""
+    overlap, *numbers = (math.fsum(chain(*(each["vpq"][index][kind] for each in counts))) for kind in range(4))
+    found, alarms, missed = (int(number) for number in numbers)
+    quality = panoptic_quality(overlap, found, alarms, missed)
+    absent = 0.0 if nothing_is_zero else math.nan
+    percent = 100.0 if found or alarms or missed or nothing_is_zero else math.nan
+    cells = [
+        SegmentationCounts(true_positive=both, false_positive=mine, false_negative=true)
+        for both, mine, true in (each["cells"][index] for each in counts)
+    ]
+    return RangeResult(
+        iou=100 * iou(cells, absent=absent),
+        pq=percent * quality.pq,
+        sq=percent * quality.sq,
+        rq=percent * quality.rq,
+        true_positive=found,
+        false_positive=alarms,
+        false_negative=missed,
+    )
+
+
+def _truth(dataset: Dataset, token: str, rules: MotionProtocol, form: Any, horizon: float) -> tuple[Any, ...]:
+    return (compared_labels(dataset, token, rules, form, horizon),)
+
+
+def _counts(_token: str, prediction: MotionOutput, label: MotionLabels, protocol: MotionProtocol) -> Counts:
+    return motion_counts(prediction, label, protocol)
+
+
+MOTION: Final = Task(
+    name="motion",
+    kinds=("motion",),
+    protocols=MOTION_PROTOCOLS,
+    evaluator=MotionEvaluator,
+    truth=_truth,
+    counts=_counts,
+    result=motion_result,
+    summary=MotionResult.as_dict,
+)
