@@ -19,15 +19,14 @@ from deepaccident_devkit.evaluation.map_accidents import (
     Contact,
     InstanceAccident,
     InstanceTracks,
-    accident_of,
-    instances_of_heads,
     match_tracks,
+    predicted_accidents,
 )
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.conflicts import time_to_collision
 from deepaccident_devkit.geometry.footprints import gaps
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelProtocol, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.support.text import choice
@@ -446,15 +445,9 @@ def foreseen_accident(
         ChoiceError: no such labels.
     """
     labels = choice("labels", labels, (None, *LABEL_PROTOCOLS))
-    read = _read_off(output, None if labels is None else LABEL_PROTOCOLS[labels], AccidentReading())
+    read = predicted_accidents(output, None if labels is None else LABEL_PROTOCOLS[labels], AccidentReading())
     there = _surest_first(read)
     return _joint(there, len(read), step) if there else None
-
-
-def _read_off(output: MotionOutput, rules: LabelProtocol | None, reading: AccidentReading) -> list[InstanceAccident]:
-    """What each prediction shows."""
-    maps = output.instances if output.heads is None else [instances_of_heads(heads) for heads in output.heads]
-    return [accident_of(each, output.grid, rules, reading) for each in (() if maps is None else maps)]
 
 
 def _surest_first(read: list[InstanceAccident]) -> list[tuple[InstanceAccident, Contact]]:
@@ -472,7 +465,7 @@ def _alarms_of_maps(
 ) -> list[NamedAlarm]:
     """At most one alarm of K predictions."""
     seconds = config.step * FRAME_PERIOD
-    read = _read_off(output, config.rules, reading)
+    read = predicted_accidents(output, config.rules, reading)
     there = _surest_first(read)
     if not there:
         return []

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, first_frames
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
@@ -256,8 +256,19 @@ def accident_of(
     contact = _contact(shapes, size, reading.danger_distance)
     identity, which = np.unique(shapes.identity, return_inverse=True)
     center = np.full((len(instance), len(identity), 2), np.nan)
-    center[shapes.frame, which] = [grid.x[0], grid.y[0]] + (shapes.center + _within_cell(rules)) * size
+    center[shapes.frame, which] = [grid.x[0], grid.y[0]] + (
+        shapes.center + (0.5 if rules is None else rules.place_in_cell)
+    ) * size
     return InstanceAccident(tracks=InstanceTracks(identity=identity, center=center), contact=contact)
+
+
+def predicted_accidents(
+    output: MotionOutput, rules: LabelProtocol | None, reading: AccidentReading, frames: int | None = None
+) -> list[InstanceAccident]:
+    """What `accident_of` reads off each of the K predictions, cut to so many frames; None for all."""
+    heads = [each if frames is None else first_frames(each, frames) for each in output.heads or ()]
+    maps = map(instances_of_heads, heads) if output.instances is None else output.instances[:, :frames]
+    return [accident_of(each, output.grid, rules, reading) for each in maps]
 
 
 def match_tracks(predicted: InstanceTracks, truth: InstanceTracks, gate: float) -> dict[int, int]:
@@ -377,8 +388,3 @@ def _candidates(shapes: _Shapes, size: FloatArray, danger_distance: float) -> tu
         firsts.append(first + start)
         seconds.append(second + start)
     return np.concatenate(firsts), np.concatenate(seconds)
-
-
-def _within_cell(rules: LabelProtocol | None) -> FloatArray:
-    """The point of a cell, in cells along x and y from its low corner, that its rasterised place stands for."""
-    return np.array([0.5, 0.5] if rules is None else rules.place_in_cell)

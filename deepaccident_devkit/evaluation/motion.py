@@ -9,7 +9,6 @@ from itertools import chain
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
-from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.instances import (
     SegmentationCounts,
@@ -364,21 +363,13 @@ def _range_result(index: int, counts: Collection[Counts], *, nothing_is_zero: bo
     )
 
 
-def _truth(dataset: Dataset, token: str, rules: MotionProtocol, form: Any, horizon: float) -> tuple[Any, ...]:
-    return (compared_labels(dataset, token, rules, form, horizon),)
-
-
-def _counts(_token: str, prediction: MotionOutput, label: MotionLabels, protocol: MotionProtocol) -> Counts:
-    return motion_counts(prediction, label, protocol)
-
-
 MOTION: Final = Task(
     name="motion",
     kinds=("motion",),
     protocols=MOTION_PROTOCOLS,
     evaluator=MotionEvaluator,
-    truth=_truth,
-    counts=_counts,
+    truth=lambda *facts: (compared_labels(*facts),),
+    counts=lambda _token, *given: motion_counts(*given),
     result=motion_result,
     summary=MotionResult.as_dict,
 )

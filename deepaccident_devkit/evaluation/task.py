@@ -23,11 +23,6 @@ if TYPE_CHECKING:
 TaskName = Literal["motion", "accident", "detection", "warning"]
 
 
-def stored_prediction(results: Any, _dataset: Dataset, token: str, _rules: Any) -> Any:
-    """The prediction of a sample as `Results` hold it."""
-    return results.prediction(token)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
     """One task, whose five doors lead from a results file to numbers: read → truth → counts → result → summary.
@@ -52,7 +47,7 @@ class Task:
     kinds: tuple[str, ...]
     protocols: Mapping[str, Any]
     evaluator: Callable[[Any], Evaluator[Any]]
-    read: Callable[[Any, Dataset, str, Any], Any] = stored_prediction
+    read: Callable[[Any, Dataset, str, Any], Any] = lambda results, _dataset, token, _rules: results.prediction(token)
     truth: Callable[[Dataset, str, Any, Any, float], tuple[Any, ...]]
     counts: Callable[..., Counts]
     result: Callable[[Collection[Counts], Any], Any]

@@ -7,7 +7,6 @@ from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any, Final
 
-from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents
@@ -147,22 +146,17 @@ def compared_accidents(
     return protocol.compared(checked_prediction(prediction), label, context)
 
 
-def _truth(dataset: Dataset, token: str, rules: AccidentProtocol, form: Any, horizon: float) -> tuple[Any, ...]:
-    return compared_labels(dataset, token, rules, form, horizon), accident_context(dataset, token, horizon)
-
-
-def _result(counts: Collection[Counts], protocol: AccidentProtocol) -> AccidentResult:
-    return protocol.result(counts)
-
-
 ACCIDENT: Final = Task(
     name="accident",
     kinds=("motion", "accident"),
     protocols=PROTOCOLS,
     evaluator=AccidentEvaluator,
-    truth=_truth,
+    truth=lambda dataset, token, rules, form, horizon: (
+        compared_labels(dataset, token, rules, form, horizon),
+        accident_context(dataset, token, horizon),
+    ),
     counts=sample_counts,
-    result=_result,
+    result=lambda counts, protocol: protocol.result(counts),
     summary=AccidentResult.as_dict,
     needs_meta=True,
 )

@@ -36,6 +36,7 @@ from deepaccident_devkit.evaluation.map_accidents import (
     accident_of,
     instances_of_heads,
     match_tracks,
+    predicted_accidents,
 )
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
@@ -47,7 +48,7 @@ from deepaccident_devkit.evaluation.predictions import (
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.motion import LabelProtocol, MotionHeads, MotionLabels
+from deepaccident_devkit.motion import MotionHeads, MotionLabels
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -110,7 +111,7 @@ class PaperAccidents:
             actors = [actor_of(shown[frame] == identity, frame, label, context) for identity in ids]
         alarms: list[Alarm | None]
         if isinstance(given, MotionOutput):
-            read = self.read_predictions(given, frames, rules)
+            read = predicted_accidents(given, rules, self.reading, frames)
             alarms = [_alarm(found, truth, seconds) if found.contact else None for found in read]
         else:
             alarms = [
@@ -136,7 +137,7 @@ class PaperAccidents:
         shown = self.truth_map(given, labels_at_present(label), frames)
         true = accident_of(shown, label.config.grid, labels, self.reading).explicit(step)
         if isinstance(given, MotionOutput):
-            read = [each.explicit(step) for each in self.read_predictions(given, frames, labels)]
+            read = [each.explicit(step) for each in predicted_accidents(given, labels, self.reading, frames)]
             return ComparedAccidents(true=true, predicted=tuple(each for each in read if each is not None))
         return ComparedAccidents(true=true, predicted=tuple(surest_within(given, (frames - 0.5) * step)))
 
@@ -157,14 +158,6 @@ class PaperAccidents:
         if not isinstance(given, MotionOutput) or given.heads is None:
             return label.instance[:frames]
         return instances_of_heads(first_frames(MotionHeads.from_labels(label), frames))
-
-    def read_predictions(self, output: MotionOutput, frames: int, rules: LabelProtocol) -> list[InstanceAccident]:
-        """What is read off each of the K predictions, cut to so many frames."""
-        if output.heads is not None:
-            maps = [instances_of_heads(first_frames(heads, frames)) for heads in output.heads]
-        else:
-            maps = [] if output.instances is None else [each[:frames] for each in output.instances]
-        return [accident_of(each, output.grid, rules, self.reading) for each in maps]
 
 
 def _united(counts: Collection[Counts]) -> dict[str, Any]:

@@ -23,13 +23,11 @@ from deepaccident_devkit.evaluation.detection.boxes import (
 )
 from deepaccident_devkit.evaluation.detection.matching import (
     Ring,
+    boxes_taken,
     frame_counts,
-    inside_area,
     nearest_by_score,
     nearest_by_truth,
     ring_of,
-    rows_taken,
-    truth_taken,
 )
 from deepaccident_devkit.evaluation.detection.result import DetectionResult, Ledger, detection_result, drawn_results
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
@@ -172,11 +170,7 @@ def detection_matches(
     if chosen not in rules.thresholds:
         raise ChoiceError(f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found {threshold!r}")
     detected, true = columns_of(prediction.boxes, prediction.scores), columns_of(truth)
-    if rules.single_precision:
-        detected, true = detected.rounded(), true.rounded()
-    rows = rows_taken(detected, inside_area(detected, rules), rules)
-    true_rows = rows_taken(true, truth_taken(true, rules), rules)
-    detected, true = detected.select(rows), true.select(true_rows)
+    (detected, rows), (true, true_rows) = boxes_taken(detected, true, rules)
     pairs: list[tuple[int, int]] = []
     unmatched: set[int] = set()
     missed: set[int] = set()
@@ -214,17 +208,13 @@ def _read(results: Any, dataset: Dataset, token: str, rules: DetectionProtocol) 
     return found.transform(dataset.world_from(token, rules.frame).inverse(), rules.frame)
 
 
-def _truth(dataset: Dataset, token: str, rules: DetectionProtocol, *_how: Any) -> tuple[Any, ...]:
-    return (detection_truth(dataset, token, rules),)
-
-
 DETECTION: Final = Task(
     name="detection",
     kinds=("detection",),
     protocols=DETECTION_PROTOCOLS,
     evaluator=DetectionEvaluator,
     read=_read,
-    truth=_truth,
+    truth=lambda dataset, token, rules, _form, _horizon: (detection_truth(dataset, token, rules),),
     counts=sample_counts,
     result=detection_result,
     summary=DetectionResult.as_dict,

@@ -287,10 +287,7 @@ def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionP
         - `errors`: (classes, detections, ATE, ASE, AOE, AVE) of the matches at the protocol's error threshold; None
           where unknown.
     """
-    if protocol.single_precision:
-        detections, truth = detections.rounded(), truth.rounded()
-    truth = truth.select(rows_taken(truth, truth_taken(truth, protocol), protocol))
-    detections = detections.select(rows_taken(detections, inside_area(detections, protocol), protocol))
+    (detections, _), (truth, _) = boxes_taken(detections, truth, protocol)
     if protocol.unknown_velocity_is_zero:
         truth = _standing_if_unknown(truth)
     codes, true_codes = class_codes(detections, protocol), class_codes(truth, protocol)
@@ -397,6 +394,17 @@ def _count_level(
 def _extend(columns: Sequence[list[Any]], *more: Iterable[Any]) -> None:
     for column, values in zip(columns, more, strict=True):
         column.extend(values)
+
+
+def boxes_taken(
+    detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol
+) -> tuple[tuple[BoxColumns, IntArray], tuple[BoxColumns, IntArray]]:
+    """Those of one sample's detections and true boxes that exist for a protocol, in its precision, and their rows."""
+    if protocol.single_precision:
+        detections, truth = detections.rounded(), truth.rounded()
+    rows = rows_taken(detections, inside_area(detections, protocol), protocol)
+    true_rows = rows_taken(truth, truth_taken(truth, protocol), protocol)
+    return (detections.select(rows), rows), (truth.select(true_rows), true_rows)
 
 
 def rows_taken(boxes: BoxColumns, which: BoolArray, protocol: DetectionProtocol) -> IntArray:

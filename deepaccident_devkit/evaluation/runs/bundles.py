@@ -16,14 +16,9 @@ import msgspec
 from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results.header import check_token
-from deepaccident_devkit.evaluation.runs.evaluation_run import (
-    SUMMARY_FORMAT,
-    SUMMARY_VERSION,
-    EvaluationRun,
-    remove_checkpoints,
-)
+from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, remove_checkpoints
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import path_of, remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.support.json_text import Record, as_record, parsed_json

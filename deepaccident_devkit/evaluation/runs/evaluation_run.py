@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -31,19 +31,18 @@ from deepaccident_devkit.evaluation.runs.setups import (
     TASKS,
     Coverage,
     EvaluationSetup,
-    SampleList,
     SampleLoader,
     SampleSelection,
-    ScopeName,
+    checkpoint_path,
     coverage,
+    default_selection,
     scenario_of,
 )
 from deepaccident_devkit.evaluation.task import headlines, plain
 from deepaccident_devkit.evaluation.warning import PreventedResult
-from deepaccident_devkit.parallel import Store, run_batch, unfinished_folder
-from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint, scenario_hashes
+from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.files import path_of, remove_in
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
@@ -72,8 +71,8 @@ BREAKDOWNS: Final = (
 
 def breakdowns_of(task: str) -> tuple[str, ...]:
     """What a task's results are broken down by if nothing else is asked for: warnings by whole recordings alone."""
-    left_out = WITHIN_RECORDINGS if TASKS[task].whole_recordings else ()
-    return tuple(name for name in BREAKDOWNS if name not in left_out)
+    whole = TASKS[task].whole_recordings
+    return tuple(name for name in BREAKDOWNS if not (whole and name in WITHIN_RECORDINGS))
 
 
 _LIBRARIES: Final = ("numpy", "scipy")
@@ -296,36 +295,6 @@ def _prevented(given: Breakdown[PreventedResult]) -> dict[str, Any]:
     }
 
 
-def default_selection(
-    setup: EvaluationSetup,
-    split: str | os.PathLike[str] = "val",
-    *,
-    samples: SampleList | None = None,
-    scope: ScopeName | None = None,
-    agents: Sequence[str] | None = None,
-) -> SampleSelection:
-    """The samples that a setup is evaluated at.
-
-    Args:
-        setup: its task and horizon.
-        split: `train`, `val`, … or the path of a split file.
-        samples: None for `all` of the task `warning`, which follows whole recordings, and else `evaluate`.
-        scope: None for `all` where all samples are evaluated, and else `accident`.
-        agents: whose; None for all.
-
-    Raises:
-        ChoiceError: no such list, scope or agent.
-    """
-    listed: SampleList = samples or ("all" if TASKS[setup.task].whole_recordings else "evaluate")
-    return SampleSelection(
-        split=os.fspath(split),
-        samples=listed,
-        scope=scope or ("all" if listed == "all" else "accident"),
-        agents=None if agents is None else tuple(agents),
-        horizon=setup.horizon,
-    )
-
-
 class _AttributesWhenAsked(Mapping[str, SampleAttributes]):
     """`sample_attributes`, made when one is asked for: an evaluation that is not broken down needs none."""
 
@@ -464,49 +433,3 @@ def _partial(covered: Coverage) -> Partial | None:
         expected=covered.expected,
         evaluated=covered.expected - missing,
     )
-
-
-_COUNTS = "counts"
-
-
-def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
-    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
-
-    `command` says which evaluation that is.
-    """
-    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
-
-
-def checkpoint_path(
-    out: str | os.PathLike[str],
-    setup: EvaluationSetup,
-    tokens: Collection[str],
-    fingerprints: Mapping[str, str],
-) -> Path:
-    """The folder beside `out` in which such a run keeps its counts.
-
-    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
-    and another devkit have another folder, and so never go on with these counts.
-
-    Args:
-        out: the folder that the finished evaluation goes to.
-        setup: task and rules.
-        tokens: the samples.
-        fingerprints: of the predictions and of the labels.
-    """
-    name = digest_of(
-        {
-            "devkit": __version__,
-            "setup": setup.as_dict(),
-            "tokens": sorted(tokens),
-            "fingerprints": dict(fingerprints),
-        }
-    )
-    return evaluation_store(out).folder / _COUNTS / name
-
-
-def remove_checkpoints(out: str | os.PathLike[str]) -> None:
-    """Remove all such folders beside `out`, once what they were for is written."""
-    store = evaluation_store(out)
-    remove_in(store.folder, _COUNTS)
-    store.remove()

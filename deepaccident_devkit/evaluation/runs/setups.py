@@ -5,23 +5,34 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    EvaluationError,
+    NotAvailableError,
+    ResultsError,
+    TokenError,
+)
 from deepaccident_devkit.evaluation.accident import ACCIDENT
 from deepaccident_devkit.evaluation.detection import DETECTION
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.motion import MOTION
-from deepaccident_devkit.evaluation.predictions import compared_labels, label_config
+from deepaccident_devkit.evaluation.predictions import compared_labels
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.task import FrozenDict, Task, TaskName, switched
 from deepaccident_devkit.evaluation.warning.evaluator import WARNING
-from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, samples
+from deepaccident_devkit.motion import MotionLabels, samples
 from deepaccident_devkit.motion.sample_lists import no_samples_text
-from deepaccident_devkit.parallel import Places
+from deepaccident_devkit.parallel import Places, Store, unfinished_folder
+from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import path_of, remove_in
 from deepaccident_devkit.support.text import choice, settle_choices, spelled
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLITS
 
@@ -270,6 +281,36 @@ class EvaluationSetup:
         }
 
 
+def default_selection(
+    setup: EvaluationSetup,
+    split: str | os.PathLike[str] = "val",
+    *,
+    samples: SampleList | None = None,
+    scope: ScopeName | None = None,
+    agents: Sequence[str] | None = None,
+) -> SampleSelection:
+    """The samples that a setup is evaluated at.
+
+    Args:
+        setup: its task and horizon.
+        split: `train`, `val`, … or the path of a split file.
+        samples: None for `all` of the task `warning`, which follows whole recordings, and else `evaluate`.
+        scope: None for `all` where all samples are evaluated, and else `accident`.
+        agents: whose; None for all.
+
+    Raises:
+        ChoiceError: no such list, scope or agent.
+    """
+    listed: SampleList = samples or ("all" if TASKS[setup.task].whole_recordings else "evaluate")
+    return SampleSelection(
+        split=os.fspath(split),
+        samples=listed,
+        scope=scope or ("all" if listed == "all" else "accident"),
+        agents=None if agents is None else tuple(agents),
+        horizon=setup.horizon,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class SampleLoader:
     """Makes the arguments of a setup's evaluator for a sample, except the token; cheap to pickle.
@@ -320,10 +361,52 @@ class SampleLoader:
         """The prediction of a sample, boxes in the protocol's frame."""
         return TASKS[self.setup.task].read(self.results, self.dataset, token, self.setup.rules)
 
-    def label_config(self) -> MotionLabelConfig | None:
-        """What the labels show that the results are compared with; None for explicit accidents of other setups."""
-        return label_config(self.setup.rules, self.results.form, self.setup.horizon)
-
     def label(self, token: str) -> MotionLabels | None:
-        """The sample's motion labels as `label_config` says; None where there is none to compare with."""
+        """The sample's motion labels that the results are compared with; None where there is none."""
         return compared_labels(self.dataset, token, self.setup.rules, self.results.form, self.setup.horizon)
+
+
+_COUNTS: Final = "counts"
+
+
+def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
+    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
+
+    `command` says which evaluation that is.
+    """
+    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
+
+
+def checkpoint_path(
+    out: str | os.PathLike[str],
+    setup: EvaluationSetup,
+    tokens: Collection[str],
+    fingerprints: Mapping[str, str],
+) -> Path:
+    """The folder beside `out` in which such a run keeps its counts.
+
+    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
+    and another devkit have another folder, and so never go on with these counts.
+
+    Args:
+        out: the folder that the finished evaluation goes to.
+        setup: task and rules.
+        tokens: the samples.
+        fingerprints: of the predictions and of the labels.
+    """
+    name = digest_of(
+        {
+            "devkit": __version__,
+            "setup": setup.as_dict(),
+            "tokens": sorted(tokens),
+            "fingerprints": dict(fingerprints),
+        }
+    )
+    return evaluation_store(out).folder / _COUNTS / name
+
+
+def remove_checkpoints(out: str | os.PathLike[str]) -> None:
+    """Remove all such folders beside `out`, once what they were for is written."""
+    store = evaluation_store(out)
+    remove_in(store.folder, _COUNTS)
+    store.remove()

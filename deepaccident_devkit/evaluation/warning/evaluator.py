@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident_truth import AccidentContext, accident_context, checked_facts
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
@@ -118,7 +117,7 @@ class WarningEvaluator(Evaluator[Any]):
     def compute(self, tokens: Iterable[str] | None = None) -> Result:
         """The metrics of all samples, beside those of the reference predictors; or of some, without."""
         if tokens is None:
-            return _result(list(self._counts.values()), self.protocol)
+            return self.protocol.result(list(self._counts.values()), references=True)
         result: Result = super().compute(tokens)
         return result
 
@@ -141,11 +140,6 @@ class WarningEvaluator(Evaluator[Any]):
         return not isinstance(self.protocol, FieldWarnings)
 
 
-def _truth(dataset: Dataset, token: str, rules: Protocol, form: Any, horizon: float) -> tuple[Any, ...]:
-    label = compared_labels(dataset, token, rules, form, horizon)
-    return label, accident_context(dataset, token, horizon, references=True)
-
-
 def _counts(
     token: str,
     prediction: Prediction,
@@ -157,18 +151,17 @@ def _counts(
     return sample_counts(token, prediction, label, context or AccidentContext())
 
 
-def _result(counts: Collection[Counts], protocol: Protocol) -> Result:
-    return protocol.result(counts, references=True)
-
-
 WARNING: Final = Task(
     name="warning",
     kinds=("motion", "accident"),
     protocols=WARNING_PROTOCOLS,
     evaluator=WarningEvaluator,
-    truth=_truth,
+    truth=lambda dataset, token, rules, form, horizon: (
+        compared_labels(dataset, token, rules, form, horizon),
+        accident_context(dataset, token, horizon, references=True),
+    ),
     counts=_counts,
-    result=_result,
+    result=lambda counts, protocol: protocol.result(counts, references=True),
     summary=TaskResult.as_dict,
     whole_recordings=True,
     needs_meta=True,

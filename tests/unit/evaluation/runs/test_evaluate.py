@@ -21,14 +21,14 @@ from deepaccident_devkit.evaluation.runs import (
     evaluation_run,
     scenario_hashes,
 )
-from deepaccident_devkit.evaluation.runs.evaluation_run import (
-    _partial,
-    breakdowns_of,
-    check_metas,
+from deepaccident_devkit.evaluation.runs.evaluation_run import _partial, breakdowns_of, check_metas
+from deepaccident_devkit.evaluation.runs.setups import (
+    Coverage,
+    EvaluationSetup,
+    TaskName,
     checkpoint_path,
     remove_checkpoints,
 )
-from deepaccident_devkit.evaluation.runs.setups import Coverage, EvaluationSetup, TaskName
 from deepaccident_devkit.splits import save_selection
 
 SETUP = EvaluationSetup(task="accident", protocol="boxes")
