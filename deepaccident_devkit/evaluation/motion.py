@@ -206,14 +206,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """The samples' counts as those of one sample of one frame, which have the same result."""
-        sums = {name: sum(each[name] for each in counts) for name in ("samples", "frames", "instance_maps")}
-        ranges = range(len(RANGES))
-        cells = [[sum(each["cells"][index][kind] for each in counts) for kind in range(3)] for index in ranges]
-        vpq = [
-            [[math.fsum(value for each in counts for value in each["vpq"][index][kind])] for kind in range(4)]
-            for index in ranges
-        ]
-        return [{**sums, "cells": cells, "vpq": vpq, "paths": _path_sums(counts)}]
+        return [_sums(counts)]
 
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
         """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
@@ -312,21 +305,31 @@ def _paths_of(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
     return trajectories(predict_instances(heads, _READ_FOR_PATHS), grid, half_cell_shift=False)
 
 
-def _path_sums(counts: Collection[Counts]) -> dict[str, float]:
-    return {name: total((each["paths"] for each in counts if each["paths"]), name) for name in _PATHS}
+def _sums(counts: Collection[Counts]) -> dict[str, Any]:
+    """The samples' counts as those of one sample of one frame."""
+    ranges, kinds = range(len(RANGES)), range(4)
+    vpq = [
+        [[math.fsum(chain.from_iterable(each["vpq"][index][kind] for each in counts))] for kind in kinds]
+        for index in ranges
+    ]
+    columns = [[*zip(*(each["cells"][index] for each in counts), strict=True)] for index in ranges]
+    paths = [each["paths"] for each in counts if each["paths"]]
+    return {
+        **{name: sum(each[name] for each in counts) for name in ("samples", "frames", "instance_maps")},
+        "cells": [[*map(sum, those or [()] * 3)] for those in columns],
+        "vpq": vpq,
+        "paths": {name: total(paths, name) for name in _PATHS},
+    }
 
 
 def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> MotionResult:
     """The metrics of some samples' counts, in any order."""
-    ranges = {
-        name: _range_result(index, counts, nothing_is_zero=protocol.nothing_is_zero)
-        for index, name in enumerate(RANGES)
-    }
-    paths = _path_sums(counts)
+    sums = _sums(counts)
+    paths, samples, number = (sums[name] for name in ("paths", "samples", "instance_maps"))
+    ranges = [_range_result(*each, protocol) for each in zip(sums["cells"], sums["vpq"], strict=True)]
     found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
-    samples, number = (sum(each[name] for each in counts) for name in ("samples", "instance_maps"))
     return MotionResult(
-        ranges=ranges,
+        ranges=dict(zip(RANGES, ranges, strict=True)),
         min_ade=ratio(paths["ade"], paths["count"]),
         min_fde=ratio(paths["fde"], paths["count"]),
         miss_rate=ratio(paths["missed"], paths["count"]),
@@ -336,24 +339,22 @@ def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> Motio
         path_false_positive=alarms,
         path_false_negative=lost,
         samples=samples,
-        frames=sum(each["frames"] for each in counts),
+        frames=sums["frames"],
         notes=(f"{number} of {samples} predictions: {_INSTANCE_MAPS}",) if number else (),
     )
 
 
-def _range_result(index: int, counts: Collection[Counts], *, nothing_is_zero: bool) -> RangeResult:
-    """Of the samples' [tp, fp, fn] cells, and of their four lists by frame, in one range."""
-    overlap, *numbers = (math.fsum(chain(*(each["vpq"][index][kind] for each in counts))) for kind in range(4))
-    found, alarms, missed = (int(number) for number in numbers)
+def _range_result(cells: Sequence[int], vpq: Sequence[Sequence[float]], protocol: MotionProtocol) -> RangeResult:
+    """Of the sums of [tp, fp, fn] cells, and of overlaps, found, false and missed instances."""
+    (overlap,), *numbers = vpq
+    found, alarms, missed = (int(number) for (number,) in numbers)
     quality = panoptic_quality(overlap, found, alarms, missed)
-    absent = 0.0 if nothing_is_zero else math.nan
-    percent = 100.0 if found or alarms or missed or nothing_is_zero else math.nan
-    cells = [
-        SegmentationCounts(true_positive=both, false_positive=mine, false_negative=true)
-        for both, mine, true in (each["cells"][index] for each in counts)
-    ]
+    absent = 0.0 if protocol.nothing_is_zero else math.nan
+    percent = 100.0 if found or alarms or missed or protocol.nothing_is_zero else math.nan
+    both, mine, true = cells
+    classes = [SegmentationCounts(true_positive=both, false_positive=mine, false_negative=true)]
     return RangeResult(
-        iou=100 * iou(cells, absent=absent),
+        iou=100 * iou(classes, absent=absent),
         pq=percent * quality.pq,
         sq=percent * quality.sq,
         rq=percent * quality.rq,
