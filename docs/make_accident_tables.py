@@ -9,8 +9,8 @@ import numpy as np
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.accident import PROTOCOLS, AccidentEvaluator, AccidentResult, accident_context
-from deepaccident_devkit.evaluation.choices import switched
 from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.evaluation.task import switched
 from deepaccident_devkit.motion import MotionHeads
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS

@@ -16,7 +16,7 @@ from make_accident_tables import HERE, put
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline, predict_results
 from deepaccident_devkit.evaluation.breakdowns import Group
-from deepaccident_devkit.evaluation.numbers import numbers_of
+from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.runs import SampleSelection, compare_bundles, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.synth import SynthConfig, make_release

@@ -18,8 +18,8 @@ from deepaccident_devkit.evaluation.detection import (
     DetectionResult,
     detection_truth,
 )
-from deepaccident_devkit.evaluation.detection.evaluator import detection_result
-from deepaccident_devkit.evaluation.detection.frame_counts import frame_counts
+from deepaccident_devkit.evaluation.detection.matching import frame_counts
+from deepaccident_devkit.evaluation.detection.result import detection_result
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
 from deepaccident_devkit.geometry import Boxes

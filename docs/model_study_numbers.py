@@ -12,8 +12,13 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import DetectedBoxes, Evaluator, MotionOutput, Resampling
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio, total
-from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS, Clusters, difference_intervals, intervals_of
-from deepaccident_devkit.evaluation.numbers import numbers_of
+from deepaccident_devkit.evaluation.intervals import (
+    LEAST_CLUSTERS,
+    Clusters,
+    difference_intervals,
+    intervals_of,
+    numbers_of,
+)
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID

@@ -20,8 +20,8 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.evaluation.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectionProtocol
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionProtocol
 from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, CleanWarnings
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera

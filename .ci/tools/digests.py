@@ -246,7 +246,7 @@ def add_evaluations(found: Found, dataset: Any, split: Path, folder: Path) -> No
     """Predictions of baselines; counts, numbers and breakdowns of each protocol of each task that takes them."""
     from deepaccident_devkit.baselines import predict_results
     from deepaccident_devkit.evaluation import read_results
-    from deepaccident_devkit.evaluation.runs.selection import SampleSelection
+    from deepaccident_devkit.evaluation.runs import SampleSelection
     from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, TASK_RESULTS
 
     tokens = SampleSelection(split=str(split), samples="all", scope="all").tokens(dataset)

@@ -50,8 +50,7 @@ from deepaccident_devkit.evaluation.runs import (
 from deepaccident_devkit.evaluation.runs.bundles import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.further import with_further
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
-from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
-from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
+from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, SampleList, ScopeName, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.release.fingerprints import digest_of

@@ -5,8 +5,6 @@ them into bundles that others can check, and looks for mistakes in predictions (
 attribute.
 """
 
-from typing import TYPE_CHECKING, Any
-
 from deepaccident_devkit.evaluation.accident import (
     AccidentContext,
     AccidentEvaluator,
@@ -20,13 +18,12 @@ from deepaccident_devkit.evaluation.accident import (
 )
 from deepaccident_devkit.evaluation.breakdowns import Breakdown, SampleAttributes, breakdown, sample_attributes
 from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator, DetectionResult, detection_truth
-from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.evaluator import Evaluator, evaluate_samples
+from deepaccident_devkit.evaluation.instances import match_trajectories, vpq_counts
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.motion import MotionEvaluator, MotionResult, motion_counts
-from deepaccident_devkit.evaluation.motion.overlaps import vpq_counts
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.trajectories import match_trajectories
 from deepaccident_devkit.evaluation.warning import (
     AnticipationResult,
     CleanWarnings,
@@ -34,9 +31,6 @@ from deepaccident_devkit.evaluation.warning import (
     FieldWarnings,
     WarningEvaluator,
 )
-
-if TYPE_CHECKING:
-    from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples
 
 __all__ = [
     "Accident",
@@ -76,16 +70,3 @@ __all__ = [
     "sample_attributes",
     "vpq_counts",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """Import `runs`, the uppermost room, when something of it is asked for: most who measure need none of it."""
-    if name != "evaluate_samples":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples
-
-    return evaluate_samples
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of
+from deepaccident_devkit.evaluation.task import FrozenMappings
 from deepaccident_devkit.selection.fields import FIELDS, full_name, group_texts
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import choice, natural_order

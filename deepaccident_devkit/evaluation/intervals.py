@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from fnmatch import fnmatchcase
+from itertools import chain
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.numbers import has_interval, numbers_of, range_of
+from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, LIMITS, Unit
 from deepaccident_devkit.support.arrays import FloatArray, IntArray, as_floats
 
 RESAMPLES: Final = 1000
@@ -246,3 +249,92 @@ def _notes(having: Mapping[str, int]) -> Iterator[str]:
 def _some(names: Sequence[str]) -> str:
     more = len(names) - _NAMED
     return ", ".join(names) if more <= 0 else f"{', '.join(names[:_NAMED])} and {more} others"
+
+
+_UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
+    {
+        "ranges/*/sq": "%",
+        "ranges/*/rq": "%",
+        "mean_iou": "%",
+        "iou/*": "%",
+        "path_accuracy": "share",
+        "area_under_curve": "share",
+        "mean_time": "s",
+        "recall": "share",
+        "precision": "share",
+        "time_in_alarm": "share",
+        "early_share": "share",
+        "tta_hit": "s",
+        "tta0": "s",
+        "tta0_after/*": "s",
+        "time_at_r80": "s",
+        "time_at_half": "s",
+        "precision_at_*": "share",
+        "recall_at_half": "share",
+        "alarm_seconds_per_minute": "1/min",
+        "episodes_per_minute": "1/min",
+        "shares/*": "share",
+        "warned": "share",
+        "extrapolated": "share",
+        "braking_seconds_per_minute": "1/min",
+    }
+)
+"""Pattern of paths → unit, of numbers that are no headlines."""
+_SIGNED: Final = ("lateness",)
+"""Numbers with a unit that can be below 0."""
+_WITHOUT: Final = (
+    "false_recordings",
+    *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
+    "median_*",
+)
+"""Totals, settings, and medians, which jump when a cluster is left out: the jackknife does not hold for them."""
+
+
+def numbers_of(result: object) -> dict[str, float]:
+    """The floats of a result by their path in it: `min_ade`, `ranges/30x30/iou`; whole numbers, texts and None not."""
+    return dict(_numbers(result, ""))
+
+
+def has_interval(path: str) -> bool:
+    """Whether a number is one that the jackknife holds for: neither a total, nor a setting, nor a median."""
+    return not _is_one_of(path, _WITHOUT)
+
+
+def range_of(path: str, alone: FloatArray) -> tuple[float, float]:
+    """The least and the most that a number can be; infinite for no limit.
+
+    By its unit: shares are in [0, 1], percents in [0, 100], lengths and times from 0. A number that is not of the
+    devkit's own has no unit: it is taken for a share if no cluster is outside [0, 1], and else for one that is never
+    below 0 if none is.
+
+    Args:
+        path: of the number.
+        alone: (C,) what it is in each of the clusters; NaN where there is nothing to count.
+    """
+    units = chain(HEADLINE_UNITS.items(), _UNITS.items())
+    unit = next((unit for pattern, unit in units if _is_one_of(path, (pattern,))), None)
+    if unit is not None:
+        return -math.inf if _is_one_of(path, _SIGNED) else 0.0, LIMITS.get(unit, math.inf)
+    there = alone[np.isfinite(alone)]
+    least = there.min(initial=0.0)
+    return (0.0, 1.0 if there.max(initial=0.0) <= 1 else math.inf) if least >= 0 else (-math.inf, math.inf)
+
+
+def _is_one_of(path: str, patterns: tuple[str, ...]) -> bool:
+    """Whether a pattern fits the path, or its end, as of the results `beside` others."""
+    return any(fnmatchcase(path, pattern) or fnmatchcase(path, f"*/{pattern}") for pattern in patterns)
+
+
+def _numbers(value: object, path: str) -> Iterator[tuple[str, float]]:
+    parts: Mapping[Any, object] = {}
+    if isinstance(value, float):
+        yield path, value
+    elif is_dataclass(value):
+        parts = {field.name: getattr(value, field.name) for field in fields(value)}
+    elif isinstance(value, Mapping):
+        parts = value
+    elif isinstance(value, (list, tuple)):
+        parts = dict(enumerate(value))
+    for key, part in parts.items():
+        name = f"{key:g}" if isinstance(key, float) else str(key)
+        yield from _numbers(part, f"{path}/{name}" if path else name)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, GeometryError
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.geometry.bev_grid import Orientation
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabels
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels, motion_labels
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     FloatArray,
@@ -23,6 +24,7 @@ from deepaccident_devkit.support.arrays import (
     checked_number,
     checked_whole,
 )
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _AXES: Final = {"segmentation": (5,), "centerness": (4, 5), "offset": (5,), "flow": (5,)}
 """Of K stacked predictions; centerness may lack that of its only channel."""
@@ -231,6 +233,31 @@ _TINY: Final = 1e-6
 """Cells: edges of a range fall on edges of cells, apart from rounding."""
 
 
+def compared_labels(dataset: Dataset, token: str, rules: Any, form: Any, horizon: float) -> MotionLabels | None:
+    """The sample's motion labels as `label_config` says; None where there is none to compare with."""
+    config = label_config(rules, form, horizon)
+    return None if config is None else motion_labels(dataset, token, config)
+
+
+def label_config(rules: Any, form: Any, horizon: float) -> MotionLabelConfig | None:
+    """What the labels show that predictions are compared with; None for explicit accidents by rules without labels.
+
+    Args:
+        rules: whose `labels` name the label protocol, where they have it; else the form does.
+        form: `Results.form`, how motion is stored; None for explicit accidents.
+        horizon: seconds that the labels look ahead.
+    """
+    labels = getattr(rules, "labels", None)
+    if form is not None:
+        step, protocol = round(form.step / FRAME_PERIOD), labels or form.labels or "clean"
+        config = MotionLabelConfig(grid=form.grid, step=step, protocol=protocol)
+    elif hasattr(rules, "labels"):
+        config = MotionLabelConfig(protocol=labels or "released")
+    else:
+        return None
+    return replace(config, future_frames=round(horizon / (config.step * FRAME_PERIOD)))
+
+
 def labels_at_present(label: MotionLabels) -> MotionLabels:
     """Labels with every frame in the present ego frame, warped with bilinear centres where they are not yet."""
     return label if label.at_present else label.to_present(centerness="bilinear")
@@ -260,27 +287,31 @@ def checked_pair(prediction: object, label: object) -> tuple[MotionOutput, Motio
     return prediction, label
 
 
-def check_protocol(label: MotionLabels, protocol: str | None) -> None:
-    """Whether labels are of a protocol, None for any; raises EvaluationError."""
+def compared_frames(prediction: MotionOutput | list[Accident], label: MotionLabels, protocol: str | None) -> int:
+    """How many frames of a prediction are compared with labels; explicit accidents fit all labels.
+
+    Raises:
+        EvaluationError: the labels are of another label protocol (None for any) or have no frame that is in the
+            recording, or the prediction covers other ground or has too few frames.
+    """
     if protocol is not None and label.config.rules != LABEL_PROTOCOLS[protocol]:
         raise EvaluationError(
             f"labels: expected those of the label protocol {protocol!r}, found others; make them with "
             f"MotionLabelConfig(protocol={protocol!r}), or give the metrics' protocol another value of its field labels"
         )
-
-
-def check_output(output: MotionOutput, label: MotionLabels, frames: int) -> None:
-    """Whether a prediction covers a label's ground and its first frames; raises EvaluationError."""
-    grid = label.config.grid
-    if (output.grid.x, output.grid.y) != (grid.x, grid.y):
+    frames, grid = frames_there(label), label.config.grid
+    if not isinstance(prediction, MotionOutput):
+        return frames
+    if (prediction.grid.x, prediction.grid.y) != (grid.x, grid.y):
         raise EvaluationError(
-            f"prediction: its cells cover x {output.grid.x}, y {output.grid.y}; expected those of the labels, "
+            f"prediction: its cells cover x {prediction.grid.x}, y {prediction.grid.y}; expected those of the labels, "
             f"x {grid.x}, y {grid.y}: make both with the same grid"
         )
-    heads, maps = output.heads or (), () if output.instances is None else output.instances
-    predicted = min([*(len(each.segmentation) for each in heads), *map(len, maps)])
+    maps = () if prediction.instances is None else prediction.instances
+    predicted = min([*(len(each.segmentation) for each in prediction.heads or ()), *map(len, maps)])
     if predicted < frames:
         raise EvaluationError(f"prediction: expected at least {frames} frames from the present on, found {predicted}")
+    return frames
 
 
 def first_frames(heads: MotionHeads, frames: int) -> MotionHeads:

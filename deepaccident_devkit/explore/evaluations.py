@@ -13,9 +13,9 @@ import msgspec
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.accident.scoring import AccidentsWithin
 from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, EVERYTHING
-from deepaccident_devkit.evaluation.numbers import LIMITS, value_text
 from deepaccident_devkit.evaluation.runs import Bundle
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE, Line
+from deepaccident_devkit.evaluation.task import LIMITS, value_text
 from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
 from deepaccident_devkit.render.outcomes.above import count_words

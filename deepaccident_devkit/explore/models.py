@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.numbers import headlines, value_text
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import Bundle, read_bundle
-from deepaccident_devkit.evaluation.runs.selection import scenario_of
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName, scenario_of
+from deepaccident_devkit.evaluation.task import headlines, value_text
 from deepaccident_devkit.explore.background import Job, Jobs
 from deepaccident_devkit.explore.evaluations import finite
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS

@@ -17,7 +17,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation import DetectionEvaluator, MotionEvaluator, detection_truth
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectedBoxes
-from deepaccident_devkit.evaluation.motion.evaluator import MOTION_PROTOCOLS
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, collate_all_egos, merged_evaluator
 from deepaccident_devkit.model.detection import detection_losses, detection_targets
 from deepaccident_devkit.model.inputs import ModelInputs, mirrored_boxes, model_inputs

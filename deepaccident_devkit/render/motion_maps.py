@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.instances import instance_paths
 from deepaccident_devkit.evaluation.predictions import MotionOutput
-from deepaccident_devkit.evaluation.trajectories import instance_paths
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import to_orientation
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionHeads, MotionLabels, PostProcessing, predict_instances

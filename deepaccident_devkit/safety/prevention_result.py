@@ -17,7 +17,7 @@ from deepaccident_devkit.accidents.outcomes import BRAKINGS, OUTCOMES, Braking
 from deepaccident_devkit.accidents.recorded import Skipped
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import ratio
-from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.task import FrozenMappings
 from deepaccident_devkit.evaluation.warning.recordings import MINUTE, AlarmRuns, Drive, ScoresOf, series_of
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import FRAME_PERIOD

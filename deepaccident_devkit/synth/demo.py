@@ -21,10 +21,10 @@ from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError, MissingRoomError
-from deepaccident_devkit.evaluation.numbers import headlines
 from deepaccident_devkit.evaluation.results import ResultsTask, read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.render import detached_figure, render_replay
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report

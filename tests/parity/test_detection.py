@@ -23,10 +23,15 @@ from deepaccident_devkit.evaluation.detection import (
     DetectionResult,
 )
 from deepaccident_devkit.evaluation.detection.boxes import BoxColumns
-from deepaccident_devkit.evaluation.detection.evaluator import detection_result
-from deepaccident_devkit.evaluation.detection.frame_counts import class_codes, frame_counts, ring_of
-from deepaccident_devkit.evaluation.detection.matching import ERRORS, highest_score_by_truth, nearest_by_truth
-from deepaccident_devkit.evaluation.detection.result import mean_of
+from deepaccident_devkit.evaluation.detection.matching import (
+    ERRORS,
+    class_codes,
+    frame_counts,
+    highest_score_by_truth,
+    nearest_by_truth,
+    ring_of,
+)
+from deepaccident_devkit.evaluation.detection.result import detection_result, mean_of
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.evaluation.motion.overlaps import (
+from deepaccident_devkit.evaluation.instances import (
     PanopticQuality,
     SegmentationCounts,
     VpqCounts,

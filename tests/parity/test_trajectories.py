@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from deepaccident_devkit.evaluation.trajectories import longest, match_trajectories, padded, trajectory_errors
+from deepaccident_devkit.evaluation.instances import longest, match_trajectories, padded, trajectory_errors
 
 CELL = 0.5
 pytestmark = pytest.mark.golden_cases("d_accident", "samples")

@@ -11,11 +11,17 @@ from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 from shapely import MultiPoint, get_coordinates
 
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.alarms.hulls import convex_hulls, hull_distances
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading, InstanceTracks, accident_of, match_tracks
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext
+from deepaccident_devkit.evaluation.map_accidents import (
+    AccidentReading,
+    InstanceTracks,
+    accident_of,
+    convex_hulls,
+    hull_distances,
+    match_tracks,
+)
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS

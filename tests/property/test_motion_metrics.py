@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 
+from deepaccident_devkit.evaluation.instances import iou, longest, mask_counts, match_trajectories, padded, vpq_counts
 from deepaccident_devkit.evaluation.motion import MotionEvaluator, motion_counts
-from deepaccident_devkit.evaluation.motion.overlaps import iou, mask_counts, vpq_counts
 from deepaccident_devkit.evaluation.predictions import instances_of
-from deepaccident_devkit.evaluation.trajectories import longest, match_trajectories, padded
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels
 

@@ -28,12 +28,12 @@ TESTS = {
     "motion": "unit/motion property/test_motion_labels property/test_postprocessing property/test_warps "
     "parity/test_fiery parity/test_labels parity/test_postprocess parity/test_trajectories parity/test_visibility "
     "parity/test_warps",
-    "evaluation/metrics": "unit/evaluation/metrics property/test_accident property/test_detection "
-    "property/test_motion_metrics parity/test_accident parity/test_anticipation parity/test_attributes "
-    "parity/test_detection parity/test_motion",
     "evaluation/results": "unit/evaluation/results",
     "evaluation/runs": "unit/evaluation/runs test_cli_evaluate",
     "evaluation/__init__": "unit/evaluation/runs",
+    "evaluation": "unit/evaluation property/test_accident property/test_detection property/test_motion_metrics "
+    "parity/test_accident parity/test_anticipation parity/test_attributes parity/test_detection parity/test_motion "
+    "parity/test_trajectories",
     "v2x": "unit/v2x unit/baselines/test_oracle property/test_v2x parity/test_poses parity/test_visibility",
     "splits": "unit/test_splits",
 }

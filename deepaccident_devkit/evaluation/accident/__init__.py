@@ -1,20 +1,34 @@
-"""How well accidents are foreseen, by three protocols."""
+"""How well accidents are foreseen, by three protocols: the task `ACCIDENT` and its evaluator."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
+from types import MappingProxyType
+from typing import Any, Final
 
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.accident.evaluator import (
-    PROTOCOLS,
-    AccidentEvaluator,
-    AccidentProtocol,
-    ComparedAccidents,
-    compared_accidents,
-)
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents
-from deepaccident_devkit.evaluation.accident.scoring import DISTANCES, AccidentResult, AccidentsWithin
-from deepaccident_devkit.evaluation.alarms.raised import foreseen_accident
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext, BoxTruth, accident_context, box_truth
-from deepaccident_devkit.evaluation.predictions import Prediction
+from deepaccident_devkit.evaluation.accident.scoring import (
+    DISTANCES,
+    AccidentResult,
+    AccidentsWithin,
+    ComparedAccidents,
+)
+from deepaccident_devkit.evaluation.accident_truth import (
+    AccidentContext,
+    BoxTruth,
+    accident_context,
+    box_truth,
+    checked_facts,
+    foreseen_accident,
+)
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading
+from deepaccident_devkit.evaluation.predictions import Prediction, checked_prediction, compared_labels
+from deepaccident_devkit.evaluation.task import Task, protocol_of
+from deepaccident_devkit.motion import MotionLabels
 
 __all__ = [
     "DISTANCES",
@@ -36,3 +50,113 @@ __all__ = [
     "compared_accidents",
     "foreseen_accident",
 ]
+
+
+AccidentProtocol = ReleasedAccidents | PaperAccidents | BoxAccidents
+PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
+    {"released": ReleasedAccidents(), "paper": PaperAccidents(), "boxes": BoxAccidents()}
+)
+"""`released` is what the released code computes, `paper` what the paper's text says, `boxes` compares with the labels
+themselves and not with rasters."""
+
+
+def sample_counts(
+    _token: str,
+    prediction: Prediction,
+    label: MotionLabels | None,
+    context: AccidentContext | None,
+    protocol: AccidentProtocol,
+) -> Counts:
+    """What one sample adds: `counts` of `BoxAccidents`, `PaperAccidents`, or of `ReleasedAccidents` (motion alone)."""
+    checked_facts(label, context)
+    return dict(protocol.counts(checked_prediction(prediction), label, context or AccidentContext()))
+
+
+class AccidentEvaluator(Evaluator[AccidentResult]):
+    """Accident prediction accuracy and the errors of the accidents that are foreseen.
+
+    >>> evaluator = AccidentEvaluator(protocol="released")
+    >>> len(evaluator)
+    0
+    """
+
+    def __init__(self, protocol: str | AccidentProtocol = "released") -> None:
+        """Start without samples.
+
+        Args:
+            protocol: of `PROTOCOLS` by name, or one of them with other fields.
+
+        Raises:
+            ChoiceError: no protocol has that name, or it is of another type.
+        """
+        super().__init__()
+        self.protocol = protocol_of(protocol, AccidentProtocol, PROTOCOLS)  # type: ignore[arg-type]  # a union is a kind too
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The protocol and its choices."""
+        return {"protocol": type(self.protocol).__name__, "choices": asdict(self.protocol)}
+
+    def update(
+        self,
+        token: str,
+        prediction: Prediction,
+        label: MotionLabels | None = None,
+        context: AccidentContext | None = None,
+    ) -> None:
+        """Count one sample.
+
+        Args:
+            token: of the sample.
+            prediction: what a model says.
+            label: the sample's motion labels, each frame in its own frame or all at the present. Those in their own
+                frames are warped to the present with bilinear centres, as the released evaluation does. The protocol
+                `boxes` needs none.
+            context: other facts on the sample, from `accident_context`, with the truth of `boxes`; None for nothing.
+
+        Raises:
+            EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample came before with
+                another outcome.
+        """
+        self.add(token, sample_counts(token, prediction, label, context, self.protocol))
+
+    def result_of(self, counts: Collection[Counts]) -> AccidentResult:
+        """The metrics of some samples' counts, in any order."""
+        return self.protocol.result(counts)
+
+    def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
+        """Fewer counts with the same result."""
+        return self.protocol.pooled(counts)
+
+
+def compared_accidents(
+    prediction: Prediction, label: MotionLabels | None, context: AccidentContext, protocol: AccidentProtocol
+) -> ComparedAccidents:
+    """Which accidents a protocol sees in a prediction and in the truth.
+
+    Args:
+        prediction: what a model says; of one that `protocol.counts` takes.
+        label: the sample's motion labels, where the protocol compares with those.
+        context: other facts on the sample.
+        protocol: by which accidents are seen.
+
+    Raises:
+        EvaluationError: the prediction is neither motion nor accidents, or the protocol lacks its truth.
+    """
+    return protocol.compared(checked_prediction(prediction), label, context)
+
+
+ACCIDENT: Final = Task(
+    name="accident",
+    kinds=("motion", "accident"),
+    protocols=PROTOCOLS,
+    evaluator=AccidentEvaluator,
+    truth=lambda dataset, token, rules, form, horizon: (
+        compared_labels(dataset, token, rules, form, horizon),
+        accident_context(dataset, token, horizon),
+    ),
+    counts=sample_counts,
+    result=lambda counts, protocol: protocol.result(counts),
+    summary=AccidentResult.as_dict,
+    needs_meta=True,
+)

@@ -18,6 +18,7 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     ERRORS_AT,
     AccidentResult,
     Alarm,
+    ComparedAccidents,
     alarms_tally,
     exact_parts,
     foreseen,
@@ -26,11 +27,19 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.alarms.raised import Pair, named_alarms, position_difference, within_horizon
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.alarms.truth import SLACK, UNPLACED_NOTE, AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.accident_truth import (
+    SLACK,
+    UNPLACED_NOTE,
+    AccidentContext,
+    BoxTruth,
+    Pair,
+    named_alarms,
+    position_difference,
+    within_horizon,
+)
 from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.predictions import Accident, Prediction, checked_prediction
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 
 _ASIDE = ("at_impact", "unplaced")
@@ -126,6 +135,22 @@ class BoxAccidents:
             "at_impact": truth.accident is not None and truth.accident.time < SLACK,
             "unplaced": truth.is_unplaced,
         }
+
+    def compared(
+        self, given: MotionOutput | list[Accident], label: MotionLabels | None, context: AccidentContext
+    ) -> ComparedAccidents:
+        """Which accidents it sees; raises EvaluationError."""
+        truth = context.truth
+        if truth is None:
+            raise EvaluationError(
+                "context: the protocol 'boxes' needs its truth; make it with accident_context(…, horizon)"
+            )
+        alarms = named_alarms(given, label, truth, self.reading)
+        return ComparedAccidents(
+            true=truth.accident,
+            predicted=tuple(alarm for alarm, _ in alarms),
+            unplaced=truth.unplaced if truth.is_unplaced else None,
+        )
 
     def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
         """The metrics of some samples' counts, in any order."""

@@ -14,6 +14,7 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     ERRORS_AT,
     AccidentResult,
     Alarm,
+    ComparedAccidents,
     actor_of,
     alarms_tally,
     foreseen,
@@ -21,33 +22,39 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.alarms.raised import MATCH_DISTANCE, by_sureness, nearest_two, position_difference
-from deepaccident_devkit.evaluation.alarms.reading import (
+from deepaccident_devkit.evaluation.accident_truth import (
+    MATCH_DISTANCE,
+    AccidentContext,
+    by_sureness,
+    nearest_two,
+    position_difference,
+)
+from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
     InstanceAccident,
     accident_of,
     instances_of_heads,
     match_tracks,
+    predicted_accidents,
 )
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext
-from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,
     Prediction,
-    check_output,
-    check_protocol,
     checked_prediction,
+    compared_frames,
     first_frames,
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.motion import LabelProtocol, MotionHeads, MotionLabels
+from deepaccident_devkit.motion import MotionHeads, MotionLabels
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 SampleChoice = Literal["best", "mean_first"]
+_NO_LABEL: Final = "label: the accident protocol 'paper' needs the sample's motion labels"
 _FORMS: Final[Mapping[str, str]] = {"instance_maps": "instance maps", "explicit": "explicit accidents"}
 """Forms of a prediction that are not heads, as counts and as notes have them."""
 
@@ -90,10 +97,10 @@ class PaperAccidents:
             EvaluationError: the prediction is neither motion nor accidents, no labels or those of another protocol,
                 another grid, too few frames.
         """
-        given, label = self._checked(prediction, label)
-        frames, rules = frames_there(label), label.config.rules
-        if isinstance(given, MotionOutput):
-            check_output(given, label, frames)
+        if label is None:
+            raise EvaluationError(_NO_LABEL)
+        given = checked_prediction(prediction)
+        frames, rules = compared_frames(given, label, self.labels), label.config.rules
         label = labels_at_present(label)
         shown = self.truth_map(given, label, frames)
         truth = accident_of(shown, label.config.grid, rules, self.reading)
@@ -104,7 +111,7 @@ class PaperAccidents:
             actors = [actor_of(shown[frame] == identity, frame, label, context) for identity in ids]
         alarms: list[Alarm | None]
         if isinstance(given, MotionOutput):
-            read = self.read_predictions(given, frames, rules)
+            read = predicted_accidents(given, rules, self.reading, frames)
             alarms = [_alarm(found, truth, seconds) if found.contact else None for found in read]
         else:
             alarms = [
@@ -120,6 +127,20 @@ class PaperAccidents:
             "mean_first": next((alarm for alarm in (*alarms[-1:], *alarms[:-1]) if alarm), None),
         }
 
+    def compared(
+        self, given: MotionOutput | list[Accident], label: MotionLabels | None, _context: AccidentContext
+    ) -> ComparedAccidents:
+        """Which accidents it sees; raises EvaluationError."""
+        if label is None:
+            raise EvaluationError(_NO_LABEL)
+        frames, labels, step = frames_there(label), label.config.rules, label.config.step * FRAME_PERIOD
+        shown = self.truth_map(given, labels_at_present(label), frames)
+        true = accident_of(shown, label.config.grid, labels, self.reading).explicit(step)
+        if isinstance(given, MotionOutput):
+            read = [each.explicit(step) for each in predicted_accidents(given, labels, self.reading, frames)]
+            return ComparedAccidents(true=true, predicted=tuple(each for each in read if each is not None))
+        return ComparedAccidents(true=true, predicted=tuple(surest_within(given, (frames - 0.5) * step)))
+
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
         given = _united(counts)
@@ -132,27 +153,11 @@ class PaperAccidents:
         """The sums of all counts, which have the same result."""
         return [{"tallies": _united(counts)}]
 
-    def _checked(
-        self, prediction: Prediction, label: MotionLabels | None
-    ) -> tuple[MotionOutput | list[Accident], MotionLabels]:
-        if label is None:
-            raise EvaluationError("label: the accident protocol 'paper' needs the sample's motion labels")
-        check_protocol(label, self.labels)
-        return checked_prediction(prediction), label
-
     def truth_map(self, given: MotionOutput | list[Accident], label: MotionLabels, frames: int) -> AnyArray:
         """(T, H, W) the instances that a prediction is compared with, of labels at the present; as the labels lie."""
         if not isinstance(given, MotionOutput) or given.heads is None:
             return label.instance[:frames]
         return instances_of_heads(first_frames(MotionHeads.from_labels(label), frames))
-
-    def read_predictions(self, output: MotionOutput, frames: int, rules: LabelProtocol) -> list[InstanceAccident]:
-        """What is read off each of the K predictions, cut to so many frames."""
-        if output.heads is not None:
-            maps = [instances_of_heads(first_frames(heads, frames)) for heads in output.heads]
-        else:
-            maps = [] if output.instances is None else [each[:frames] for each in output.instances]
-        return [accident_of(each, output.grid, rules, self.reading) for each in maps]
 
 
 def _united(counts: Collection[Counts]) -> dict[str, Any]:

@@ -19,25 +19,25 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     DISTANCES,
     ERRORS,
     AccidentResult,
+    ComparedAccidents,
     actor_of,
     named,
     sample_tally,
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.alarms.raised import position_difference
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext, position_difference
 from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.instances import Paths, instance_paths, longest, match_trajectories, padded
 from deepaccident_devkit.evaluation.predictions import (
+    Accident,
     MotionOutput,
     Prediction,
-    check_output,
-    check_protocol,
+    compared_frames,
     first_frames,
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.trajectories import Paths, instance_paths, longest, match_trajectories, padded
 from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.exact.outlines import pair_gaps
 from deepaccident_devkit.geometry import BevGrid
@@ -49,6 +49,7 @@ from deepaccident_devkit.motion import (
     trajectories,
 )
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Pair = tuple[int, int]
 _NOTHING_FOUND: Final = {"id": 1.0, "position": 20.0, "time": 1.0}
@@ -78,6 +79,9 @@ class ReleasedAccidents:
     prediction_gap: ClassVar[float] = 5.0
     """Cells; the predicted instances that are nearer collide: 2.5 m. The paper has 1 m for both."""
 
+    maps_alone: ClassVar[bool] = True
+    """It compares no explicit accidents."""
+
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.
 
@@ -89,9 +93,7 @@ class ReleasedAccidents:
                 "the released protocol compares motion: give a MotionOutput and the sample's motion labels; "
                 "explicit accidents are for protocol='paper' or 'boxes'"
             )
-        check_protocol(label, self.labels)
-        frames = frames_there(label)
-        check_output(prediction, label, frames)
+        frames = compared_frames(prediction, label, self.labels)
         label = labels_at_present(label)
         truth, present = self.truth_paths(label, frames)
         points = longest(truth.paths) or len(truth.drawn)
@@ -102,6 +104,33 @@ class ReleasedAccidents:
         counts, pair = accident_counts(predictions, truth, matches)
         actors = None if pair is None else [actor_of(present == name, 0, label, context) for name in pair]
         return counts | {"named": named(actors, context)}
+
+    def compared(
+        self, given: MotionOutput | list[Accident], label: MotionLabels | None, _context: AccidentContext
+    ) -> ComparedAccidents:
+        """Which accidents it sees; raises EvaluationError."""
+        if label is None or not isinstance(given, MotionOutput):
+            raise EvaluationError("the released protocol compares motion: give a MotionOutput and the motion labels")
+        frames = frames_there(label)
+        truth, _ = self.truth_paths(labels_at_present(label), frames)
+        points = longest(truth.paths) or len(truth.drawn)
+        last = points - 1
+
+        def found(paths: DrawnPaths, gap: float) -> list[Accident]:
+            padded = padded_paths(paths, points)
+            pair = collision(padded, last, gap)
+            if pair is None:
+                return []
+            positions = np.array([padded.paths[name][last] for name in pair])
+            return [Accident(positions=positions, time=last * (label.config.step * FRAME_PERIOD))]
+
+        predictions = self.prediction_paths(given, frames)
+        if not predictions[0].paths:
+            predictions = []
+        return ComparedAccidents(
+            true=next(iter(found(truth, self.truth_gap)), None),
+            predicted=tuple(alarm for each in predictions for alarm in found(each, self.prediction_gap)),
+        )
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""

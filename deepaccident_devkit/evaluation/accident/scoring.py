@@ -10,10 +10,11 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.alarms.reading import TIE, even
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
-from deepaccident_devkit.evaluation.numbers import TaskResult
+from deepaccident_devkit.evaluation.map_accidents import TIE, even
+from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.support.arrays import BoolArray, ShortRepr
 
@@ -69,6 +70,18 @@ class AccidentResult(TaskResult):
     """
 
     task: ClassVar[str] = "accident"
+    rows: ClassVar[tuple[Row, ...]] = (
+        Row("apa", "apa", "share", "higher"),
+        Row("precision", "precision", "share", "higher"),
+        Row("recall", "recall", "share", "higher"),
+        Row("false_alarm_rate", "false_alarm_rate", "share"),
+        Row("average_precision", "average_precision", "share", "higher"),
+        Row("within/*/accuracy", "accuracy@*", "share", "higher"),
+        Row("id_error", "id_error", "share"),
+        Row("position_error", "position_error", "m"),
+        Row("time_error", "time_error", "s"),
+        Row("lateness", "lateness", "s", "neither"),
+    )
     within: Mapping[float, AccidentsWithin]
     apa: float
     id_error: float | None
@@ -80,6 +93,21 @@ class AccidentResult(TaskResult):
     truths: Mapping[str, int]
     notes: tuple[str, ...] = ()
     beside: Mapping[str, AccidentResult] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedAccidents(ShortRepr):
+    """The accidents of one sample, in the present ego frame; those read off maps have no `ids`.
+
+    Attributes:
+        true: the accident to come, by the protocol; None without one.
+        predicted: the accidents foreseen, one for each alarm, or for each prediction with one.
+        unplaced: seconds to an impact within the horizon that no place is known of (`BoxTruth.unplaced`); None without.
+    """
+
+    true: Accident | None
+    predicted: tuple[Accident, ...]
+    unplaced: float | None = None
 
 
 ERRORS: Final = ("id", "position", "time")

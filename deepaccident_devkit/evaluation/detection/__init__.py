@@ -1,14 +1,40 @@
-"""Detection metrics: average precision and errors of boxes, by the released code's rules, the paper's and others."""
+"""Detection metrics: average precision and errors of boxes, by the released code's rules, the paper's and others.
 
-from deepaccident_devkit.evaluation.detection.boxes import DetectedBoxes, detection_truth
-from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
-from deepaccident_devkit.evaluation.detection.frame_counts import DetectionMatches, detection_matches
-from deepaccident_devkit.evaluation.detection.protocols import (
+The task is `DETECTION`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
+from deepaccident_devkit.evaluation.detection.boxes import (
     DETECTION_PROTOCOLS,
+    DetectedBoxes,
     DetectionProtocol,
+    columns_of,
     detection_protocol,
+    detection_truth,
 )
-from deepaccident_devkit.evaluation.detection.result import DetectionResult
+from deepaccident_devkit.evaluation.detection.matching import (
+    Ring,
+    boxes_taken,
+    frame_counts,
+    nearest_by_score,
+    nearest_by_truth,
+    ring_of,
+)
+from deepaccident_devkit.evaluation.detection.result import DetectionResult, Ledger, detection_result, drawn_results
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.task import Task
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry.boxes import checked_boxes
+from deepaccident_devkit.support.arrays import FrozenArrays, IntArray
 
 __all__ = [
     "DETECTION_PROTOCOLS",
@@ -21,3 +47,176 @@ __all__ = [
     "detection_protocol",
     "detection_truth",
 ]
+
+
+def sample_counts(token: str, prediction: DetectedBoxes, truth: Boxes, protocol: DetectionProtocol) -> Counts:
+    """What one sample adds: what `frame_counts` has of its boxes, beside its token."""
+    if not isinstance(prediction, DetectedBoxes):
+        raise EvaluationError(
+            f"{token}: expected DetectedBoxes as the prediction, found {type(prediction).__name__}; make them with "
+            f"DetectedBoxes.from_arrays(center, size, yaw, scores, frame={protocol.frame!r}), of no rows "
+            "where nothing is detected"
+        )
+    for name, boxes in (("prediction", prediction.boxes), ("truth", checked_boxes("truth", truth))):
+        if boxes.frame != protocol.frame:
+            raise GeometryError(
+                f"{token}: {name} in frame {boxes.frame!r}, the protocol counts in {protocol.frame!r}; "
+                "transform them, or choose frame="
+            )
+    counts = frame_counts(columns_of(prediction.boxes, prediction.scores), columns_of(truth), protocol)
+    return {"token": token, **counts}
+
+
+class DetectionEvaluator(Evaluator[DetectionResult]):
+    """Counts matches of detected and true boxes by sample; `compute` makes curves and errors of them.
+
+    ```python
+    evaluator = DetectionEvaluator("paper")
+    for token in samples(da, "val", "evaluate", "paper"):
+        evaluator.update(token, detector(token), detection_truth(da, token, evaluator.protocol))
+    print(evaluator.compute().mean_average_precision, evaluator.compute().mean_errors)
+    ```
+
+    Attributes:
+        protocol: the rules, with the switches that were given.
+    """
+
+    def __init__(self, protocol: str | DetectionProtocol = "released", **switches: Any) -> None:
+        """Start without samples.
+
+        Args:
+            protocol: `released` (its distance_mAP), `released_iou` (its iou_mAP), `paper`, `opencood`, or your own.
+            **switches: fields of `DetectionProtocol` to change.
+
+        Raises:
+            ChoiceError: no such protocol, switch or choice.
+            ConfigError: choices that exclude each other.
+        """
+        super().__init__()
+        self.protocol = detection_protocol(protocol, **switches)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The protocol's choices."""
+        return self.protocol.as_dict()
+
+    def update(self, token: str, prediction: DetectedBoxes, truth: Boxes) -> None:
+        """Take a sample.
+
+        Args:
+            token: the sample's.
+            prediction: what was detected, in the protocol's frame; may be empty.
+            truth: the true boxes in that frame, as `detection_truth` gives them; the protocol's own box, area and
+                ranges are applied here.
+
+        Raises:
+            GeometryError: the truth is not of boxes, or boxes are in another frame.
+            EvaluationError: the prediction is not of boxes, or the sample came before, with another result.
+        """
+        self.add(token, sample_counts(token, prediction, truth, self.protocol))
+
+    def result_of(self, counts: Collection[Counts]) -> DetectionResult:
+        """The metrics of some samples' counts, in any order."""
+        return detection_result(counts, self.protocol)
+
+    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[DetectionResult]:
+        """The result of each draw (`Evaluator.resampled`); what does not depend on the draw is made once."""
+        owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        ledger = Ledger([counts for part in parts for counts in part], self.protocol)
+        yield from drawn_results(ledger, self.protocol, times[:, owner[ledger.order]].astype(np.int32))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DetectionMatches(FrozenArrays):
+    """The matches of one sample at one threshold, with all detections at once; rows of the boxes given.
+
+    Boxes that do not count (beyond the protocol's area and ranges, of other classes, or matched with such) are in none.
+
+    Attributes:
+        threshold: metres or a share, of the protocol's.
+        detection: (M,) int64 detections that are true positives.
+        truth: (M,) int64 the true box of each.
+        false: (F,) int64 detections without a true box.
+        missed: (G,) int64 true boxes without a detection.
+    """
+
+    threshold: float
+    detection: IntArray
+    truth: IntArray
+    false: IntArray
+    missed: IntArray
+
+
+def detection_matches(
+    prediction: DetectedBoxes,
+    truth: Boxes,
+    protocol: str | DetectionProtocol = "released",
+    threshold: float | None = None,
+) -> DetectionMatches:
+    """Match one sample's detections with its true boxes as `DetectionEvaluator` does.
+
+    Args:
+        prediction: what was detected, in the protocol's frame.
+        truth: the true boxes in that frame, as `detection_truth` gives them.
+        protocol: name, or a protocol.
+        threshold: one of the protocol's; None for that of its errors, or else the middle one.
+
+    Raises:
+        ChoiceError: no such protocol, or not one of its thresholds.
+    """
+    rules = detection_protocol(protocol)
+    middle = rules.thresholds[len(rules.thresholds) // 2]
+    chosen = threshold or rules.error_threshold or middle
+    if chosen not in rules.thresholds:
+        raise ChoiceError(f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found {threshold!r}")
+    detected, true = columns_of(prediction.boxes, prediction.scores), columns_of(truth)
+    (detected, rows), (true, true_rows) = boxes_taken(detected, true, rules)
+    pairs: list[tuple[int, int]] = []
+    unmatched: set[int] = set()
+    missed: set[int] = set()
+    for position in range(len(rules.ranges)):
+        ring = ring_of(detected, true, rules, position)
+        holder = _holders(ring, rules, rules.thresholds.index(chosen))
+        counts, true_counts = ring.counts, ring.truth_counts
+        pairs += [(rows[by], true_rows[one]) for one, by in holder.items() if counts[by] and true_counts[one]]
+        unmatched |= {*np.flatnonzero(counts).tolist()} - {*holder.values()}
+        missed |= {*np.flatnonzero(true_counts).tolist()} - {*holder}
+    matched = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+    return DetectionMatches(
+        threshold=chosen,
+        detection=matched[:, 0],
+        truth=matched[:, 1],
+        false=np.sort(rows[list(unmatched)]),
+        missed=np.sort(true_rows[list(missed)]),
+    )
+
+
+def _holders(ring: Ring, rules: DetectionProtocol, level: int) -> Mapping[int, int]:
+    """True box → detection of all that match, those that do not count among them."""
+    reach, classes = ring.reach(level), len(rules.classes)
+    if rules.matching == "by_score":
+        taken = nearest_by_score(reach)
+    else:
+        counts = {candidate: bool(ring.counts[candidate // classes]) for candidate in reach}
+        taken = nearest_by_truth(reach, counts, ring.truth_counts.tolist()).holder
+    return {truth: candidate // classes for truth, candidate in taken.items()}
+
+
+def _read(results: Any, dataset: Dataset, token: str, rules: DetectionProtocol) -> DetectedBoxes:
+    """The boxes, which results hold in the world, in the protocol's frame around the agent."""
+    found: DetectedBoxes = results.prediction(token)
+    return found.transform(dataset.world_from(token, rules.frame).inverse(), rules.frame)
+
+
+DETECTION: Final = Task(
+    name="detection",
+    kinds=("detection",),
+    protocols=DETECTION_PROTOCOLS,
+    evaluator=DetectionEvaluator,
+    read=_read,
+    truth=lambda dataset, token, rules, _form, _horizon: (detection_truth(dataset, token, rules),),
+    counts=sample_counts,
+    result=detection_result,
+    summary=DetectionResult.as_dict,
+    looks_ahead=False,
+)

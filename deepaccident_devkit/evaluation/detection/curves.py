@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.detection.protocols import DetectionProtocol
+from deepaccident_devkit.evaluation.detection.boxes import DetectionProtocol
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 
 

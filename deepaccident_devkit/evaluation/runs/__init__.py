@@ -13,12 +13,16 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     ReleaseInfo,
     ResultsInfo,
     breakdowns_of,
-    default_selection,
     evaluate_results,
 )
-from deepaccident_devkit.evaluation.runs.many_samples import evaluation_store
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
-from deepaccident_devkit.evaluation.runs.selection import Coverage, SampleSelection, coverage
+from deepaccident_devkit.evaluation.runs.setups import (
+    Coverage,
+    SampleSelection,
+    coverage,
+    default_selection,
+    evaluation_store,
+)
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
 from deepaccident_devkit.evaluation.runs.verification import Difference, Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes

@@ -19,10 +19,8 @@ from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results.records import check_token
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
-from deepaccident_devkit.evaluation.runs.many_samples import remove_checkpoints
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
-from deepaccident_devkit.evaluation.runs.selection import SampleSelection, scenario_of
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, remove_checkpoints, scenario_of
 from deepaccident_devkit.evaluation.warning.recordings import GROUPS
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in, replacing_folder, temporary_path

@@ -20,12 +20,18 @@ import numpy as np
 from deepaccident_devkit.errors import EvaluationError, shortened
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.frozen_mappings import plain
-from deepaccident_devkit.evaluation.intervals import Clusters, Resampling, difference_intervals, numbers_of_draws
-from deepaccident_devkit.evaluation.numbers import Headline, has_interval, headlines, numbers_of
+from deepaccident_devkit.evaluation.intervals import (
+    Clusters,
+    Resampling,
+    difference_intervals,
+    has_interval,
+    numbers_of,
+    numbers_of_draws,
+)
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
-from deepaccident_devkit.evaluation.runs.selection import scenario_of
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.runs.verification import differing
+from deepaccident_devkit.evaluation.task import Headline, headlines, plain
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, ShortRepr, known
 from deepaccident_devkit.support.text import columns_text, path_of

@@ -6,9 +6,9 @@ import json
 import os
 import platform
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,21 +24,21 @@ from deepaccident_devkit.evaluation.breakdowns import (
     breakdown,
     sample_attributes,
 )
-from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.frozen_mappings import plain
+from deepaccident_devkit.evaluation.evaluator import Evaluator, evaluate_samples
 from deepaccident_devkit.evaluation.intervals import Resampling
-from deepaccident_devkit.evaluation.numbers import headlines
 from deepaccident_devkit.evaluation.results import Results, read_results
-from deepaccident_devkit.evaluation.runs.many_samples import checkpoint_path, evaluate_samples
-from deepaccident_devkit.evaluation.runs.selection import (
+from deepaccident_devkit.evaluation.runs.setups import (
+    TASKS,
     Coverage,
-    SampleList,
+    EvaluationSetup,
+    SampleLoader,
     SampleSelection,
-    ScopeName,
+    checkpoint_path,
     coverage,
+    default_selection,
     scenario_of,
 )
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.task import headlines, plain
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -70,7 +70,8 @@ BREAKDOWNS: Final = (
 
 def breakdowns_of(task: str) -> tuple[str, ...]:
     """What a task's results are broken down by if nothing else is asked for: warnings by whole recordings alone."""
-    return tuple(name for name in BREAKDOWNS if task != "warning" or name not in WITHIN_RECORDINGS)
+    whole = TASKS[task].whole_recordings
+    return tuple(name for name in BREAKDOWNS if not (whole and name in WITHIN_RECORDINGS))
 
 
 _LIBRARIES: Final = ("numpy", "scipy")
@@ -219,7 +220,7 @@ class EvaluationRun:
             ChoiceError: no such attribute.
         """
         chosen = breakdowns_of(self.setup.task) if by is None else map(attribute_name, by)
-        work = partial(breakdown, self.evaluator, self.attributes, resampling=resampling)
+        work = partial(breakdown, self.evaluator, dict(self.attributes), resampling=resampling)
         how = {"workers": 1, **how}
         found = run_batch(work, list(dict.fromkeys(chosen)), **how)
         return replace(self, breakdowns=tuple(found))
@@ -236,7 +237,7 @@ class EvaluationRun:
             **{name: each for name, each in self.selection.as_dict().items() if name != "horizon"},
             "counts": {
                 "samples": len(self.evaluator),
-                "scenarios": len({each.scenario for each in self.attributes.values()}),
+                "scenarios": len(set(map(scenario_of, self.evaluator.tokens))),
                 "left_out": self.left_out,
             },
             "release": {
@@ -252,7 +253,7 @@ class EvaluationRun:
                 "form": self.results.form,
             },
             "headlines": [{**asdict(each), "text": each.text()} for each in headlines(self.setup.task, self.result)],
-            "metrics": self.result.as_dict(),
+            "metrics": TASKS[self.setup.task].summary(self.result),
             "breakdowns": {each.by: self._breakdown(each) for each in self.breakdowns},
             "environment": {
                 "python": platform.python_version(),
@@ -279,7 +280,7 @@ class EvaluationRun:
                 "scenarios": group.scenarios,
                 "clusters": group.clusters,
                 "headlines": {each.path: each.value for each in headlines(self.setup.task, group.result)},
-                "metrics": group.result.as_dict(),
+                "metrics": TASKS[self.setup.task].summary(group.result),
                 "intervals": plain(group.intervals),
                 "notes": list(group.notes),
             }
@@ -297,38 +298,24 @@ def _further(given: Breakdown[Any]) -> dict[str, Any]:
     }
 
 
-_OF_ACCIDENTS: Final = ("accident", "warning")
-"""Tasks whose truth is in meta."""
+class _AttributesWhenAsked(Mapping[str, SampleAttributes]):
+    """`sample_attributes`, made when one is asked for: an evaluation that is not broken down needs none."""
 
+    def __init__(self, dataset: Dataset, tokens: Iterable[str]) -> None:
+        self._dataset, self._tokens = dataset, tuple(tokens)
 
-def default_selection(
-    setup: EvaluationSetup,
-    split: str | os.PathLike[str] = "val",
-    *,
-    samples: SampleList | None = None,
-    scope: ScopeName | None = None,
-    agents: Sequence[str] | None = None,
-) -> SampleSelection:
-    """The samples that a setup is evaluated at.
+    @cached_property
+    def _made(self) -> dict[str, SampleAttributes]:
+        return sample_attributes(self._dataset, self._tokens)
 
-    Args:
-        setup: its task and horizon.
-        split: `train`, `val`, … or the path of a split file.
-        samples: None for `all` of the task `warning`, which follows whole recordings, and else `evaluate`.
-        scope: None for `all` where all samples are evaluated, and else `accident`.
-        agents: whose; None for all.
+    def __getitem__(self, token: str) -> SampleAttributes:
+        return self._made[token]
 
-    Raises:
-        ChoiceError: no such list, scope or agent.
-    """
-    listed: SampleList = samples or ("all" if setup.task == "warning" else "evaluate")
-    return SampleSelection(
-        split=os.fspath(split),
-        samples=listed,
-        scope=scope or ("all" if listed == "all" else "accident"),
-        agents=None if agents is None else tuple(agents),
-        horizon=setup.horizon,
-    )
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._made)
+
+    def __len__(self) -> int:
+        return len(self._tokens)
 
 
 def evaluate_results(
@@ -370,7 +357,7 @@ def evaluate_results(
     loader = SampleLoader(dataset, results if isinstance(results, Results) else read_results(results), setup)
     covered = coverage(dataset, loader.results.tokens, chosen)
     tokens = _covered_tokens(dataset, loader.results, chosen, covered, allow_partial=allow_partial)
-    if setup.task in _OF_ACCIDENTS:
+    if TASKS[setup.task].needs_meta:
         check_metas(dataset, tokens, chosen.split)
     how = {"workers": None, **how}
     loader.results.check(**how)
@@ -388,7 +375,7 @@ def evaluate_results(
         result=evaluator.compute(),
         partial=_partial(covered),
         left_out=len(covered.extra) + len(covered.unknown),
-        attributes=sample_attributes(dataset, tokens),
+        attributes=_AttributesWhenAsked(dataset, tokens),
         times_to_impact={token: dataset.sample.get(token)["time_to_impact"] for token in tokens},
         breakdowns=(),
         release=ReleaseInfo(dataroot=str(dataset.dataroot), version=dataset.version, scenarios=hashes),

@@ -12,9 +12,9 @@ from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
 from deepaccident_devkit.evaluation.accident import AccidentResult
 from deepaccident_devkit.evaluation.detection import DetectionProtocol
 from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.frozen_mappings import plain
 from deepaccident_devkit.evaluation.motion import MotionResult
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
+from deepaccident_devkit.evaluation.task import plain
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import check_size, fault_text, read_bytes
 

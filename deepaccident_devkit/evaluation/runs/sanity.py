@@ -19,13 +19,13 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident import AccidentContext, BoxAccidents
-from deepaccident_devkit.evaluation.alarms.raised import LABEL_STEP, by_sureness, position_difference
+from deepaccident_devkit.evaluation.accident_truth import LABEL_STEP, by_sureness, position_difference
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.detection.boxes import columns_of
-from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.task import FrozenMappings
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.parallel import run_batch

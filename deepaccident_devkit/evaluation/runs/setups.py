@@ -1,54 +1,236 @@
-"""`EvaluationSetup`: a task, its protocol and its horizon, and the arguments of its evaluator for a sample."""
+"""What is evaluated: by which rules (`EvaluationSetup`), and at which samples (`SampleSelection`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.accident import PROTOCOLS as ACCIDENT_PROTOCOLS
-from deepaccident_devkit.evaluation.accident import AccidentEvaluator, ReleasedAccidents, accident_context
-from deepaccident_devkit.evaluation.choices import switched
-from deepaccident_devkit.evaluation.detection import (
-    DETECTION_PROTOCOLS,
-    DetectedBoxes,
-    DetectionEvaluator,
-    detection_truth,
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    EvaluationError,
+    NotAvailableError,
+    ResultsError,
+    TokenError,
 )
+from deepaccident_devkit.evaluation.accident import ACCIDENT
+from deepaccident_devkit.evaluation.detection import DETECTION
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.frozen_mappings import FrozenDict
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator
+from deepaccident_devkit.evaluation.motion import MOTION
+from deepaccident_devkit.evaluation.predictions import compared_labels
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, WarningEvaluator
-from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
-from deepaccident_devkit.parallel import Places
-from deepaccident_devkit.support.text import choice, settle_choices
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.evaluation.task import FrozenDict, Task, TaskName, switched
+from deepaccident_devkit.evaluation.warning.evaluator import WARNING
+from deepaccident_devkit.motion import MotionLabels, samples
+from deepaccident_devkit.motion.sample_labels import no_samples_text
+from deepaccident_devkit.parallel import Places, Store, unfinished_folder
+from deepaccident_devkit.release.fingerprints import digest_of
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import remove_in
+from deepaccident_devkit.support.text import choice, path_of, settle_choices, spelled
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLITS
 
-TaskName = Literal["motion", "accident", "detection", "warning"]
+__all__ = ["TASKS", "TASK_PROTOCOLS", "TASK_RESULTS", "EvaluationSetup", "SampleLoader", "TaskName"]
+
+SampleList = Literal["evaluate", "all"]
+ScopeName = Literal["accident", "all"]
+_SHOWN: Final = 3
+"""Samples that a message names."""
+LIST_STEP: Final = 0.5
+"""Seconds from one sample of a list to the next."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SampleSelection:
+    """A list of samples, as `motion.samples` makes it.
+
+    Attributes:
+        split: `train`, `val`, … or the path of a split file.
+        samples: `evaluate` for those within the horizon before the end, `all` for two a second of whole scenarios.
+        scope: `accident` for scenarios designed to end in one, `all` for the normal ones, too.
+        agents: whose samples, in the order of `taxonomy.AGENTS`; None for all.
+        horizon: seconds before the end; only to `evaluate`.
+    """
+
+    split: str
+    samples: SampleList = "evaluate"
+    scope: ScopeName = "accident"
+    agents: tuple[str, ...] | None = None
+    horizon: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Check and put the agents in order; raises ChoiceError."""
+        object.__setattr__(self, "split", spelled(os.fspath(self.split), (*SPLITS, *MINI_SPLITS)))
+        settle_choices(self, {"samples": get_args(SampleList), "scope": get_args(ScopeName)})
+        if self.agents is not None:
+            object.__setattr__(self, "agents", _agents(self.agents))
+
+    def tokens(self, dataset: Dataset) -> list[str]:
+        """The samples' tokens by scenario, agent and time.
+
+        Raises:
+            ChoiceError: no such split.
+            ConfigError: `evaluate` with a horizon that is no number of steps of 0.5 s.
+            NotAvailableError: this release has no such samples with labels.
+        """
+        horizon = self.horizon if self.samples == "evaluate" else LIST_STEP
+        steps = horizon / LIST_STEP
+        if abs(steps - round(steps)) > 1e-6:
+            raise ConfigError(
+                f"horizon: samples to evaluate are {LIST_STEP} s apart, so that {horizon:g} s does not say which; "
+                f"choose a multiple, or samples='all'"
+            )
+        listed = samples(dataset, self.split, self.samples, "paper", horizon=horizon, scope=self.scope)
+        if self.samples == "all" and self.scope == "accident":
+            listed = [token for token in listed if _designed_accident(token)]
+        chosen = [token for token in listed if self.agents is None or agent_of(token) in self.agents]
+        if not chosen:
+            whose = "" if self.agents is None else f" of {', '.join(self.agents)}"
+            raise NotAvailableError(
+                f"{self.split}: this release has no labelled samples{whose} there ({self.text()}); "
+                f"{no_samples_text(dataset, self.split, self.scope)}"
+            )
+        return chosen
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, as JSON holds it."""
+        return asdict(self) | {"agents": None if self.agents is None else list(self.agents)}
+
+    def text(self) -> str:
+        """In words: `split val, samples evaluate (the last 2 s), scope accident, all agents`."""
+        within = f" (the last {self.horizon:g} s)" if self.samples == "evaluate" else ""
+        whose = "all agents" if self.agents is None else f"agents {', '.join(self.agents)}"
+        return f"split {self.split}, samples {self.samples}{within}, scope {self.scope}, {whose}"
+
+
+def scenario_of(token: str) -> str:
+    """The scenario's token in a sample's."""
+    return token.rsplit("/", 2)[0]
+
+
+def agent_of(token: str) -> str:
+    """The agent's name in a sample's token; empty if it is no sample's token."""
+    return token.rsplit("/", 2)[1] if token.count("/") > 1 else ""
+
+
+def _designed_accident(token: str) -> bool:
+    return token.split("/", 1)[0].endswith("_accident")
+
+
+def _agents(given: Sequence[str]) -> tuple[str, ...]:
+    names = [choice("agents", name, AGENTS) for name in ([given] if isinstance(given, str) else given)]
+    if not names:
+        raise ChoiceError("agents: expected at least one agent, or None for all, found none")
+    return tuple(name for name in AGENTS if name in names)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Coverage(ShortRepr):
+    """Results against the list of samples that are evaluated; tokens in order.
+
+    Attributes:
+        expected: how many samples the list has.
+        missing: of the list, without a prediction.
+        extra: samples of this release with a prediction that are not in the list.
+        unknown: tokens of predictions that are no samples of this release.
+        splits: that the predictions are of.
+        agents: likewise, in the order of `taxonomy.AGENTS`.
+    """
+
+    expected: int
+    missing: tuple[str, ...] = ()
+    extra: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
+    splits: tuple[str, ...] = ()
+    agents: tuple[str, ...] = ()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the results have each sample of the list, and no other."""
+        return not (self.missing or self.extra or self.unknown)
+
+    def to_text(self) -> str:
+        """The differences: how many, three of each, and what predictions there are; or that all are there."""
+        if self.is_complete:
+            return f"all {self.expected} samples have a prediction, and nothing else has"
+        parts = [
+            _named(self.missing, f"of {self.expected} samples have no prediction"),
+            _named(self.extra, "predictions are of samples that are not evaluated"),
+            _named(self.unknown, "predictions are of no sample of this release"),
+        ]
+        if self.extra and not (self.missing or self.unknown):
+            parts.append(
+                "leave them out with --allow-partial (allow_partial=True); no sample lacks a prediction, so the "
+                "numbers are not partial then"
+            )
+        if self.agents:
+            parts.append(
+                f"the predictions are of the splits {', '.join(self.splits)} and the agents {', '.join(self.agents)}"
+            )
+        return "; ".join(part for part in parts if part)
+
+
+def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelection) -> Coverage:
+    """Compare the tokens of results with the samples that a selection has.
+
+    Args:
+        dataset: the release.
+        results: tokens of the predictions.
+        selection: what is to be evaluated.
+
+    Raises:
+        ChoiceError: as of `SampleSelection.tokens`, of the selection itself.
+        ConfigError: likewise.
+        NotAvailableError: likewise.
+    """
+    expected, given = selection.tokens(dataset), set(results)
+    others = sorted(given.difference(expected))
+    unknown = {token for token in others if not _is_sample(dataset, token)}
+    present = {agent_of(token) for token in given - unknown}
+    splits = {dataset.get("scenario", name)["split"] for name in set(map(scenario_of, given - unknown))}
+    return Coverage(
+        expected=len(expected),
+        missing=tuple(token for token in expected if token not in given),
+        extra=tuple(token for token in others if token not in unknown),
+        unknown=tuple(token for token in others if token in unknown),
+        splits=tuple(name for name in SPLITS if name in splits),
+        agents=tuple(name for name in AGENTS if name in present),
+    )
+
+
+def _is_sample(dataset: Dataset, token: str) -> bool:
+    try:
+        dataset.getind("sample", token)
+    except TokenError:
+        return False
+    return True
+
+
+def _named(tokens: Sequence[str], what: str) -> str:
+    if not tokens:
+        return ""
+    more = ", …" if len(tokens) > _SHOWN else ""
+    return f"{len(tokens)} {what} ({', '.join(tokens[:_SHOWN])}{more})"
+
+
+TASKS: Final[Mapping[str, Task]] = MappingProxyType(
+    {task.name: task for task in (MOTION, ACCIDENT, DETECTION, WARNING)}
+)
+"""All tasks by name; a new one has a line here, and its name in `TaskName`."""
 TASK_PROTOCOLS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
-    {
-        "motion": MOTION_PROTOCOLS,
-        "accident": ACCIDENT_PROTOCOLS,
-        "detection": DETECTION_PROTOCOLS,
-        "warning": WARNING_PROTOCOLS,
-    }
+    {name: task.protocols for name, task in TASKS.items()}
 )
 """Task → its protocols by name."""
 TASK_RESULTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        "motion": ("motion",),
-        "accident": ("motion", "accident"),
-        "detection": ("detection",),
-        "warning": ("motion", "accident"),
-    }
+    {name: task.kinds for name, task in TASKS.items()}
 )
 """Task → the kinds of results that it is evaluated from."""
-
-
 _LONGEST_HORIZON: Final = 100
 """Seconds; recordings are shorter."""
 
@@ -71,22 +253,22 @@ class EvaluationSetup:
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
-        settle_choices(self, {"task": get_args(TaskName)})
-        protocol = choice(f"protocol of {self.task}", self.protocol, TASK_PROTOCOLS[self.task])
+        settle_choices(self, {"task": tuple(TASKS)})
+        protocol = choice(f"protocol of {self.task}", self.protocol, TASKS[self.task].protocols)
         object.__setattr__(self, "protocol", protocol)
         if not 0 < self.horizon <= _LONGEST_HORIZON:
             raise ConfigError(f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}")
         object.__setattr__(self, "switches", FrozenDict(self.switches))
-        switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)  # refuses impossible choices
+        switched(TASKS[self.task].protocols[self.protocol], self.switches)  # refuses impossible choices
 
     @property
     def rules(self) -> Any:
         """The protocol itself, with the switches."""
-        return switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)
+        return switched(TASKS[self.task].protocols[self.protocol], self.switches)
 
     def evaluator(self) -> Evaluator[Any]:
         """A new evaluator of these rules."""
-        return _EVALUATORS[self.task](self.rules)
+        return TASKS[self.task].evaluator(self.rules)
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it, with the evaluator's own `settings`: every choice."""
@@ -99,12 +281,34 @@ class EvaluationSetup:
         }
 
 
-_EVALUATORS: Final[Mapping[str, Callable[[Any], Evaluator[Any]]]] = {
-    "motion": MotionEvaluator,
-    "accident": AccidentEvaluator,
-    "detection": DetectionEvaluator,
-    "warning": WarningEvaluator,
-}
+def default_selection(
+    setup: EvaluationSetup,
+    split: str | os.PathLike[str] = "val",
+    *,
+    samples: SampleList | None = None,
+    scope: ScopeName | None = None,
+    agents: Sequence[str] | None = None,
+) -> SampleSelection:
+    """The samples that a setup is evaluated at.
+
+    Args:
+        setup: its task and horizon.
+        split: `train`, `val`, … or the path of a split file.
+        samples: None for `all` of the task `warning`, which follows whole recordings, and else `evaluate`.
+        scope: None for `all` where all samples are evaluated, and else `accident`.
+        agents: whose; None for all.
+
+    Raises:
+        ChoiceError: no such list, scope or agent.
+    """
+    listed: SampleList = samples or ("all" if TASKS[setup.task].whole_recordings else "evaluate")
+    return SampleSelection(
+        split=os.fspath(split),
+        samples=listed,
+        scope=scope or ("all" if listed == "all" else "accident"),
+        agents=None if agents is None else tuple(agents),
+        horizon=setup.horizon,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +327,13 @@ class SampleLoader:
 
     def __post_init__(self) -> None:
         """Check that the results are of a kind that the rules take, and look far enough; raises EvaluationError."""
-        kinds = TASK_RESULTS[self.setup.task]
+        kinds = TASKS[self.setup.task].kinds
         if self.results.task not in kinds:
             raise EvaluationError(
                 f"{self.results.path}: holds {self.results.task} results; {self.setup.task} is evaluated from "
                 f"{' or '.join(kinds)} results"
             )
-        if self.results.task == "accident" and isinstance(self.setup.rules, ReleasedAccidents):
+        if self.results.task == "accident" and getattr(self.setup.rules, "maps_alone", False):
             raise EvaluationError(
                 f"{self.results.path}: holds explicit accidents; the protocol {self.setup.protocol!r} compares motion: "
                 "give motion results, or choose protocol 'paper' or 'boxes'"
@@ -149,38 +353,60 @@ class SampleLoader:
 
     def __call__(self, token: str) -> tuple[Any, ...]:
         """Prediction, truth and other arguments of the evaluator."""
-        prediction, rules = self.results.prediction(token), self.setup.rules
-        if isinstance(prediction, DetectedBoxes):
-            return self.detected(token, prediction, rules.frame), detection_truth(self.dataset, token, rules)
-        if self.setup.task == "motion":
-            return prediction, self.label(token)
-        context = accident_context(self.dataset, token, self.setup.horizon, references=self.setup.task == "warning")
-        return prediction, self.label(token), context
+        rules, form, horizon = self.setup.rules, self.results.form, self.setup.horizon
+        truth = TASKS[self.setup.task].truth(self.dataset, token, rules, form, horizon)
+        return self.prediction(token), *truth
 
-    def label_config(self) -> MotionLabelConfig | None:
-        """What the labels show that motion results are compared with; None for explicit accidents of other setups."""
-        form = self.results.form
-        labels = getattr(self.setup.rules, "labels", None)
-        if form is None:
-            if not hasattr(self.setup.rules, "labels"):
-                return None
-            return _reaching(MotionLabelConfig(protocol=labels or "released"), self.setup.horizon)
-        config = MotionLabelConfig(
-            grid=form.grid, step=round(form.step / FRAME_PERIOD), protocol=labels or form.labels or "clean"
-        )
-        return _reaching(config, self.setup.horizon)
+    def prediction(self, token: str) -> Any:
+        """The prediction of a sample, boxes in the protocol's frame."""
+        return TASKS[self.setup.task].read(self.results, self.dataset, token, self.setup.rules)
 
     def label(self, token: str) -> MotionLabels | None:
-        """The sample's motion labels as `label_config` says; None where there is none to compare with."""
-        config = self.label_config()
-        return None if config is None else motion_labels(self.dataset, token, config)
-
-    def detected(self, token: str, prediction: DetectedBoxes, frame: str) -> DetectedBoxes:
-        """A sample's boxes, which results hold in the world, in a frame of its agent."""
-        boxes = prediction.boxes.transform(self.dataset.world_from(token, frame).inverse(), frame)
-        return DetectedBoxes(boxes=boxes, scores=prediction.scores)
+        """The sample's motion labels that the results are compared with; None where there is none."""
+        return compared_labels(self.dataset, token, self.setup.rules, self.results.form, self.setup.horizon)
 
 
-def _reaching(config: MotionLabelConfig, horizon: float) -> MotionLabelConfig:
-    """Labels that look as far ahead."""
-    return replace(config, future_frames=round(horizon / (config.step * FRAME_PERIOD)))
+_COUNTS: Final = "counts"
+
+
+def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
+    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
+
+    `command` says which evaluation that is.
+    """
+    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
+
+
+def checkpoint_path(
+    out: str | os.PathLike[str],
+    setup: EvaluationSetup,
+    tokens: Collection[str],
+    fingerprints: Mapping[str, str],
+) -> Path:
+    """The folder beside `out` in which such a run keeps its counts.
+
+    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
+    and another devkit have another folder, and so never go on with these counts.
+
+    Args:
+        out: the folder that the finished evaluation goes to.
+        setup: task and rules.
+        tokens: the samples.
+        fingerprints: of the predictions and of the labels.
+    """
+    name = digest_of(
+        {
+            "devkit": __version__,
+            "setup": setup.as_dict(),
+            "tokens": sorted(tokens),
+            "fingerprints": dict(fingerprints),
+        }
+    )
+    return evaluation_store(out).folder / _COUNTS / name
+
+
+def remove_checkpoints(out: str | os.PathLike[str]) -> None:
+    """Remove all such folders beside `out`, once what they were for is written."""
+    store = evaluation_store(out)
+    remove_in(store.folder, _COUNTS)
+    store.remove()

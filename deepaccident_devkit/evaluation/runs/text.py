@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.further import further_results
-from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
+from deepaccident_devkit.evaluation.runs.setups import agent_of, scenario_of
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
 from deepaccident_devkit.reports import Table
 from deepaccident_devkit.support.text import columns_text

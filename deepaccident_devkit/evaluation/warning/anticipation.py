@@ -12,8 +12,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
-from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.numbers import TaskResult
+from deepaccident_devkit.evaluation.task import FrozenMappings, Row, TaskResult
 from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.warning.recordings import (
     GIVEN,
@@ -98,6 +97,15 @@ class AnticipationResult(TaskResult):
     """
 
     task: ClassVar[str] = "warning"
+    rows: ClassVar[tuple[Row, ...]] = (
+        Row("groups/*/auc_ahead", "auc_ahead *", "share", "higher"),
+        Row("groups/*/twin_wins", "twin_wins *", "share", "higher"),
+        Row("groups/*/average_precision", "AP *", "share", "higher"),
+        Row("groups/*/operating/precision", "precision *", "share", "higher"),
+        Row("groups/*/operating/time_in_alarm", "time_in_alarm *", "share"),
+        Row("groups/*/operating/recall", "recall *", "share", "higher"),
+        Row("groups/*/operating/tta0", "tta0 *", "s", "higher"),
+    )
     samples: int
     operating_by: str
     groups: Mapping[str, AnticipationFigures]

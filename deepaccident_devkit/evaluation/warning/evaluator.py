@@ -7,10 +7,10 @@ from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any, Final
 
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext, checked_facts
-from deepaccident_devkit.evaluation.choices import protocol_of
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext, accident_context, checked_facts
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.predictions import Prediction
+from deepaccident_devkit.evaluation.predictions import Prediction, compared_labels
+from deepaccident_devkit.evaluation.task import Task, TaskResult, protocol_of
 from deepaccident_devkit.evaluation.warning.anticipation import (
     AnticipationResult,
     CleanWarnings,
@@ -83,8 +83,7 @@ class WarningEvaluator(Evaluator[Any]):
             EvaluationError: the token is no sample's, the context or something in it is missing, the prediction is
                 neither, or the sample came before with another outcome.
         """
-        checked_facts(label, context)
-        self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
+        self.add(token, _counts(token, prediction, label, context, self.protocol))
 
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""
@@ -114,3 +113,31 @@ class WarningEvaluator(Evaluator[Any]):
     def has_intervals(self) -> bool:
         """The protocol `field` has none: its numbers take long, and are only for comparison with published ones."""
         return not isinstance(self.protocol, FieldWarnings)
+
+
+def _counts(
+    token: str,
+    prediction: Prediction,
+    label: MotionLabels | None,
+    context: AccidentContext | None,
+    _protocol: Protocol,
+) -> Counts:
+    checked_facts(label, context)
+    return sample_counts(token, prediction, label, context or AccidentContext())
+
+
+WARNING: Final = Task(
+    name="warning",
+    kinds=("motion", "accident"),
+    protocols=WARNING_PROTOCOLS,
+    evaluator=WarningEvaluator,
+    truth=lambda dataset, token, rules, form, horizon: (
+        compared_labels(dataset, token, rules, form, horizon),
+        accident_context(dataset, token, horizon, references=True),
+    ),
+    counts=_counts,
+    result=lambda counts, protocol: protocol.result(counts, references=True),
+    summary=TaskResult.as_dict,
+    whole_recordings=True,
+    needs_meta=True,
+)

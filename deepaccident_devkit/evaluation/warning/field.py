@@ -15,7 +15,7 @@ from typing import ClassVar, Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.numbers import TaskResult
+from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.evaluation.warning.recordings import (
     GIVEN,
     PREDICTORS,
@@ -290,6 +290,11 @@ class FieldResult(TaskResult):
     """
 
     task: ClassVar[str] = "warning"
+    rows: ClassVar[tuple[Row, ...]] = (
+        Row("figures/*/average_precision", "AP *", "share", "higher"),
+        Row("figures/*/mean_time", "mTTA *", "s", "higher"),
+        Row("figures/*/time_at_r80", "TTA@R80 *", "s", "higher"),
+    )
     samples: int
     figures: Mapping[str, FieldFigures]
     references: Mapping[str, Mapping[str, FieldFigures]]

@@ -16,18 +16,21 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.alarms.raised import Pair, named_alarms, position_difference, within_horizon
-from deepaccident_devkit.evaluation.alarms.reading import TIE, AccidentReading
-from deepaccident_devkit.evaluation.alarms.truth import (
+from deepaccident_devkit.evaluation.accident_truth import (
     REFERENCES,
     SLACK,
     UNPLACED_NOTE,
     AccidentContext,
     BoxTruth,
     Involvement,
+    Pair,
+    named_alarms,
+    position_difference,
+    within_horizon,
 )
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.map_accidents import TIE, AccidentReading
 from deepaccident_devkit.evaluation.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray

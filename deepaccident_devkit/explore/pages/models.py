@@ -15,8 +15,8 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation.numbers import value_text
 from deepaccident_devkit.evaluation.runs import Bundle, ComparedNumber, Comparison, compare_bundles, results_text
+from deepaccident_devkit.evaluation.task import value_text
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.evaluations import Evaluated, evaluated, verdict
 from deepaccident_devkit.explore.explorer import Explorer

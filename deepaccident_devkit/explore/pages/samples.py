@@ -16,8 +16,7 @@ from starlette.routing import Route
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError, TokenError
 from deepaccident_devkit.evaluation.breakdowns import SampleAttributes, attribute_name, sample_attributes
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
-from deepaccident_devkit.evaluation.runs.setups import SampleLoader
+from deepaccident_devkit.evaluation.runs.setups import SampleLoader, agent_of, scenario_of
 from deepaccident_devkit.explore.background import Job
 from deepaccident_devkit.explore.choices import MOST_WORD
 from deepaccident_devkit.explore.evaluations import finite, other_values, verdict
@@ -256,11 +255,9 @@ def _figure(explorer: Explorer, model: Model, token: str, shown: Shown) -> Any:
     if results is None:
         raise NotAvailableError(f"{model.name}: its predictions were not given")
     loader = SampleLoader(explorer.dataset, results, model.setup)
-    prediction, rules = results.prediction(token), model.setup.rules
+    prediction, rules = loader.prediction(token), model.setup.rules
     how: dict[str, Any] = {"task": _task(model), "protocol": None if model.setup.task == "warning" else rules}
-    if isinstance(prediction, DetectedBoxes):
-        prediction = loader.detected(token, prediction, rules.frame)
-    else:
+    if not isinstance(prediction, DetectedBoxes):
         how["label"] = loader.label(token)
     figure = detached_figure(_SIZES[shown.kind, shown.size])
     if shown.kind == "above":

@@ -13,17 +13,15 @@ import numpy as np
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.accident import compared_accidents
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator, compared_accidents
 from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, WITHIN_RECORDINGS, Breakdown
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
-from deepaccident_devkit.evaluation.motion.evaluator import MotionEvaluator
-from deepaccident_devkit.evaluation.numbers import Headline, headlines
+from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader
+from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.captions import draw_legend_of_fills, set_scene_title, set_title

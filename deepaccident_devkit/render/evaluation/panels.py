@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
-from deepaccident_devkit.evaluation.numbers import LIMITS, Headline, headlines
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
+from deepaccident_devkit.evaluation.task import LIMITS, Headline, headlines
 from deepaccident_devkit.render.captions import set_title
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, with_light_grid

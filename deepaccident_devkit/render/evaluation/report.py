@@ -13,12 +13,12 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, Breakdown, Group
 from deepaccident_devkit.evaluation.detection import DetectionResult
 from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS
-from deepaccident_devkit.evaluation.numbers import Headline, headlines
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
 from deepaccident_devkit.evaluation.runs.text import predictor_tables, reading_notes
+from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, sample_figures, save_figure
 from deepaccident_devkit.render.evaluation.panels import UNKNOWN
 from deepaccident_devkit.render.styles import page_style

@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.scoring import DISTANCES, ERRORS_AT, Alarm, hit_of
 from deepaccident_devkit.evaluation.detection import DetectionResult
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
-from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.motion.evaluator import RANGES
-from deepaccident_devkit.evaluation.motion.overlaps import panoptic_quality
+from deepaccident_devkit.evaluation.instances import panoptic_quality
+from deepaccident_devkit.evaluation.motion import RANGES, MotionEvaluator
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.render.boxes import write_beside
 from deepaccident_devkit.render.captions import set_title

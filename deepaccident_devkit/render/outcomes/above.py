@@ -10,7 +10,7 @@ import numpy as np
 
 from deepaccident_devkit.evaluation.accident import AccidentResult, BoxTruth, ComparedAccidents
 from deepaccident_devkit.evaluation.accident.scoring import AccidentsWithin
-from deepaccident_devkit.evaluation.alarms.raised import position_difference
+from deepaccident_devkit.evaluation.accident_truth import position_difference
 from deepaccident_devkit.evaluation.detection import (
     DetectedBoxes,
     DetectionMatches,
@@ -18,8 +18,8 @@ from deepaccident_devkit.evaluation.detection import (
     detection_matches,
     detection_protocol,
 )
-from deepaccident_devkit.evaluation.motion.evaluator import RANGES
-from deepaccident_devkit.evaluation.motion.overlaps import vpq_matches
+from deepaccident_devkit.evaluation.instances import vpq_matches
+from deepaccident_devkit.evaluation.motion import RANGES
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,

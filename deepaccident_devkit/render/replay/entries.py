@@ -15,8 +15,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Accident, AccidentContext, BoxAccidents, MotionOutput, accident_context
 from deepaccident_devkit.evaluation.accident import Prediction
 from deepaccident_devkit.evaluation.accident.scoring import ERRORS_AT, hit_of
-from deepaccident_devkit.evaluation.alarms.raised import Pair, named_alarms
-from deepaccident_devkit.evaluation.alarms.truth import RELEASED_HORIZON
+from deepaccident_devkit.evaluation.accident_truth import RELEASED_HORIZON, Pair, named_alarms
 from deepaccident_devkit.evaluation.predictions import checked_prediction
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader

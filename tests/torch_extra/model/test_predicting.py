@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     read_results,
 )
-from deepaccident_devkit.evaluation.motion.evaluator import MOTION_PROTOCOLS
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
 from deepaccident_devkit.model.detection import TaskMaps, detection_targets
 from deepaccident_devkit.model.inputs import mirrored_boxes

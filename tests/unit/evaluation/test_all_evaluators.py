@@ -30,7 +30,7 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
-from deepaccident_devkit.evaluation.numbers import numbers_of
+from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.runs.comparison import Swaps, swapped_differences
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionHeads

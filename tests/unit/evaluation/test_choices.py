@@ -8,9 +8,9 @@ import pytest
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.accident import PaperAccidents
-from deepaccident_devkit.evaluation.choices import switch_names, switched
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS
+from deepaccident_devkit.evaluation.task import switch_names, switched
 
 ALL = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
 

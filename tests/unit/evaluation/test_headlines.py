@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.frozen_mappings import plain
+from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.numbers import headlines, numbers_of, value_text
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
+from deepaccident_devkit.evaluation.task import headlines, plain, value_text
 
 RUNS = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from deepaccident_devkit.evaluation.intervals import has_interval, numbers_of, range_of
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.numbers import HEADLINE_UNITS, has_interval, numbers_of, range_of
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
+from deepaccident_devkit.evaluation.task import HEADLINE_UNITS
 
 NOWHERE = np.array([math.nan])
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.numbers import numbers_of
+from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.warning import (
     AccidentOutcomes,
     CleanWarnings,

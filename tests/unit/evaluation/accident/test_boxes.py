@@ -9,11 +9,10 @@ from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.accident import BoxTruth, accident_context, box_truth
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator, BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.alarms.truth import UNPLACED_NOTE, AccidentContext
+from deepaccident_devkit.evaluation.accident_truth import UNPLACED_NOTE, AccidentContext
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.motion import OWN_BOX_ID
 from deepaccident_devkit.taxonomy import AGENTS

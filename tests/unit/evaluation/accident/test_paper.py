@@ -7,11 +7,10 @@ from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.alarms.raised import position_difference
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading, accident_of
-from deepaccident_devkit.evaluation.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext, position_difference
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading, accident_of
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS

@@ -17,7 +17,7 @@ from deepaccident_devkit.evaluation.accident import (
     PaperAccidents,
 )
 from deepaccident_devkit.evaluation.accident.scoring import actor_of, exact_parts
-from deepaccident_devkit.evaluation.alarms.reading import accident_of
+from deepaccident_devkit.evaluation.map_accidents import accident_of
 from deepaccident_devkit.geometry import BevGrid
 
 GRID = BevGrid()

@@ -6,7 +6,7 @@ import pytest
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.detection import DetectionEvaluator, detection_protocol
 from deepaccident_devkit.evaluation.detection.curves import Cell, curves, recall_matches
-from deepaccident_devkit.evaluation.detection.frame_counts import COLUMNS
+from deepaccident_devkit.evaluation.detection.matching import COLUMNS
 
 
 def test_levels_of_recall_are_sums_in_double_precision() -> None:

@@ -11,8 +11,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import DetectedBoxes, detection_truth
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, detection_matches, detection_protocol
 from deepaccident_devkit.evaluation.detection.boxes import BoxColumns, columns_of
-from deepaccident_devkit.evaluation.detection.frame_counts import frame_counts
-from deepaccident_devkit.evaluation.detection.matching import match_errors
+from deepaccident_devkit.evaluation.detection.matching import frame_counts, match_errors
 from deepaccident_devkit.geometry import Boxes
 
 

@@ -9,10 +9,9 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
+from deepaccident_devkit.evaluation.instances import instance_paths, match_trajectories, trajectory_errors, vpq_counts
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator, MotionProtocol, motion_counts
-from deepaccident_devkit.evaluation.motion.overlaps import vpq_counts
 from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
-from deepaccident_devkit.evaluation.trajectories import instance_paths, match_trajectories, trajectory_errors
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, to_orientation
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels

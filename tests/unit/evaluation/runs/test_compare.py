@@ -19,7 +19,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.accident.scoring import exact_parts
-from deepaccident_devkit.evaluation.numbers import numbers_of
+from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import (
     Comparison,

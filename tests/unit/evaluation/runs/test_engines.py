@@ -20,8 +20,7 @@ from deepaccident_devkit.evaluation.runs import (
     verify_bundle,
 )
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
-from deepaccident_devkit.evaluation.runs.selection import scenario_of
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader, scenario_of
 from deepaccident_devkit.splits import save_selection
 
 SETUP = EvaluationSetup(task="accident", protocol="boxes")

@@ -22,9 +22,13 @@ from deepaccident_devkit.evaluation.runs import (
     scenario_hashes,
 )
 from deepaccident_devkit.evaluation.runs.evaluation_run import _partial, breakdowns_of, check_metas
-from deepaccident_devkit.evaluation.runs.many_samples import checkpoint_path, remove_checkpoints
-from deepaccident_devkit.evaluation.runs.selection import Coverage
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
+from deepaccident_devkit.evaluation.runs.setups import (
+    Coverage,
+    EvaluationSetup,
+    TaskName,
+    checkpoint_path,
+    remove_checkpoints,
+)
 from deepaccident_devkit.splits import save_selection
 
 SETUP = EvaluationSetup(task="accident", protocol="boxes")

@@ -17,7 +17,7 @@ from evaluating import BROKEN, Sums, number, number_and_trace
 
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import evaluate_samples
-from deepaccident_devkit.evaluation.runs import many_samples
+from deepaccident_devkit.evaluation import evaluator as evaluators
 
 VALUES = {f"{index:02d}": float(10 ** (index % 17)) + index / 10 for index in range(40)}
 
@@ -122,12 +122,12 @@ class TestCheckpoints:
         finally:
             process.kill()
             process.wait()
-        kept = many_samples._BATCH * len(list(path.glob("kept/*")))
+        kept = evaluators._BATCH * len(list(path.glob("kept/*")))
         assert 0 < kept < 160
         before = done(folder)
         evaluator = evaluate_samples(Sums(), values, partial(number_and_trace, folder), workers=1, checkpoint=path)
         assert evaluator.compute() == evaluate_samples(Sums(), values, number, workers=1).compute()
-        late = 2 * many_samples._BATCH  # workers of the killed run end a moment later
+        late = 2 * evaluators._BATCH  # workers of the killed run end a moment later
         assert done(folder) <= before + 160 - kept + late
 
     def test_of_other_settings_or_damaged(self, tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation.runs import Coverage, SampleSelection, default_selection
-from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, agent_of, scenario_of
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 

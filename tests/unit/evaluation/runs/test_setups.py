@@ -20,6 +20,7 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     instances_of,
 )
+from deepaccident_devkit.evaluation.predictions import label_config
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, SampleLoader
 from deepaccident_devkit.evaluation.warning import WarningEvaluator
@@ -99,12 +100,10 @@ class TestLoader:
         assert (config.grid, config.step, config.future_frames) == (motion.form.grid, 10, 1)
         assert config.grid == prediction.grid
 
-    def test_the_protocol_says_which_labels_and_else_the_results(
-        self, da_motion: DeepAccident, motion: Results
-    ) -> None:
+    def test_the_protocol_says_which_labels_and_else_the_results(self, motion: Results) -> None:
         for task, protocol, expected in (("accident", "paper", "released"), ("accident", "boxes", "clean")):
-            loader = SampleLoader(da_motion, motion, EvaluationSetup(task=task, protocol=protocol))
-            assert loader.label_config().protocol == expected
+            rules = EvaluationSetup(task=task, protocol=protocol).rules
+            assert label_config(rules, motion.form, horizon=2.0).protocol == expected
 
     def test_accidents_have_their_context(self, da_motion: DeepAccident, token: str, tmp_path: Path) -> None:
         alarm = Accident(positions=np.zeros((2, 2)), time=1.0)

@@ -11,7 +11,7 @@ from memory_results import MemoryResults
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import instances_of
-from deepaccident_devkit.evaluation.alarms.truth import UNPLACED_NOTE
+from deepaccident_devkit.evaluation.accident_truth import UNPLACED_NOTE
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results

@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
-from deepaccident_devkit.evaluation import Accident
+from deepaccident_devkit.evaluation import Accident, accident_truth
 from deepaccident_devkit.evaluation.accident import AccidentContext, BoxTruth, accident_context
-from deepaccident_devkit.evaluation.alarms import truth
-from deepaccident_devkit.evaluation.alarms.truth import constant_velocity_alarms
-from deepaccident_devkit.evaluation.numbers import headlines, numbers_of
+from deepaccident_devkit.evaluation.accident_truth import constant_velocity_alarms
+from deepaccident_devkit.evaluation.intervals import numbers_of
+from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.evaluation.warning import (
     AnticipationResult,
     CleanScores,
@@ -333,7 +333,7 @@ def test_the_context_tells_involvement_twins_and_what_constant_velocities_lead_t
     other = accident_context(da_motion, twin, 2.0)
     assert other.time_to_twin_impact == pytest.approx((last - 1) / 10)
     asked = []
-    monkeypatch.setattr(truth, "constant_velocity_alarms", lambda _boxes, _names, own: asked.append(own) or ())
+    monkeypatch.setattr(accident_truth, "constant_velocity_alarms", lambda _boxes, _names, own: asked.append(own) or ())
     for agent in ("ego_vehicle", "ego_vehicle_behind", "infrastructure"):
         there = accident_context(da_motion, f"{crash['token']}/{agent}/{last - 1:03d}", 2.0, references=True)
         assert set(asked) == {there.own_actor_id if there.involvement == "ego_involved" else None}

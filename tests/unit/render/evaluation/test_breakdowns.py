@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
-from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
+from deepaccident_devkit.evaluation.detection import DetectionEvaluator
 from deepaccident_devkit.evaluation.detection.result import DetectionResult
 from deepaccident_devkit.render.evaluation import render_breakdown
 from deepaccident_devkit.render.styles import AGENT_COLORS

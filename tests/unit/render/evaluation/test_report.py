@@ -16,8 +16,8 @@ from report_page import page_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, OutputFolderError
-from deepaccident_devkit.evaluation.numbers import headlines
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.render.evaluation import save_report
 from deepaccident_devkit.render.evaluation.figures import complete_figure, run_figures
 from deepaccident_devkit.render.styles import WARNING_COLOR

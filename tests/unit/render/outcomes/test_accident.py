@@ -8,7 +8,7 @@ from drawing import new_axes, rendered, title_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, AccidentContext, AccidentEvaluator, box_truth
-from deepaccident_devkit.evaluation.accident.evaluator import ComparedAccidents
+from deepaccident_devkit.evaluation.accident.scoring import ComparedAccidents
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.outcomes import draw_accident_outcome
 from deepaccident_devkit.render.outcomes.above import difference_words, verdict_words

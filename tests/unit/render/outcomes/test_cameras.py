@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     instances_of,
 )
-from deepaccident_devkit.evaluation.accident.evaluator import ComparedAccidents
+from deepaccident_devkit.evaluation.accident.scoring import ComparedAccidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.boxes import NEAREST_DRAWN

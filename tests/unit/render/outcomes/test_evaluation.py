@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation import (
     box_truth,
     instances_of,
 )
-from deepaccident_devkit.evaluation.accident.evaluator import PROTOCOLS, compared_accidents
+from deepaccident_devkit.evaluation.accident import PROTOCOLS, compared_accidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.boxes import collider_ids

@@ -8,8 +8,7 @@ from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.accident import AccidentReading
-from deepaccident_devkit.evaluation.alarms.raised import foreseen_accident, named_alarms
-from deepaccident_devkit.evaluation.alarms.truth import BoxTruth
+from deepaccident_devkit.evaluation.accident_truth import BoxTruth, foreseen_accident, named_alarms
 from deepaccident_devkit.evaluation.predictions import Accident
 
 NOBODY = BoxTruth(

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.evaluation.motion.overlaps import (
+from deepaccident_devkit.evaluation.instances import (
     PanopticQuality,
     SegmentationCounts,
     iou,

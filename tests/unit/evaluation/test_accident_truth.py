@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.alarms.truth import BoxTruth, box_truth, constant_velocity_alarms
+from deepaccident_devkit.evaluation.accident_truth import BoxTruth, box_truth, constant_velocity_alarms
 from deepaccident_devkit.geometry import Boxes
 
 GONE, FAR, AWAY = (math.nan, math.nan), (90.0, 90.0), (-90.0, 90.0)

@@ -5,8 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from deepaccident_devkit.evaluation.alarms.hulls import convex_hulls
-from deepaccident_devkit.evaluation.alarms.reading import AccidentReading, InstanceTracks, accident_of, match_tracks
+from deepaccident_devkit.evaluation.map_accidents import (
+    AccidentReading,
+    InstanceTracks,
+    accident_of,
+    convex_hulls,
+    match_tracks,
+)
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
 

@@ -1,40 +1,37 @@
-"""`MotionEvaluator`: the motion metrics of any number of samples, the counts of each sample, and their protocol."""
+"""How well a model foresees where all actors are: IoU, VPQ, minADE, minFDE, miss rate; the task `MOTION`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
-from deepaccident_devkit.evaluation.choices import protocol_of
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
-from deepaccident_devkit.evaluation.motion.overlaps import (
+from deepaccident_devkit.evaluation.instances import (
     SegmentationCounts,
+    instance_paths,
     iou,
+    longest,
     mask_counts,
+    match_trajectories,
+    padded,
     panoptic_quality,
+    trajectory_errors,
     vpq_counts,
 )
-from deepaccident_devkit.evaluation.numbers import TaskResult
 from deepaccident_devkit.evaluation.predictions import (
     MotionOutput,
     cells_within,
-    check_output,
-    check_protocol,
     checked_pair,
+    compared_frames,
+    compared_labels,
     first_frames,
-    frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.trajectories import (
-    instance_paths,
-    longest,
-    match_trajectories,
-    padded,
-    trajectory_errors,
-)
+from deepaccident_devkit.evaluation.task import Row, Task, TaskResult, protocol_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -46,6 +43,15 @@ from deepaccident_devkit.motion import (
 )
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, ShortRepr
 from deepaccident_devkit.support.text import settle_choices
+
+__all__ = [
+    "MOTION_PROTOCOLS",
+    "MotionEvaluator",
+    "MotionProtocol",
+    "MotionResult",
+    "RangeResult",
+    "motion_counts",
+]
 
 RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
 """Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted."""
@@ -131,6 +137,13 @@ class MotionResult(TaskResult):
     """
 
     task: ClassVar[str] = "motion"
+    rows: ClassVar[tuple[Row, ...]] = (
+        Row("ranges/*/iou", "iou *", "%", "higher"),
+        Row("ranges/*/pq", "vpq *", "%", "higher"),
+        Row("min_ade", "min_ade", "m"),
+        Row("min_fde", "min_fde", "m"),
+        Row("miss_rate", "miss_rate", "share"),
+    )
     ranges: Mapping[str, RangeResult]
     min_ade: float
     min_fde: float
@@ -189,18 +202,11 @@ class MotionEvaluator(Evaluator[MotionResult]):
 
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
         """The metrics of some samples' counts, in any order."""
-        return self._result(counts, [each["vpq"] for each in counts])
+        return motion_result(counts, self.protocol)
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """The samples' counts as those of one sample of one frame, which have the same result."""
-        sums = {name: sum(each[name] for each in counts) for name in ("samples", "frames", "instance_maps")}
-        ranges = range(len(RANGES))
-        cells = [[sum(each["cells"][index][kind] for each in counts) for kind in range(3)] for index in ranges]
-        vpq = [
-            [[math.fsum(value for each in counts for value in each["vpq"][index][kind])] for kind in range(4)]
-            for index in ranges
-        ]
-        return [{**sums, "cells": cells, "vpq": vpq, "paths": _path_sums(counts)}]
+        return [_sums(counts)]
 
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
         """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
@@ -223,50 +229,8 @@ class MotionEvaluator(Evaluator[MotionResult]):
             for frame in range(self._counts[token]["frames"])
         ]
         numbers = [number for number, token in enumerate(order) if token in set(selected)]
-        return self._result([self._counts[order[number]] for number in numbers], [frames[number] for number in numbers])
-
-    def _result(self, counts: Collection[Counts], vpq: Sequence[Any]) -> MotionResult:
-        paths = _path_sums(counts)
-        found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
-        samples, number = (sum(each[name] for each in counts) for name in ("samples", "instance_maps"))
-        return MotionResult(
-            ranges={
-                name: self._range_result([each["cells"][index] for each in counts], [each[index] for each in vpq])
-                for index, name in enumerate(RANGES)
-            },
-            min_ade=ratio(paths["ade"], paths["count"]),
-            min_fde=ratio(paths["fde"], paths["count"]),
-            miss_rate=ratio(paths["missed"], paths["count"]),
-            paths=int(paths["count"]),
-            path_accuracy=ratio(found, found + alarms / 2 + lost / 2),
-            path_true_positive=found,
-            path_false_positive=alarms,
-            path_false_negative=lost,
-            samples=samples,
-            frames=sum(each["frames"] for each in counts),
-            notes=(f"{number} of {samples} predictions: {_INSTANCE_MAPS}",) if number else (),
-        )
-
-    def _range_result(self, cells: Sequence[Any], vpq: Sequence[Any]) -> RangeResult:
-        """Of samples' [tp, fp, fn] cells, and of their four lists by frame."""
-        overlap, *numbers = (math.fsum(value for each in vpq for value in each[index]) for index in range(4))
-        found, alarms, missed = (int(number) for number in numbers)
-        quality = panoptic_quality(overlap, found, alarms, missed)
-        absent = 0.0 if self.protocol.nothing_is_zero else math.nan
-        percent = 100.0 if found or alarms or missed or self.protocol.nothing_is_zero else math.nan
-        classes = [
-            SegmentationCounts(true_positive=both, false_positive=mine, false_negative=true)
-            for both, mine, true in cells
-        ]
-        return RangeResult(
-            iou=100 * iou(classes, absent=absent),
-            pq=percent * quality.pq,
-            sq=percent * quality.sq,
-            rq=percent * quality.rq,
-            true_positive=found,
-            false_positive=alarms,
-            false_negative=missed,
-        )
+        chosen = [{**self._counts[order[number]], "vpq": frames[number]} for number in numbers]
+        return motion_result(chosen, self.protocol)
 
 
 def motion_counts(
@@ -285,9 +249,7 @@ def motion_counts(
     """
     rules = protocol or MotionProtocol()
     prediction, label = checked_pair(prediction, label)
-    check_protocol(label, rules.labels)
-    frames = frames_there(label)
-    check_output(prediction, label, frames)
+    frames = compared_frames(prediction, label, rules.labels)
     truth, grid = labels_at_present(label), label.config.grid
     last = _last_maps(prediction, frames)
     actors, instance = (prediction.grid.reorient(maps, grid.orientation) for maps in last)
@@ -343,5 +305,72 @@ def _paths_of(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
     return trajectories(predict_instances(heads, _READ_FOR_PATHS), grid, half_cell_shift=False)
 
 
-def _path_sums(counts: Collection[Counts]) -> dict[str, float]:
-    return {name: total((each["paths"] for each in counts if each["paths"]), name) for name in _PATHS}
+def _sums(counts: Collection[Counts]) -> dict[str, Any]:
+    """The samples' counts as those of one sample of one frame."""
+    ranges, kinds = range(len(RANGES)), range(4)
+    vpq = [
+        [[math.fsum(chain.from_iterable(each["vpq"][index][kind] for each in counts))] for kind in kinds]
+        for index in ranges
+    ]
+    columns = [[*zip(*(each["cells"][index] for each in counts), strict=True)] for index in ranges]
+    paths = [each["paths"] for each in counts if each["paths"]]
+    return {
+        **{name: sum(each[name] for each in counts) for name in ("samples", "frames", "instance_maps")},
+        "cells": [[*map(sum, those or [()] * 3)] for those in columns],
+        "vpq": vpq,
+        "paths": {name: total(paths, name) for name in _PATHS},
+    }
+
+
+def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> MotionResult:
+    """The metrics of some samples' counts, in any order."""
+    sums = _sums(counts)
+    paths, samples, number = (sums[name] for name in ("paths", "samples", "instance_maps"))
+    ranges = [_range_result(*each, protocol) for each in zip(sums["cells"], sums["vpq"], strict=True)]
+    found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
+    return MotionResult(
+        ranges=dict(zip(RANGES, ranges, strict=True)),
+        min_ade=ratio(paths["ade"], paths["count"]),
+        min_fde=ratio(paths["fde"], paths["count"]),
+        miss_rate=ratio(paths["missed"], paths["count"]),
+        paths=int(paths["count"]),
+        path_accuracy=ratio(found, found + alarms / 2 + lost / 2),
+        path_true_positive=found,
+        path_false_positive=alarms,
+        path_false_negative=lost,
+        samples=samples,
+        frames=sums["frames"],
+        notes=(f"{number} of {samples} predictions: {_INSTANCE_MAPS}",) if number else (),
+    )
+
+
+def _range_result(cells: Sequence[int], vpq: Sequence[Sequence[float]], protocol: MotionProtocol) -> RangeResult:
+    """Of the sums of [tp, fp, fn] cells, and of overlaps, found, false and missed instances."""
+    (overlap,), *numbers = vpq
+    found, alarms, missed = (int(number) for (number,) in numbers)
+    quality = panoptic_quality(overlap, found, alarms, missed)
+    absent = 0.0 if protocol.nothing_is_zero else math.nan
+    percent = 100.0 if found or alarms or missed or protocol.nothing_is_zero else math.nan
+    both, mine, true = cells
+    classes = [SegmentationCounts(true_positive=both, false_positive=mine, false_negative=true)]
+    return RangeResult(
+        iou=100 * iou(classes, absent=absent),
+        pq=percent * quality.pq,
+        sq=percent * quality.sq,
+        rq=percent * quality.rq,
+        true_positive=found,
+        false_positive=alarms,
+        false_negative=missed,
+    )
+
+
+MOTION: Final = Task(
+    name="motion",
+    kinds=("motion",),
+    protocols=MOTION_PROTOCOLS,
+    evaluator=MotionEvaluator,
+    truth=lambda *facts: (compared_labels(*facts),),
+    counts=lambda _token, *given: motion_counts(*given),
+    result=motion_result,
+    summary=MotionResult.as_dict,
+)

@@ -1,6 +1,8 @@
-"""`AccidentReading`: how an accident is read off instance maps, by the paper's words.
+"""Accidents that instance maps show, by the paper's words: instances whose outlines come near each other.
 
-docs/released_code.md, Paper versus code, has where the released code differs.
+docs/released_code.md, Paper versus code, has where the released code differs. Outlines are convex hulls of sets of
+cells; points and straight lines are hulls like any other. With whole numbers as coordinates everything that is compared
+is exact, so that equal distances are equal floats.
 """
 
 from __future__ import annotations
@@ -11,11 +13,135 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.evaluation.alarms.hulls import convex_hulls, hull_distances
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, first_frames
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation, cells_in
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
+
+_PAIRS_AT_ONCE = 1 << 18
+"""The number of pairs of corner and side in one batch: bounds the memory."""
+
+
+def convex_hulls(points: IntArray, group: IntArray) -> FloatArray:
+    """The convex hulls of N groups of points.
+
+    Args:
+        points: (P, 2) int64 whole coordinates.
+        group: (P,) int64 which group each belongs to: 0 to N − 1, each at least once.
+
+    Returns:
+        (N, V, 2) corners in order around each hull, without those on a straight side; hulls of fewer than V corners
+        repeat their last one. A single point has 1 corner, a straight line 2.
+    """
+    if not len(points):
+        return np.zeros((0, 1, 2))
+    chain, along, aside = _both_sides(points, group)
+    kept = _lower_envelope(chain, along, aside)
+    group, right = chain[kept] // 2, chain[kept] % 2
+    along, aside = along[kept], np.where(right, -aside[kept], aside[kept])
+    # up the left side and down the right one, without the right one's end where both meet in a point
+    order = np.lexsort((np.where(right, -along, along), right, group))
+    group, corners = group[order], np.stack([along, aside], axis=1)[order]
+    again = np.zeros(len(group), dtype=bool)
+    again[1:] = (group[1:] == group[:-1]) & (corners[1:] == corners[:-1]).all(axis=1)
+    last = np.append(group[1:] != group[:-1], True)
+    first = np.concatenate([[0], np.flatnonzero(last)[:-1] + 1])
+    again[last] |= (corners[last] == corners[first]).all(axis=1) & (first != np.flatnonzero(last))
+    return _padded(corners[~again], group[~again])
+
+
+def hull_distances(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The shortest ways between hulls, pair by pair, 0 where they touch or overlap: (P, V, 2), (P, W, 2) → (P,)."""
+    result = np.zeros(len(first))
+    step = max(1, _PAIRS_AT_ONCE // max(1, first.shape[1] * second.shape[1]))
+    for start in range(0, len(first), step):
+        part = slice(start, start + step)
+        result[part] = _distances(first[part], second[part])
+    return result
+
+
+def _both_sides(points: IntArray, group: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """The leftmost and the rightmost points of each row of each group, the latter mirrored.
+
+    Returns:
+        Chains (2 · group for the left, 2 · group + 1 for the right side), rows and columns, by chain and row.
+    """
+    low = points.min(axis=0)
+    rows, columns = (points.max(axis=0) - low + 1).tolist()
+    key = np.sort((group * rows + points[:, 0] - low[0]) * columns + points[:, 1] - low[1])
+    line, column = np.divmod(key, columns)
+    begins = np.append(True, line[1:] != line[:-1])
+    ends = np.append(begins[1:], True)
+    group, row = np.divmod(line[begins], rows)
+    chain = np.concatenate([2 * group, 2 * group + 1])
+    aside = np.concatenate([column[begins] + low[1], -(column[ends] + low[1])])
+    order = np.argsort(chain, kind="stable")
+    return chain[order], np.tile(row + low[0], 2)[order], aside[order]
+
+
+def _lower_envelope(chain: IntArray, along: IntArray, aside: IntArray) -> IntArray:
+    """Which points of each chain, ascending in `along`, are corners of its convex lower side; its ends always are.
+
+    A point on or above the line between any two others is no corner. So all points above the line between their
+    neighbours are removed at once, again and again, until there are none.
+    """
+    kept = np.arange(len(chain))
+    while True:
+        part, a, b = chain[kept], along[kept], aside[kept]
+        inner = np.zeros(len(kept), dtype=bool)
+        inner[1:-1] = (part[2:] == part[:-2]) & (
+            (b[1:-1] - b[:-2]) * (a[2:] - a[:-2]) >= (b[2:] - b[:-2]) * (a[1:-1] - a[:-2])
+        )
+        if not inner.any():
+            return kept
+        kept = kept[~inner]
+
+
+def _padded(corners: IntArray, group: IntArray) -> FloatArray:
+    count = np.bincount(group)
+    first = np.cumsum(count) - count
+    which = np.minimum(np.arange(count.max()), count[:, None] - 1)
+    return np.asarray(corners[first[:, None] + which].astype(np.float64))
+
+
+def _distances(first: FloatArray, second: FloatArray) -> FloatArray:
+    there, way_there = _to_sides(first, second)
+    back, way_back = _to_sides(second, first)
+    way = np.where((there <= back)[:, None], way_there, -way_back)
+    nearest = np.minimum(there, back)
+    return np.where(_parts(way, first, second), np.sqrt(nearest), 0.0)
+
+
+def _to_sides(points: FloatArray, hull: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The shortest way from a side of hulls (P, W, 2) to a corner (P, V, 2): its square, and a vector of any length."""
+    side = np.roll(hull, -1, axis=1) - hull
+    apart = points[:, :, None] - hull[:, None]
+    length = (side * side).sum(axis=-1)[:, None]
+    along = (apart * side[:, None]).sum(axis=-1)
+    across = side[:, None, :, 0] * apart[..., 1] - side[:, None, :, 1] * apart[..., 0]
+    beside = (along > 0) & (along < length)
+    # beyond a side's ends the way to the end itself is the nearest; each end is some side's start
+    squared = np.where(beside, across * across / np.where(beside, length, 1.0), (apart * apart).sum(axis=-1))
+    pair = np.arange(len(points))
+    flat = squared.reshape(len(points), -1)
+    best = np.argmin(flat, axis=1)
+    corner, edge = np.divmod(best, hull.shape[1])
+    to_end, chosen = apart[pair, corner, edge], side[pair, edge]
+    normal = np.stack([-chosen[:, 1], chosen[:, 0]], axis=1) * across[pair, corner, edge, None]
+    return flat[pair, best], np.where(beside[pair, corner, edge, None], normal, to_end)
+
+
+def _parts(way: FloatArray, first: FloatArray, second: FloatArray) -> BoolArray:
+    """Whether a line across `way`, from second to first, has each hull on a side of its own.
+
+    Of hulls that are apart the shortest way between corners and sides is the shortest of all, and such a line crosses
+    it; hulls that overlap cannot be separated.
+    """
+    near = np.einsum("pvk,pk->pv", first, way).min(axis=1)
+    far = np.einsum("pvk,pk->pv", second, way).max(axis=1)
+    return np.asarray(near > far)
+
 
 TIE: Final = 1e-9
 """Lengths that differ by less, in metres, are equal: means of cells are inexact in the last bits."""
@@ -97,6 +223,12 @@ class InstanceAccident:
             return np.full((2, 2), np.nan)
         return self.tracks.at(self.contact.frame, self.contact.ids)
 
+    def explicit(self, seconds: float) -> Accident | None:
+        """It as an explicit accident without ids, `seconds` from frame to frame; None without a contact."""
+        if self.contact is None:
+            return None
+        return Accident(positions=self.positions, time=self.contact.frame * seconds)
+
 
 def even(length: FloatArray) -> FloatArray:
     """Lengths in metres of which those that differ by less than `TIE` in their last bits are equal floats."""
@@ -123,8 +255,19 @@ def accident_of(
     contact = _contact(shapes, size, reading.danger_distance)
     identity, which = np.unique(shapes.identity, return_inverse=True)
     center = np.full((len(instance), len(identity), 2), np.nan)
-    center[shapes.frame, which] = [grid.x[0], grid.y[0]] + (shapes.center + _within_cell(rules)) * size
+    center[shapes.frame, which] = [grid.x[0], grid.y[0]] + (
+        shapes.center + (0.5 if rules is None else rules.place_in_cell)
+    ) * size
     return InstanceAccident(tracks=InstanceTracks(identity=identity, center=center), contact=contact)
+
+
+def predicted_accidents(
+    output: MotionOutput, rules: LabelProtocol | None, reading: AccidentReading, frames: int | None = None
+) -> list[InstanceAccident]:
+    """What `accident_of` reads off each of the K predictions, cut to so many frames; None for all."""
+    heads = [each if frames is None else first_frames(each, frames) for each in output.heads or ()]
+    maps = map(instances_of_heads, heads) if output.instances is None else output.instances[:, :frames]
+    return [accident_of(each, output.grid, rules, reading) for each in maps]
 
 
 def match_tracks(predicted: InstanceTracks, truth: InstanceTracks, gate: float) -> dict[int, int]:
@@ -244,8 +387,3 @@ def _candidates(shapes: _Shapes, size: FloatArray, danger_distance: float) -> tu
         firsts.append(first + start)
         seconds.append(second + start)
     return np.concatenate(firsts), np.concatenate(seconds)
-
-
-def _within_cell(rules: LabelProtocol | None) -> FloatArray:
-    """The point of a cell, in cells along x and y from its low corner, that its rasterised place stands for."""
-    return np.array([0.5, 0.5] if rules is None else rules.place_in_cell)

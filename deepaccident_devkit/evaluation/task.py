@@ -1,0 +1,314 @@
+"""`Task`: what is evaluated, from a results file to numbers; the choices of protocols, and results with headlines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, TypeVar, get_args
+
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.reports import table_html
+from deepaccident_devkit.support.arrays import ShortRepr, known
+from deepaccident_devkit.support.text import choice, possible_text
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+TaskName = Literal["motion", "accident", "detection", "warning"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """One task, whose five doors lead from a results file to numbers: read → truth → counts → result → summary.
+
+    Attributes:
+        name: of `TaskName`.
+        kinds: the kinds of results that it is evaluated from.
+        protocols: its rules by name.
+        evaluator: of some rules; keeps the counts of each sample between the doors `counts` and `result`.
+        read: results, dataset, token, rules → the prediction of a sample, as the rules count it.
+        truth: dataset, token, rules, how motion is stored (`Results.form`; None for other results), horizon in
+            seconds → all that the prediction is compared with.
+        counts: token, prediction, all that `truth` gave, rules → what the sample adds.
+        result: the counts of samples, rules → their metrics.
+        summary: result → its numbers by name, as JSON holds them.
+        whole_recordings: whether whole recordings are followed, so that attributes within them are of no use.
+        needs_meta: whether the truth is in the scenarios' meta files.
+        looks_ahead: whether predictions have a horizon.
+    """
+
+    name: TaskName
+    kinds: tuple[str, ...]
+    protocols: Mapping[str, Any]
+    evaluator: Callable[[Any], Evaluator[Any]]
+    read: Callable[[Any, Dataset, str, Any], Any] = lambda results, _dataset, token, _rules: results.prediction(token)
+    truth: Callable[[Dataset, str, Any, Any, float], tuple[Any, ...]]
+    counts: Callable[..., Counts]
+    result: Callable[[Collection[Counts], Any], Any]
+    summary: Callable[[Any], dict[str, Any]]
+    whole_recordings: bool = False
+    needs_meta: bool = False
+    looks_ahead: bool = True
+
+
+Kind = TypeVar("Kind")
+Rules = TypeVar("Rules", bound="DataclassInstance")
+_WORDS: Final[Mapping[type | None, str]] = {bool: "true or false", float: "a number", str: "a word", tuple: "a list"}
+_LIKE: Final[Mapping[type, tuple[type, ...]]] = {bool: (bool,), float: (float, int), str: (str,), tuple: (tuple,)}
+"""A kind of value → the types that are of it; a bool is an int to Python, so that it comes first."""
+
+
+def switch_names(rules: DataclassInstance) -> list[str]:
+    """The names of all choices of a protocol; those of a part of it with the part's name before them."""
+    names = []
+    for field in fields(rules):
+        value = getattr(rules, field.name)
+        if is_dataclass(value) and not isinstance(value, type):
+            names += [f"{field.name}.{name}" for name in switch_names(value)]
+        else:
+            names.append(field.name)
+    return names
+
+
+def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
+    """A protocol with some choices changed.
+
+    Args:
+        rules: the protocol, a frozen dataclass; parts of it may be others.
+        switches: name of `switch_names` → value; lists stand for tuples, as JSON has them.
+
+    Raises:
+        ChoiceError: the protocol has no such choice, or it is of another kind: a number for a word.
+        DeepAccidentError: it cannot have that value.
+    """
+    if not switches:
+        return rules
+    changes: dict[str, Any] = {}
+    parts: dict[str, dict[str, Any]] = {}
+    names = switch_names(rules)
+    for name, value in switches.items():
+        if name not in names:
+            there = f"there are {possible_text(name, names)}" if names else "it has none"
+            raise ChoiceError(f"{type(rules).__name__} has no switch {name!r}; {there}")
+        head, _, rest = name.partition(".")
+        if rest:
+            parts.setdefault(head, {})[rest] = value
+        else:
+            changes[head] = _of_kind(name, rules, head, as_tuples(value))
+    changes |= {head: switched(getattr(rules, head), those) for head, those in parts.items()}
+    return replace(rules, **changes)  # all at once, since some go together alone
+
+
+def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any:
+    """A value of the kind of a field's own; raises ChoiceError. A field whose value is None takes any."""
+    before = getattr(rules, field)
+    kind = next((kind for kind in (bool, float, str, tuple) if isinstance(before, _LIKE[kind])), None)
+    fits = kind is None or (isinstance(value, _LIKE[kind]) and (kind is bool or not isinstance(value, bool)))
+    takes_none = any("None" in str(each.type) for each in fields(rules) if each.name == field)
+    if not (takes_none if value is None else fits):
+        raise ChoiceError(f"switch {name}: expected {_WORDS[kind]}, such as {before!r}, found {value!r}")
+    return value
+
+
+def protocol_of(given: object, kind: type[Kind], named: Mapping[str, Kind]) -> Kind:
+    """A protocol by its name, or as it is given if it is of a kind; raises ChoiceError."""
+    return given if isinstance(given, kind) else named[choice("protocol", given, named)]
+
+
+def as_tuples(value: Any) -> Any:
+    """Lists as tuples, so that protocols can be compared and looked up by."""
+    return tuple(as_tuples(each) for each in value) if isinstance(value, list | tuple) else value
+
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+
+
+class FrozenDict(dict[Key, Value]):
+    """A dict that does not change, and so has a hash where its values have one.
+
+    A dict and not a view of one, since `dataclasses.asdict`, `copy.deepcopy` and `pickle` refuse views.
+    """
+
+    def __hash__(self) -> int:  # type: ignore[override]  # dict has none, as it changes
+        """Equal ones hash alike."""
+        return hash(frozenset(self.items()))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle would fill an empty one."""
+        return type(self), (dict(self),)
+
+    def _refused(self, *_arguments: Any, **_named: Any) -> NoReturn:
+        raise TypeError("the mappings of a result cannot be changed; make a dict of it")
+
+    __setitem__ = __delitem__ = __ior__ = _refused
+    clear = pop = popitem = setdefault = update = _refused
+
+
+class FrozenMappings(ShortRepr):
+    """Base of frozen dataclasses whose mappings are read-only, from the start and in every copy."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Freeze the mappings."""
+        for name, value in _values(self).items():
+            if isinstance(value, Mapping):
+                object.__setattr__(self, name, _frozen(value))
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, as JSON holds it: None for NaN, numbers as keys as text ("5")."""
+        return {name: plain(value) for name, value in _values(self).items()}
+
+
+def plain(value: Any) -> Any:
+    """What a result holds, as JSON holds it: None for NaN and infinite numbers."""
+    if isinstance(value, FrozenMappings):
+        return value.as_dict()
+    if is_dataclass(value):
+        return {name: plain(each) for name, each in _values(value).items()}
+    if isinstance(value, Mapping):
+        return {f"{key:g}" if isinstance(key, float) else str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _frozen(value: Any) -> Any:
+    if not isinstance(value, Mapping):
+        return value
+    return FrozenDict({key: _frozen(each) for key, each in value.items()})
+
+
+def _values(record: Any) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in fields(record)}
+
+
+Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
+LIMITS: Final[Mapping[Unit, float]] = MappingProxyType({"%": 100.0, "share": 1.0, "1 - overlap": 1.0})
+"""The most that a number of a unit can be; others have no limit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Headline:
+    """One number of a result.
+
+    Attributes:
+        name: short, as tables print it: `iou 30x30`, `accuracy@10`, `mAP`.
+        value: None where there is nothing to count, or the result has no such number.
+        unit: `%` for percent, `share` for a share in [0, 1].
+        higher_is_better: whether more is better; None where neither is.
+        path: of the number in the result, as `breakdowns.numbers_of` has it: `ranges/30x30/iou`.
+    """
+
+    name: str
+    value: float | None
+    unit: Unit
+    higher_is_better: bool | None
+    path: str
+
+    def text(self) -> str:
+        """The value with its unit; see `value_text`."""
+        return value_text(self.value, self.unit)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Where a headline stands in a task's result; `*` is any key, and takes its place in the name."""
+
+    path: str
+    name: str
+    unit: Unit
+    better: Literal["higher", "lower", "neither"] = "lower"
+
+
+_SHOWN: Final = 4
+"""Headlines in a result's text."""
+_HIGHER_IS_BETTER: Final = {"higher": True, "lower": False, "neither": None}
+HEADLINE_UNITS: Final[dict[str, Unit]] = {}
+"""Path of a headline, `*` for any key → its unit; of all results (`TaskResult`)."""
+
+
+class TaskResult(FrozenMappings):
+    """Base of the results of a task's evaluators: its text, and what a notebook shows, are its headlines."""
+
+    __slots__ = ()
+
+    task: ClassVar[str]
+    rows: ClassVar[tuple[Row, ...]] = ()
+    samples: int
+
+    def __init_subclass__(cls) -> None:
+        """Make the units of its headlines known."""
+        super().__init_subclass__()
+        HEADLINE_UNITS.update({row.path: row.unit for row in cls.rows})
+
+    def __repr__(self) -> str:
+        """How many samples, and the first headlines."""
+        found = headlines(self.task, self)
+        shown = [f"{each.name} {each.text()}" for each in found[:_SHOWN]]
+        return f"{type(self).__name__}({self.samples:,} samples: {', '.join(shown)}{', …' * (len(found) > _SHOWN)})"
+
+    def _repr_html_(self) -> str:
+        rows = [(each.name, each.text()) for each in headlines(self.task, self)]
+        return table_html([("number", "value"), *rows], f"{type(self).__name__}, {self.samples:,} samples")
+
+
+def headlines(task: str, result: object) -> tuple[Headline, ...]:
+    """The headline numbers of a result, the most important first.
+
+    Args:
+        task: `motion`, `accident`, `detection` or `warning`.
+        result: of that task's evaluator.
+
+    Returns:
+        Those that this result has: a protocol without a number (the released accidents have no precision) has no such
+        headline either.
+
+    Raises:
+        ChoiceError: no such task.
+    """
+    choice("task", task, get_args(TaskName))
+    return tuple(
+        Headline(
+            name=row.name.replace("*", key),
+            value=known(value),
+            unit=row.unit,
+            higher_is_better=_HIGHER_IS_BETTER[row.better],
+            path=row.path.replace("*", key),
+        )
+        for row in getattr(result, "rows", ())
+        for key, value in _found(result, row.path)
+    )
+
+
+def value_text(value: float | None, unit: Unit, *, signed: bool = False) -> str:
+    """A number with its unit, for people: `41.20 %`, `0.875`, `1.300 m`; `–` for none.
+
+    With `signed` it is a change: `+1.300 m`, and `+0.54` of percents, in percentage points.
+    """
+    if value is None:
+        return "–"
+    number = f"{value:{'+' if signed else ''}.{2 if unit == '%' else 3}f}"
+    return number if unit in ("share", "1 - overlap") or (signed and unit == "%") else f"{number} {unit}"
+
+
+def _found(result: object, path: str) -> Iterator[tuple[str, Any]]:
+    """Keys that stand for the `*` (an empty one without) and the values there."""
+    head, _, rest = path.partition("/")
+    if isinstance(result, Mapping):
+        for name, each in result.items():
+            text = f"{name:g}" if isinstance(name, float) else str(name)
+            if head in ("*", text):
+                yield from ((text, value) for _, value in (_found(each, rest) if rest else [("", each)]))
+    elif hasattr(result, head):
+        value = getattr(result, head)
+        yield from _found(value, rest) if rest else [("", value)]
