@@ -1,6 +1,7 @@
 """Render docs/images/layers.svg from the layers of pyproject.toml: `python docs/make_architecture.py`."""
 
 import ast
+import re
 import sys
 from html import escape
 from pathlib import Path
@@ -16,8 +17,13 @@ PICTURE = TOP / "docs" / "images" / "layers.svg"
 WIDTH, MARGIN, GAP = 1080, 16, 8
 TOP_OF_TEXT, LINE, LETTER = 18, 16, 5.9
 """Pixels."""
-_COLORS = {"data": "#dbe9f6", "work": "#e5f2df", "use": "#fbeed5"}
-_KINDS = {"data": "the release and its tables", "work": "what is computed and rendered", "use": "what people call"}
+_COLORS = {"data": "#dbe9f6", "work": "#e5f2df", "use": "#fbeed5", "ring": "#efe3f3"}
+_KINDS = {
+    "ring": "the ring: may be left out",
+    "use": "what people call",
+    "work": "what is computed and rendered",
+    "data": "the release and its tables",
+}
 
 
 def main() -> None:
@@ -31,7 +37,7 @@ def layers() -> list[list[str]]:
     contract = next(
         contract for contract in content["tool"]["importlinter"]["contracts"] if contract["type"] == "layers"
     )
-    return [[name.strip(" ()") for name in layer.split("|")] for layer in contract["layers"]]
+    return [[name.strip(" ()") for name in re.split("[|:]", layer)] for layer in contract["layers"]]
 
 
 def purpose(module: str) -> str:
@@ -65,19 +71,19 @@ def picture() -> str:
 
 
 def _kind(rows: list[list[str]], number: int) -> str:
-    """Below the data set lies what reads it; what is above the facade or is it, is called by people."""
-    names = [name for row in rows[: number + 1] for name in row]
-    if "dataset" in names:
-        return "data"
-    return "use" if "baselines" not in names else "work"
+    """The ring stands on all; below the data set lies what reads it, and above the facade what is called by people."""
+    above = [name for row in rows[: number + 1] for name in row]
+    if "safety" in rows[number]:
+        return "ring"
+    return "data" if "dataset" in above else "work" if "export" in above else "use"
 
 
 def _key(top: int) -> list[str]:
     parts, left = [], MARGIN
     for kind, words in _KINDS.items():
         parts += [_rectangle(left, top - 10, 12, 12, kind), _text(left + 18, top, words, 'font-size="12"')]
-        left += 220
-    rule = "imports go downwards; side by side: neither knows of the other"
+        left += 200
+    rule = "imports go downwards, never up"
     return [*parts, _text(left, top, rule, 'font-size="12"')]
 
 

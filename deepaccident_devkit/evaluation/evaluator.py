@@ -353,25 +353,17 @@ def _evaluated(batch: _Batch[Any]) -> _Counted:
         for token, counts in parsed_json(content, constants=True).items():
             evaluator.add(token, counts)
         return evaluator, {}
-    found = {token: _fault(evaluator, token, batch.load, task) for token, task in batch.samples}
-    faults = {token: fault for token, fault in found.items() if fault is not None}
+    faults: dict[str, EvaluationError] = {}
+    for token, task in batch.samples:
+        try:
+            evaluator.update(token, *batch.load(task))
+        except Exception as error:  # noqa: BLE001, PERF203 - whatever a caller's own function raises
+            text = str(error).removeprefix(f"{token}: ")
+            faults[token] = EvaluationError(f"{token}: cannot be evaluated: {type(error).__name__}: {text}")
+            faults[token].__cause__ = error
     if store is not None and not faults:
         store.keep(batch.name, batch.key, json.dumps(dict(evaluator.counts)).encode())
     return evaluator, faults
-
-
-def _fault(
-    evaluator: Evaluator[Any], token: str, load: Callable[[Any], Sequence[Any]], task: Any
-) -> EvaluationError | None:
-    """Count a sample; the error if it cannot be, with its cause."""
-    try:
-        evaluator.update(token, *load(task))
-    except Exception as error:  # noqa: BLE001 - whatever a caller's own function raises
-        text = str(error).removeprefix(f"{token}: ")
-        fault = EvaluationError(f"{token}: cannot be evaluated: {type(error).__name__}: {text}")
-        fault.__cause__ = error
-        return fault
-    return None
 
 
 def _fault_of_all(failed: Sequence[EvaluationError], samples: int) -> EvaluationError:

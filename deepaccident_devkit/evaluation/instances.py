@@ -209,17 +209,10 @@ def _matches(
     inside = shared[frame, true_id, predicted_id]
     match = np.flatnonzero(3 * inside > true_size[frame, true_id] + predicted_size[frame, predicted_id])
     if consistent:
-        match = match[_same_partner(true_id[match], predicted_id[match])]
+        order = np.argsort(true_id[match], kind="stable")  # of each true id by time
+        other = (np.diff(true_id[match][order]) == 0) & (np.diff(predicted_id[match][order]) != 0)
+        match = np.delete(match, order[1:][other])
     return frame[match], true_id[match], predicted_id[match]
-
-
-def _same_partner(true_id: IntArray, predicted_id: IntArray) -> BoolArray:
-    """Which matches, in the order of time, are with the same predicted id as the match before of that true id."""
-    order = np.argsort(true_id, kind="stable")
-    other = (np.diff(true_id[order]) == 0) & (np.diff(predicted_id[order]) != 0)
-    same = np.ones(len(order), dtype=bool)
-    same[order[1:]] = ~other
-    return same
 
 
 Paths = Mapping[int, FloatArray]

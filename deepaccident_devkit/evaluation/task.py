@@ -158,13 +158,13 @@ class FrozenMappings(ShortRepr):
 
     def __post_init__(self) -> None:
         """Freeze the mappings."""
-        for name, value in _values(self).items():
-            if isinstance(value, Mapping):
-                object.__setattr__(self, name, _frozen(value))
+        for each in fields(self):  # type: ignore[arg-type]  # its subclasses are dataclasses
+            if isinstance(value := getattr(self, each.name), Mapping):
+                object.__setattr__(self, each.name, _frozen(value))
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it: None for NaN, numbers as keys as text ("5")."""
-        return {name: plain(value) for name, value in _values(self).items()}
+        return {each.name: plain(getattr(self, each.name)) for each in fields(self)}  # type: ignore[arg-type]
 
 
 def plain(value: Any) -> Any:
@@ -172,7 +172,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, FrozenMappings):
         return value.as_dict()
     if is_dataclass(value):
-        return {name: plain(each) for name, each in _values(value).items()}
+        return {each.name: plain(getattr(value, each.name)) for each in fields(value)}
     if isinstance(value, Mapping):
         return {f"{key:g}" if isinstance(key, float) else str(key): plain(each) for key, each in value.items()}
     if isinstance(value, np.ndarray):
@@ -186,10 +186,6 @@ def _frozen(value: Any) -> Any:
     if not isinstance(value, Mapping):
         return value
     return FrozenDict({key: _frozen(each) for key, each in value.items()})
-
-
-def _values(record: Any) -> dict[str, Any]:
-    return {field.name: getattr(record, field.name) for field in fields(record)}
 
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]

@@ -110,7 +110,7 @@ def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) 
 
 def fingerprint(hashes: Mapping[str, ScenarioHashes]) -> str:
     """One hash for the truth of several scenarios, in any order."""
-    return digest_of({token: each.as_dict() for token, each in hashes.items()})
+    return digest_of({token: asdict(each) for token, each in hashes.items()})
 
 
 def digest_of(value: Any) -> str:

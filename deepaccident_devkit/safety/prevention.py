@@ -30,11 +30,11 @@ from deepaccident_devkit.evaluation.warning.recordings import (
     PREDICTORS,
     TRIVIAL,
     UNPLACED,
-    Drive,
+    Recording,
     ScoresOf,
     by_group,
-    drives_of,
     parts_of,
+    recordings_of,
 )
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.reports import Table
@@ -43,11 +43,11 @@ from deepaccident_devkit.safety.prevention_result import (
     NOMINAL,
     SETTINGS,
     AccidentOutcomes,
+    AlarmOutcomes,
     OutcomeTable,
     PreventedResult,
     PreventionCurve,
     PreventionFigures,
-    ScoredEnds,
 )
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -244,14 +244,14 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[PreventedResult]:
         """The result of each draw, without references and curves."""
-        groups = dict(self._groups(drives_of(parts)))
+        groups = dict(self._groups(recordings_of(parts)))
         tables = {group: self._ends(those, GIVEN) for group, those in groups.items()}
         for draw in times:
             figures = {group: self._given(ends, draw) for group, ends in tables.items()}
             yield self._of_groups({GIVEN: figures})
 
     def _result(self, parts: Sequence[Collection[Counts]], *, references: bool) -> PreventedResult:
-        groups = dict(self._groups(drives_of(parts)))
+        groups = dict(self._groups(recordings_of(parts)))
         given = {group: self._ends(those, GIVEN) for group, those in groups.items()}
         made = {GIVEN: {group: self._given(ends) for group, ends in given.items()}}
         if not references:
@@ -284,23 +284,23 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
         """A predictor that names nobody has no right alarms."""
         return next(name for name, (_, scores_of) in _ALARMS.items() if scores_of == self._rules.scores_of)
 
-    def _groups(self, drives: Sequence[Drive]) -> Iterator[tuple[str, list[Drive]]]:
+    def _groups(self, recordings: Sequence[Recording]) -> Iterator[tuple[str, list[Recording]]]:
         """Group → its recordings, accidents of pedestrians apart; those without an accident are in both."""
         tables = self._outcomes.tables
-        for group, those in by_group(drives):
+        for group, those in by_group(recordings):
             walking = {each.name for each in those if each.name in tables and tables[each.name].pedestrian}
             yield group, [each for each in those if each.name not in walking]
             if walking:
                 yield f"{group}{_WALKING}", [each for each in those if each.kind != "accident" or each.name in walking]
 
-    def _ends(self, drives: Sequence[Drive], predictor: str, draw: int = 0) -> Mapping[str, ScoredEnds]:
+    def _ends(self, recordings: Sequence[Recording], predictor: str, draw: int = 0) -> Mapping[str, AlarmOutcomes]:
         """Which alarms warn → one predictor's scores of a group of recordings, with the ends of its accidents."""
         tables = self._outcomes.tables
-        right = ScoredEnds(drives, predictor, "pair", tables, draw)
-        any_alarm = right if predictor in TRIVIAL else ScoredEnds(drives, predictor, "recording", tables, draw)
+        right = AlarmOutcomes(recordings, predictor, "pair", tables, draw)
+        any_alarm = right if predictor in TRIVIAL else AlarmOutcomes(recordings, predictor, "recording", tables, draw)
         return {"right": right, "any_alarm": any_alarm}
 
-    def _given(self, ends: Mapping[str, ScoredEnds], draw: IntArray | None = None) -> PreventionFigures:
+    def _given(self, ends: Mapping[str, AlarmOutcomes], draw: IntArray | None = None) -> PreventionFigures:
         main = ends[self._alarms]
         weight = np.ones(len(main.part)) if draw is None else draw[main.part].astype(np.float64)
         quiet = main.quiet_braking(weight)
@@ -308,7 +308,7 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
         return self._figures(ends, threshold, quiet, weight)
 
     def _figures(
-        self, ends: Mapping[str, ScoredEnds], threshold: float, quiet: float, weight: FloatArray
+        self, ends: Mapping[str, AlarmOutcomes], threshold: float, quiet: float, weight: FloatArray
     ) -> PreventionFigures:
         main = ends[self._alarms]
         return PreventionFigures(
@@ -321,15 +321,15 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
             **{alarms: each.ends(threshold, weight) for alarms, each in ends.items()},
         )
 
-    def _references(self, drives: Sequence[Drive]) -> Iterator[tuple[str, PreventionFigures]]:
+    def _references(self, recordings: Sequence[Recording]) -> Iterator[tuple[str, PreventionFigures]]:
         """Predictor → figures; of a random one the means over some draws, also at the threshold within the budget."""
-        weight = np.ones(len(drives))
+        weight = np.ones(len(recordings))
         for predictor in PREDICTORS[1:]:
             fixed = reference_threshold(predictor)
             if draws_of(predictor) == 1:
-                yield predictor, self._figures(self._ends(drives, predictor), fixed, math.nan, weight)
+                yield predictor, self._figures(self._ends(recordings, predictor), fixed, math.nan, weight)
                 continue
-            drawn = [self._ends(drives, predictor, draw) for draw in range(draws_of(predictor))]
+            drawn = [self._ends(recordings, predictor, draw) for draw in range(draws_of(predictor))]
             quiet = [each[self._alarms].quiet_braking(weight) for each in drawn]
             for name, thresholds in ((predictor, [fixed] * len(drawn)), (f"{predictor}{_QUIET}", quiet)):
                 yield (

@@ -1,6 +1,6 @@
 """How accidents would have ended (`OutcomeTable`), and `PreventedResult`: those that braking after alarms prevents.
 
-`ScoredEnds` asks one predictor's scores how accidents end as the threshold of an alarm moves.
+`AlarmOutcomes` asks one predictor's scores how accidents end as the threshold of an alarm moves.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from deepaccident_devkit.accidents.recorded import Skipped
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import ratio
 from deepaccident_devkit.evaluation.task import FrozenMappings
-from deepaccident_devkit.evaluation.warning.recordings import MINUTE, AlarmRuns, Drive, ScoresOf, series_of
+from deepaccident_devkit.evaluation.warning.recordings import MINUTE, AlarmRuns, Recording, ScoresOf, series_of
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -209,7 +209,7 @@ class _Alarms(FrozenArrays):
     seconds: FloatArray
 
 
-class ScoredEnds:
+class AlarmOutcomes:
     """One predictor's scores of one group of recordings with the ends of its accidents, to be asked with any weights.
 
     Attributes:
@@ -221,25 +221,27 @@ class ScoredEnds:
 
     def __init__(
         self,
-        drives: Sequence[Drive],
+        recordings: Sequence[Recording],
         predictor: str,
         scores_of: ScoresOf,
         outcomes: Mapping[str, OutcomeTable],
         draw: int = 0,
     ) -> None:
         """Count what figures at any threshold need; accidents without a table are not judged."""
-        self._series = series_of(drives, predictor, scores_of, draw)
-        self.part = np.array([each.part for each in drives], dtype=np.int64)
-        judged = [each.kind == "accident" and each.name in outcomes for each in drives]
+        self._series = series_of(recordings, predictor, scores_of, draw)
+        self.part = np.array([each.part for each in recordings], dtype=np.int64)
+        judged = [each.kind == "accident" and each.name in outcomes for each in recordings]
         self.accident, self.normal = np.flatnonzero(judged), np.flatnonzero(~self._series.positive)
         valid = self._series.valid
         self._scores = np.where(valid, self._series.scores, -np.inf)
         self._seconds = valid[self.normal].sum(axis=1) / self._series.fps
         counting = self._scores[np.concatenate([self.accident, self.normal])]
         self.levels = np.unique(counting[np.isfinite(counting)])
-        own = [outcomes[drives[row].name] for row in self.accident.tolist()]
+        own = [outcomes[recordings[row].name] for row in self.accident.tolist()]
         self._latencies = own[0].latencies if own else (0.0,)
-        rows = [table.rows(self._frames(drives[row])) for table, row in zip(own, self.accident.tolist(), strict=True)]
+        rows = [
+            table.rows(self._frames(recordings[row])) for table, row in zip(own, self.accident.tolist(), strict=True)
+        ]
         shape = (len(own), len(self._latencies), self._series.scores.shape[1] + 1, len(BRAKINGS))
         self._outcome, self._extrapolated = (
             np.array([getattr(table, name)[:, each] for table, each in zip(own, rows, strict=True)]).reshape(shape)
@@ -248,7 +250,7 @@ class ScoredEnds:
         self._found: dict[float, _Alarms] = {}
 
     def __repr__(self) -> str:
-        return f"ScoredEnds({len(self.accident):,} accidents, {len(self.normal):,} others, {self._series!r})"
+        return f"AlarmOutcomes({len(self.accident):,} accidents, {len(self.normal):,} others, {self._series!r})"
 
     def minutes(self, weight: FloatArray) -> float:
         """Of the recordings without an accident."""
@@ -311,11 +313,11 @@ class ScoredEnds:
             mitigated=shares[:, :, OUTCOMES.index("mitigated")],
         )
 
-    def _frames(self, drive: Drive) -> IntArray:
+    def _frames(self, recording: Recording) -> IntArray:
         """(T + 1,) frame number of each column of the scores; −1, no frame, of the one after the last."""
         step = round(1 / (self._series.fps * FRAME_PERIOD))
         columns = self._series.scores.shape[1]
-        return np.append(drive.frame[0] + step * np.arange(columns), -1)
+        return np.append(recording.frame[0] + step * np.arange(columns), -1)
 
     def _at(self, threshold: float) -> _Alarms:
         """The alarms at a threshold; kept."""

@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -298,15 +298,16 @@ def _further(given: Breakdown[Any]) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True, eq=False)
 class _AttributesWhenAsked(Mapping[str, SampleAttributes]):
     """`sample_attributes`, made when one is asked for: an evaluation that is not broken down needs none."""
 
-    def __init__(self, dataset: Dataset, tokens: Iterable[str]) -> None:
-        self._dataset, self._tokens = dataset, tuple(tokens)
+    dataset: Dataset
+    tokens: Sequence[str]
 
     @cached_property
     def _made(self) -> dict[str, SampleAttributes]:
-        return sample_attributes(self._dataset, self._tokens)
+        return sample_attributes(self.dataset, self.tokens)
 
     def __getitem__(self, token: str) -> SampleAttributes:
         return self._made[token]
@@ -315,7 +316,7 @@ class _AttributesWhenAsked(Mapping[str, SampleAttributes]):
         return iter(self._made)
 
     def __len__(self) -> int:
-        return len(self._tokens)
+        return len(self.tokens)
 
 
 def evaluate_results(
@@ -376,7 +377,7 @@ def evaluate_results(
         partial=_partial(covered),
         left_out=len(covered.extra) + len(covered.unknown),
         attributes=_AttributesWhenAsked(dataset, tokens),
-        times_to_impact={token: dataset.sample.get(token)["time_to_impact"] for token in tokens},
+        times_to_impact={token: dataset.get("sample", token)["time_to_impact"] for token in tokens},
         breakdowns=(),
         release=ReleaseInfo(dataroot=str(dataset.dataroot), version=dataset.version, scenarios=hashes),
         results=results_info(loader.results),

@@ -242,7 +242,7 @@ class EvaluationSetup:
     Attributes:
         task: `motion`, `accident`, `detection` or `warning`.
         protocol: the name of one of the task's (`TASK_PROTOCOLS`).
-        switches: choices of the protocol that are changed, by name (`choices.switch_names`).
+        switches: choices of the protocol that are changed, by name (`task.switch_names`).
         horizon: seconds that the predictions look ahead; detection has none.
     """
 

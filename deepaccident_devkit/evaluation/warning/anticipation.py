@@ -19,12 +19,12 @@ from deepaccident_devkit.evaluation.warning.recordings import (
     GROUPS,
     KINDS,
     PREDICTORS,
-    Drive,
+    Recording,
     ScoresOf,
     by_group,
-    drives_of,
     left_out_notes,
     parts_of,
+    recordings_of,
     series_of,
     twin_pairs,
 )
@@ -140,8 +140,8 @@ class CleanWarnings:
     def result(self, counts: Collection[Counts], *, references: bool = False) -> AnticipationResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""
         parts = parts_of(counts)
-        drives, samples = drives_of(parts), [sample for part in parts for sample in part]
-        groups = dict(by_group(drives))
+        recordings, samples = recordings_of(parts), [sample for part in parts for sample in part]
+        groups = dict(by_group(recordings))
         made = {
             predictor: {group: _figures(those, predictor, self) for group, those in groups.items()}
             for predictor in (PREDICTORS if references else PREDICTORS[:1])
@@ -152,12 +152,12 @@ class CleanWarnings:
             groups=made.pop(GIVEN),
             references=made,
             beyond=sum(each["beyond"] for each in samples),
-            notes=tuple(_notes(samples, drives, self)),
+            notes=tuple(_notes(samples, recordings, self)),
         )
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[AnticipationResult]:
         """The result of each draw, without references; see `Evaluator.resampled`."""
-        tables = {group: _Table(those, GIVEN, self) for group, those in by_group(drives_of(parts))}
+        tables = {group: _Table(those, GIVEN, self) for group, those in by_group(recordings_of(parts))}
         samples, beyond = (
             np.array([sum(count(each) for each in part) for part in parts], dtype=np.int64)
             for count in (lambda _: 1, lambda each: each["beyond"])
@@ -175,15 +175,17 @@ class CleanWarnings:
 class _Table:
     """One predictor's scores of one group of recordings, to be asked with any weights."""
 
-    def __init__(self, drives: Sequence[Drive], predictor: str, rules: CleanWarnings, draw: int = 0) -> None:
+    def __init__(self, recordings: Sequence[Recording], predictor: str, rules: CleanWarnings, draw: int = 0) -> None:
         self._predictor, self._rules = predictor, rules
-        series = series_of(drives, predictor, rules.scores_of, draw)
-        everyone = None if rules.scores_of == "recording" else series_of(drives, predictor, "recording", draw).highest()
+        series = series_of(recordings, predictor, rules.scores_of, draw)
+        everyone = (
+            None if rules.scores_of == "recording" else series_of(recordings, predictor, "recording", draw).highest()
+        )
         self._scores = CleanScores(series, everyone)
-        self._pairs = twin_pairs(drives)
-        self._part = np.array([each.part for each in drives], dtype=np.int64)
-        self._kind = np.array([each.kind for each in drives])
-        self._sees_others = drives[0].group not in (GROUPS[0], GROUPS[-1])
+        self._pairs = twin_pairs(recordings)
+        self._part = np.array([each.part for each in recordings], dtype=np.int64)
+        self._kind = np.array([each.kind for each in recordings])
+        self._sees_others = recordings[0].group not in (GROUPS[0], GROUPS[-1])
 
     def figures(self, draw: IntArray | None = None) -> AnticipationFigures:
         """The figures of recordings that count as often as their part is drawn; None for once each."""
@@ -222,9 +224,9 @@ class _Table:
         return ratio(float((won * pairs).sum()), float(pairs.sum()))
 
 
-def _figures(drives: Sequence[Drive], predictor: str, rules: CleanWarnings) -> AnticipationFigures:
+def _figures(recordings: Sequence[Recording], predictor: str, rules: CleanWarnings) -> AnticipationFigures:
     """One predictor's figures; of a random one their means over some draws, so that no luck ranks it."""
-    drawn = [_Table(drives, predictor, rules, draw).figures() for draw in range(draws_of(predictor))]
+    drawn = [_Table(recordings, predictor, rules, draw).figures() for draw in range(draws_of(predictor))]
     return drawn[0] if len(drawn) == 1 else mean_of(drawn)
 
 
@@ -247,17 +249,17 @@ def mean_of(parts: Sequence[Any]) -> Any:
     return first
 
 
-def _notes(counts: Collection[Counts], drives: Sequence[Drive], rules: CleanWarnings) -> Iterator[str]:
-    kinds = {each.kind for each in drives}
-    if drives and "accident" not in kinds:
+def _notes(counts: Collection[Counts], recordings: Sequence[Recording], rules: CleanWarnings) -> Iterator[str]:
+    kinds = {each.kind for each in recordings}
+    if recordings and "accident" not in kinds:
         yield "no recording of an accident was evaluated; give accident scenarios too for warnings"
-    if drives and kinds == {"accident"}:
+    if recordings and kinds == {"accident"}:
         yield "no recording without an accident was evaluated; give normal scenarios too for false alarms"
-    if drives and rules.threshold is None:
+    if recordings and rules.threshold is None:
         yield (
             "the operating point is that of a recall of 0.8, or the highest, on these very recordings; choose it on "
             "another split with --threshold-from, or give it with --switch threshold=…"
         )
     yield from left_out_notes(counts)
-    if drives and not any(each["references"] for each in counts):
+    if recordings and not any(each["references"] for each in counts):
         yield "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"

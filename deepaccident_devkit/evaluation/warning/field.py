@@ -21,9 +21,9 @@ from deepaccident_devkit.evaluation.warning.recordings import (
     PREDICTORS,
     ScoreSeries,
     by_group,
-    drives_of,
     left_out_notes,
     parts_of,
+    recordings_of,
     series_of,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, ShortRepr
@@ -312,7 +312,7 @@ class FieldWarnings:
     def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""
         parts = parts_of(counts)
-        groups, samples = dict(by_group(drives_of(parts))), [sample for part in parts for sample in part]
+        groups, samples = dict(by_group(recordings_of(parts))), [sample for part in parts for sample in part]
         made = {
             predictor: {
                 f"{code} {group}": field_figures(series_of(those, predictor, "recording"), code)

@@ -242,7 +242,7 @@ _COLUMN: Final[Mapping[ScoresOf, int]] = {name: column for column, name in enume
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Drive(FrozenArrays):
+class Recording(FrozenArrays):
     """What one agent's recording of a scenario says; arrays are read-only.
 
     Attributes:
@@ -276,10 +276,10 @@ def parts_of(counts: Collection[Counts]) -> list[Sequence[Counts]]:
     return [[each for each in counts if PART not in each], *(each[PART] for each in counts if PART in each)]
 
 
-def drives_of(parts: Sequence[Collection[Counts]]) -> list[Drive]:
+def recordings_of(parts: Sequence[Collection[Counts]]) -> list[Recording]:
     """The recordings of each part's samples, by name; those of unplaced accidents (`UNPLACED`) left out."""
     return [
-        _drive(name, list(those), part)
+        _recording(name, list(those), part)
         for part, counts in enumerate(parts)
         for name, those in groupby(
             sorted((each for each in counts if each["kind"] != UNPLACED), key=_PLACE), key=itemgetter("recording")
@@ -297,43 +297,45 @@ def left_out_notes(samples: Collection[Counts]) -> Iterator[str]:
         yield f"{beyond} alarms are for later than the horizon and do not count"
 
 
-def series_of(drives: Sequence[Drive], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:
+def series_of(recordings: Sequence[Recording], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:
     """The scores of some recordings, a column a step: the smallest from a sample to the next of any of them.
 
     Lengths must not tell which recordings end in an accident. So twins end where their accident does, and others at
     the latest after the median length of the accidents.
 
     Args:
-        drives: the recordings.
+        recordings: the recordings.
         predictor: of `PREDICTORS`.
         scores_of: whose alarms count where somebody collides.
         draw: of a random predictor.
     """
-    gaps = [int(np.diff(each.frame).min()) for each in drives if len(each.frame) > 1]
+    gaps = [int(np.diff(each.frame).min()) for each in recordings if len(each.frame) > 1]
     step = max(min(gaps, default=1), 1)
-    begin = np.array([each.frame[0] for each in drives], dtype=np.float64)
-    columns = [np.rint((each.frame - each.frame[0]) / step).astype(np.int64) for each in drives]
-    scores = np.full((len(drives), 1 + max((int(each[-1]) for each in columns), default=0)), np.nan)
-    for row, (drive, column) in enumerate(zip(drives, columns, strict=True)):
-        known = drive.scores.get(predictor)
-        scores[row, column] = _trivial(predictor, drive, draw) if known is None else known[:, _COLUMN[scores_of]]
-    kinds = np.array([each.kind for each in drives])
-    toa = (np.array([each.end for each in drives], dtype=np.float64) - begin) / step
+    begin = np.array([each.frame[0] for each in recordings], dtype=np.float64)
+    columns = [np.rint((each.frame - each.frame[0]) / step).astype(np.int64) for each in recordings]
+    scores = np.full((len(recordings), 1 + max((int(each[-1]) for each in columns), default=0)), np.nan)
+    for row, (recording, column) in enumerate(zip(recordings, columns, strict=True)):
+        known = recording.scores.get(predictor)
+        scores[row, column] = _trivial(predictor, recording, draw) if known is None else known[:, _COLUMN[scores_of]]
+    kinds = np.array([each.kind for each in recordings])
+    toa = (np.array([each.end for each in recordings], dtype=np.float64) - begin) / step
     if (kinds == "accident").any():
         toa[kinds == "others"] = np.minimum(toa, np.median(toa[kinds == "accident"]))[kinds == "others"]
     return ScoreSeries(scores=scores, positive=kinds == "accident", toa=toa, fps=1 / (step * FRAME_PERIOD))
 
 
-def twin_pairs(drives: Sequence[Drive]) -> IntArray:
+def twin_pairs(recordings: Sequence[Recording]) -> IntArray:
     """(P, 2) rows of the accident recordings and of their twins', of one part each."""
-    rows = {(each.story, each.part, each.kind): row for row, each in enumerate(drives)}
+    rows = {(each.story, each.part, each.kind): row for row, each in enumerate(recordings)}
     pairs = [
-        (row, rows.get((each.story, each.part, "twins"))) for row, each in enumerate(drives) if each.kind == "accident"
+        (row, rows.get((each.story, each.part, "twins")))
+        for row, each in enumerate(recordings)
+        if each.kind == "accident"
     ]
     return np.array([pair for pair in pairs if pair[1] is not None], dtype=np.int64).reshape(-1, 2)
 
 
-def _drive(name: str, samples: Sequence[Counts], part: int) -> Drive:
+def _recording(name: str, samples: Sequence[Counts], part: int) -> Recording:
     first = samples[0]
     scenario, _, agent = name.rpartition("/")
     frame = np.array([each["frame"] for each in samples], dtype=np.int64)
@@ -346,7 +348,7 @@ def _drive(name: str, samples: Sequence[Counts], part: int) -> Drive:
     for number, each in enumerate(REFERENCES):
         known = [sample["references"][number] if sample["references"] else [None, None] for sample in samples]
         scores[each] = _scores(known)
-    return Drive(
+    return Recording(
         name=name,
         story=f"{cluster_of(scenario)}/{agent}",
         group=first["involvement"] or GROUPS[-1],
@@ -364,18 +366,18 @@ def _scores(pairs: Iterable[Sequence[float | None]]) -> FloatArray:
     return np.nan_to_num(scores.reshape(-1, 2), nan=-np.inf, neginf=-np.inf)
 
 
-def _trivial(predictor: str, drive: Drive, draw: int) -> FloatArray:
+def _trivial(predictor: str, recording: Recording, draw: int) -> FloatArray:
     """(S,) scores of a predictor that knows nothing; random ones are seeded by the recording and the draw."""
     if predictor in ("always", "never"):
-        return np.full(len(drive.frame), 1.0 if predictor == "always" else -np.inf)
-    source = np.random.default_rng([zlib.crc32(drive.name.encode()), TRIVIAL.index(predictor), draw])
-    frames = 1 if predictor == "random per recording" else int(drive.frame[-1]) + 1
-    return source.random(frames)[drive.frame % frames]
+        return np.full(len(recording.frame), 1.0 if predictor == "always" else -np.inf)
+    source = np.random.default_rng([zlib.crc32(recording.name.encode()), TRIVIAL.index(predictor), draw])
+    frames = 1 if predictor == "random per recording" else int(recording.frame[-1]) + 1
+    return source.random(frames)[recording.frame % frames]
 
 
-def by_group(drives: Sequence[Drive]) -> Iterator[tuple[str, list[Drive]]]:
+def by_group(recordings: Sequence[Recording]) -> Iterator[tuple[str, list[Recording]]]:
     """Group → its recordings, of the groups that there are."""
     for group in GROUPS:
-        chosen = [each for each in drives if each.group == group]
+        chosen = [each for each in recordings if each.group == group]
         if chosen:
             yield group, chosen

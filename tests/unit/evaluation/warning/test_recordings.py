@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.warning import CleanScores, ScoreSeries
 from deepaccident_devkit.evaluation.warning.clean import EARLY, SAME_RECALL, WINDOW
-from deepaccident_devkit.evaluation.warning.recordings import REFERENCES, drives_of, series_of
+from deepaccident_devkit.evaluation.warning.recordings import REFERENCES, recordings_of, series_of
 
 
 def counts(frame: int, kind: str = "accident", name: str = "t_accident/s/a", **more: Any) -> dict[str, Any]:
@@ -43,13 +43,13 @@ LOW = -math.inf
 
 
 def test_columns_are_steps_from_the_first_sample() -> None:
-    drives = drives_of([ALL])
-    assert [(each.name, each.kind, each.end) for each in drives] == [
+    recordings = recordings_of([ALL])
+    assert [(each.name, each.kind, each.end) for each in recordings] == [
         ("n/o/a", "others", 32),
         ("t_accident/s/a", "accident", 23),
         ("t_normal/s/a", "twins", 26),
     ]
-    pair, whole = (series_of(drives, "given", scores_of) for scores_of in ("pair", "recording"))
+    pair, whole = (series_of(recordings, "given", scores_of) for scores_of in ("pair", "recording"))
     gap = math.nan
     assert_array_equal(pair.scores[0], [0.8, gap, 0.8, gap, gap, gap, 0.8])
     assert_array_equal(pair.scores[1], [0.3, 0.4, gap, LOW, gap, gap, gap])
@@ -60,34 +60,34 @@ def test_columns_are_steps_from_the_first_sample() -> None:
     assert pair.fps == pytest.approx(2.0)
     assert pair.valid.sum(axis=1).tolist() == [2, 3, 4]
     assert pair.highest().tolist() == [0.8, 0.4, 0.5]
-    references = [series_of(drives, name, scores_of) for name in REFERENCES for scores_of in ("pair", "recording")]
+    references = [series_of(recordings, name, scores_of) for name in REFERENCES for scores_of in ("pair", "recording")]
     assert [each.scores[1, 1] for each in references] == [0.2, 0.6, LOW, 0.5]
     assert [each.scores[1, 0] for each in references] == [LOW] * 4
 
 
 def test_others_end_by_themselves_where_nobody_collides_or_sooner() -> None:
-    assert series_of(drives_of([ALONE]), "given", "pair").toa.tolist() == [3.1]  # steps of ten frames
+    assert series_of(recordings_of([ALONE]), "given", "pair").toa.tolist() == [3.1]  # steps of ten frames
     alone = [*ALONE[:1], counts(2, "others", "n/o/a")]
-    series = series_of(drives_of([[*alone, *CRASH]]), "given", "pair")
+    series = series_of(recordings_of([[*alone, *CRASH]]), "given", "pair")
     assert series.toa.tolist() == [2.0, 21.0]
     assert series.fps == pytest.approx(10)
     longer = [counts(each["frame"], name="t_accident/z/a", to_end=101 - each["frame"]) for each in CRASH]
-    assert series_of(drives_of([[*ALONE, *CRASH, *longer]]), "given", "pair").toa[0] == pytest.approx(31 / 5)
-    single = series_of(drives_of([ALONE[:1]]), "given", "pair")
+    assert series_of(recordings_of([[*ALONE, *CRASH, *longer]]), "given", "pair").toa[0] == pytest.approx(31 / 5)
+    single = series_of(recordings_of([ALONE[:1]]), "given", "pair")
     assert (single.scores.tolist(), single.toa.tolist(), single.fps) == ([[0.8]], [1.0], pytest.approx(10))
-    assert series_of(drives_of([CRASH]), "given", "pair").fps == pytest.approx(2.0)
-    uneven = drives_of([[counts(frame, "others") for frame in (1, 4, 9)]])
+    assert series_of(recordings_of([CRASH]), "given", "pair").fps == pytest.approx(2.0)
+    uneven = recordings_of([[counts(frame, "others") for frame in (1, 4, 9)]])
     assert np.isfinite(series_of(uneven, "always", "pair").scores).tolist() == [[True, True, False, True]]
     assert series_of([], "given", "pair").scores.shape == (0, 1)
 
 
 def test_a_recording_has_ten_thousand_frames_at_most() -> None:
-    assert drives_of([[counts(0), counts(10_000)]])[0].end == 10_001
+    assert recordings_of([[counts(0), counts(10_000)]])[0].end == 10_001
     for frame in (10_001, -1):
         with pytest.raises(
             EvaluationError, match=f"^t_accident/s/a: expected frames up to 10,000, found {min(0, frame)} to"
         ):
-            drives_of([[counts(0), counts(frame)]])
+            recordings_of([[counts(0), counts(frame)]])
 
 
 def test_first_scores_and_leads_at_the_threshold_itself() -> None:
