@@ -128,19 +128,20 @@ class Manifest:
         """
         own = f"{form.name}{_ENDING}"
         try:
+            if folder.exists() and not folder.is_dir():
+                raise ExportError(f"{folder}: is a file; give a folder")
+            # before the look for a manifest: another process may write that now, and files only after it
+            others = [] if not folder.exists() else sorted(each.name for each in folder.iterdir())
             if (folder / own).exists():
                 found = cls.read(folder, form.name)
                 found.check(folder, settings)
                 return found
-            if folder.exists() and not folder.is_dir():
-                raise ExportError(f"{folder}: is a file; give a folder")
-            others = [] if not folder.exists() else sorted(each.name for each in folder.iterdir())
         except ExportError:
             raise
         except OSError as error:
             raise ExportError(f"{folder}: cannot be read ({error}); choose another folder") from error
-        # a killed export may have left the store alone, and another process may have written the manifest just now
-        strange = [each for each in others if each not in (_FOLDER, own) and temporary_of(each) is None]
+        # a killed export may have left the store alone
+        strange = [each for each in others if each != _FOLDER and temporary_of(each) is None]
         if strange and not any(f"{each}{_ENDING}" in others for each in form.beside):
             raise ExportError(
                 f"{folder}: is not empty ({shortened(strange[0])}) and holds no {form.name} export; choose a new folder"
