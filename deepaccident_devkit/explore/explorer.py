@@ -49,10 +49,8 @@ _QUALITY: Final = 75
 _REACH: Final = 40.0
 """Metres from the middle of a picture from above to its left edge."""
 _FRONT: Final = "Camera_Front"
-_MOST_PICTURES: Final = 64_000_000
-"""Bytes of pictures in memory."""
-_MOST_REPLAYS: Final = 6
-"""Scenarios whose replay is in memory: some megabytes each."""
+_MOST_PICTURES, _MOST_REPLAYS = 64_000_000, 6
+"""Bytes of pictures in memory; and scenarios whose replay is in memory, some megabytes each."""
 DPI: Final = 80
 """Pixels of rendered figures to an inch."""
 _MANY: Final = 64

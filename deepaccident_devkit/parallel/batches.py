@@ -36,10 +36,9 @@ Progress: TypeAlias = "bool | Callable[[float], object]"
 """Whether to show a progress bar; or a function that gets each item's share of the work, for a bar of the caller's."""
 _SAME_SIGNAL: Final = 0.1
 """Seconds in which a signal that ended a worker ends this process too, if it was sent to all processes of a job."""
-_AHEAD: Final = 4
-"""Items under way for each one that the workers do at once."""
-_FAR_AHEAD: Final = 32
-"""The same, counted from the oldest item that is not done: what is needed in order waits for it in memory."""
+_AHEAD, _FAR_AHEAD = 4, 32
+"""Items under way for each one that the workers do at once; and counted from the oldest item that is not done, since
+what is needed in order waits for it in memory."""
 _WIDTH_SECONDS: Final = 5.0
 """Time after which an executor is asked again: workers join and leave."""
 

@@ -1,6 +1,6 @@
 """All pictures. A function for one panel takes `ax=` and returns the Axes; nothing here opens a window."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.render.accident import render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
@@ -22,7 +22,7 @@ from deepaccident_devkit.render.samples import render_calibration, render_frame,
 from deepaccident_devkit.render.styles import style
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
-from deepaccident_devkit.rooms import added
+from deepaccident_devkit.rooms import names_of
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 
 __all__ = [
@@ -61,9 +61,4 @@ if not TYPE_CHECKING:  # the types stay those of the functions themselves
         if _name.startswith("render_") and _name in globals():
             globals()[_name] = with_keywords_named(globals()[_name], __name__)
 
-
-def __getattr__(name: str) -> Any:
-    """Import the picture of a room when it is asked for."""
-    if name != "render_town_map":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return added("picture", name)
+__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `maps` adds

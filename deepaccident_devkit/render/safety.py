@@ -1,11 +1,5 @@
 """Pictures of what `deepaccident_devkit.safety` computes, which has them, under the names that they had here."""
 
-from typing import Any
+from deepaccident_devkit.rooms import names_of
 
-from deepaccident_devkit.rooms import ADDED, added
-
-
-def __getattr__(name: str) -> Any:
-    if name not in ADDED["picture"]:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return added("picture", name)
+__getattr__, __dir__ = names_of(__name__, ("render_avoidability", "render_lead_times", "save_safety_report"))

@@ -33,10 +33,9 @@ SHEER_CURTAINS: Final = (
 VISIBILITIES: Final = ("visible", "partial", "invisible")
 _STEP: Final = 5
 """Frames between two observations: the released code works at 2 Hz."""
-_OBSERVED: Final = 3
-"""Observations that count: the present one and two before it."""
-_EVALUATED: Final = 4
-"""Steps before the last frame at which the released code evaluates: 0.5, 1, 1.5 and 2 s."""
+_OBSERVED, _EVALUATED = 3, 4
+"""Observations that count, the present one and two before it; and steps before the last frame at which the released
+code evaluates: 0.5, 1, 1.5 and 2 s."""
 _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
     "ego_vehicle": {
         "behind": "ego_vehicle_behind",

@@ -24,12 +24,9 @@ PANEL: Final = (5.2, 3.0)
 _BESIDE: Final = 1.3
 """The axis' length in lengths of the longest bar, so that the words beside the bars have room."""
 UNKNOWN: Final = "not known"
-_WIDTH: Final = 7.2
-"""Inches, as the heights below."""
-_ROW: Final = 0.42
+_WIDTH, _ROW, _TITLE = 7.2, 0.42, 0.9  # inches
 _AXIS: Final = 0.6
-"""Of the ticks and the label of a panel."""
-_TITLE: Final = 0.9
+"""Inches of the ticks and the label of a panel."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
