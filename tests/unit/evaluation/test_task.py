@@ -8,6 +8,8 @@ from evaluation_runs import stored_run
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup, TaskName
 
+TOP = Path(__file__).parents[3]
+
 
 @pytest.mark.parametrize(
     ("task", "protocol"),
@@ -27,3 +29,15 @@ def test_read_truth_counts_result_summary(
     summary = doors.summary(doors.result(counts, setup.rules))
     assert summary["samples"] == len(results) > 1
     assert summary == run.result.as_dict()
+
+
+@pytest.mark.slow
+def test_a_sample_enters_few_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TOP))
+    from benchmarks.entered import walks
+
+    made = walks()
+    for walk in ("motion, released", "accident, boxes"):
+        own = [module for module in made[walk] if module.startswith("deepaccident_devkit.evaluation")]
+        assert len(made[walk]) <= 35, walk
+        assert len(own) <= 10, walk
