@@ -28,6 +28,8 @@ TESTS = {
     "motion": "unit/motion property/test_motion_labels property/test_postprocessing property/test_warps "
     "parity/test_fiery parity/test_labels parity/test_postprocess parity/test_trajectories parity/test_visibility "
     "parity/test_warps",
+    "exact": "unit/exact unit/motion property/test_postprocessing property/test_warps parity/test_accident "
+    "parity/test_labels parity/test_postprocess parity/test_warps",
     "evaluation/results": "unit/evaluation/results",
     "evaluation/runs": "unit/evaluation/runs test_cli_evaluate",
     "evaluation/__init__": "unit/evaluation/runs",
