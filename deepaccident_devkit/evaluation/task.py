@@ -218,7 +218,10 @@ class Headline:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Where a headline stands in a task's result; `*` is any key, and takes its place in the name."""
+    """Where a headline stands in a task's result; `*` is any key, and takes its place in the name.
+
+    A path has one unit in the results of all tasks.
+    """
 
     path: str
     name: str
