@@ -126,7 +126,7 @@ def _counts(tally: "Tally", done: str) -> str:
 def _of_format(name: str, kind: type[Any], *options: Callable[[Any], Any]) -> click.Command:
     """The verb of a format, whose own options set fields of the format."""
 
-    @verb(name, short_help=_LINES[name], help=_HELP[name])
+    @verb(name, short_help=_LINES[name], help=_HELP.get(name, _LINES[name]))
     @bulk_parameters()
     @together(*options)
     def export_format(**chosen: Any) -> None:

@@ -258,7 +258,7 @@ class Format(ABC):
 
     @abstractmethod
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Write a unit, and count its samples in `output.tally`; called again for the same unit after an interruption."""
+        """Write a unit, and count its samples (`output.tally`); called again for the same one after an interruption."""
 
     @abstractmethod
     def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
