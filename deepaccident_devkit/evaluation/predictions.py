@@ -82,7 +82,7 @@ class MotionOutput(FrozenArrays):
         grid: BevGrid,
         orientation: Orientation | None = None,
     ) -> MotionOutput:
-        """Heads as a model gives them: stacked arrays of any framework (`arrays.as_numbers`), and lists.
+        """Heads as a model gives them: stacked arrays of any framework (`support.arrays.as_numbers`), and lists.
 
         float32 arrays in the processor's memory are not copied. A single prediction may lack the first axis, K, in all
         four. The arrays are of one sample: K is no batch.

@@ -1,6 +1,6 @@
 """Transforms between frames of moments and agents, and BEV feature maps in another frame, with gradients.
 
-The sibling of `geometry.six_vectors` and `motion.warps.chains`, for whole batches. Nothing here depends on the
+The sibling of `geometry.conventions` and `motion.warping`, for whole batches. Nothing here depends on the
 handedness, so long as all that goes in has the same. Products are written as sums, because `autocast` would
 round a matrix product to bfloat16, and metres need more digits than that.
 
@@ -23,7 +23,7 @@ Chain = Literal["released", "exact"]
 
 
 def matrices_from_six(six: Tensor) -> Tensor:
-    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4), as `geometry.six_vectors.to_matrices`."""
+    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4), as `geometry.conventions.matrices_of_six`."""
     cx, cy, cz = torch.cos(six[..., 3:]).unbind(-1)
     sx, sy, sz = torch.sin(six[..., 3:]).unbind(-1)
     tx, ty, tz = six[..., :3].unbind(-1)

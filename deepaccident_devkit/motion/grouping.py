@@ -96,7 +96,7 @@ class MotionHeads(ShortRepr):
         *,
         ignore_index: int | None = None,
     ) -> MotionHeads:
-        """Heads from arrays of any framework (`arrays.as_numbers`) or lists, in the order in which models give them.
+        """Heads from arrays of any framework (`support.arrays.as_numbers`) or lists, in the order of models' outputs.
 
         float32 arrays in the processor's memory are not copied.
 

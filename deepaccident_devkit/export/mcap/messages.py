@@ -219,12 +219,12 @@ def points3(points: FloatArray) -> list[Any]:
 
 
 def rgb(color: str) -> ByteArray:
-    """(3,) uint8 of a colour of `render.colors`, such as `#9a9a9a`."""
+    """(3,) uint8 of a colour of `render.styles`, such as `#9a9a9a`."""
     return np.frombuffer(bytes.fromhex(color[1:]), dtype=np.uint8)
 
 
 def color_message(color: str, alpha: float = 1.0) -> Any:
-    """A `Color` of a colour of `render.colors`."""
+    """A `Color` of a colour of `render.styles`."""
     red, green, blue = (rgb(color) / 255).tolist()
     return Color(r=red, g=green, b=blue, a=alpha)
 

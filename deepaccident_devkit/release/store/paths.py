@@ -107,7 +107,7 @@ class StorePath:
         return self.store.local_path(self.inside)
 
     def content(self, kind: FileKind) -> bytes:
-        """The file's bytes, as `reading.read_bytes` gives them; raises OSError."""
+        """The file's bytes, as `support.reading.read_bytes` gives them; raises OSError."""
         return self.store.read(self.inside, kind)
 
 

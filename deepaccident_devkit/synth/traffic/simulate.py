@@ -331,6 +331,6 @@ def _relative(poses: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _footprints(poses: FloatArray, size: FloatArray) -> FloatArray:
-    """Rectangles (…, 5) as `geometry.footprints` has them: x, y, length, width, yaw."""
+    """Rectangles (…, 5) as `geometry.box_arrays` has them: x, y, length, width, yaw."""
     sizes = np.broadcast_to(size, (*poses.shape[:-1], 2))
     return np.concatenate([poses[..., :2], sizes, poses[..., 2:]], axis=-1)
