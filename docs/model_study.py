@@ -33,14 +33,7 @@ from model_study_protocol import (
     ReleasePlan,
     rows_of,
 )
-from model_study_rows import (
-    RowJob,
-    count_results,
-    evaluators_of,
-    opened,
-    write_counts,
-    write_results,
-)
+from model_study_rows import RowJob, count_results, evaluators_of, opened, write_counts, write_results
 
 from deepaccident_devkit import __version__
 from deepaccident_devkit.evaluation import Resampling

@@ -15,14 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.accidents.replay import (
-    BrakingPlans,
-    Motion,
-    ReplayStates,
-    braking_plans,
-    motion_of,
-    replay,
-)
+from deepaccident_devkit.accidents.replay import BrakingPlans, Motion, ReplayStates, braking_plans, motion_of, replay
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 

@@ -23,7 +23,7 @@ from deepaccident_devkit.evaluation.map_accidents import (
     match_tracks,
     predicted_accidents,
 )
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, compared_labels
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.box_arrays import gaps, time_to_collision
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig, MotionLabels
@@ -193,6 +193,14 @@ def accident_context(
             {} if not references or tracks is None else _references(dataset, there, tracks, own_actor_id, involvement)
         ),
     )
+
+
+def compared_facts(
+    dataset: Dataset, token: str, rules: Any, form: Any, horizon: float, *, references: bool = False
+) -> tuple[MotionLabels | None, AccidentContext]:
+    """What predictions of accidents are compared with: `compared_labels` by these rules, and `accident_context`."""
+    labels = compared_labels(dataset, token, rules, form, horizon)
+    return labels, accident_context(dataset, token, horizon, references=references)
 
 
 def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_HORIZON) -> BoxTruth:

@@ -10,12 +10,15 @@ VPQ).
 Paths (docs/released_code.md, Paths) are those of the instances of the first frame: id → (n, 2) positions, such as
 `motion.trajectories` gives in metres, or `LinkedInstances.centers` times the cells' size. An instance that a frame
 lacks has no point for it, so that point k of a path is not always of frame k. The released code ignores this, and so
-do these functions. They are paired as the released code does (`traj_mapping`). It adds a row and a column of zeros to
-its costs (ids begin at 1) and then drops the first match, `matches[1:]`, as the one of those two. With a stable sort it
-always is; an unstable one (numpy's default, which differs with version and processor) can pair the zeros with somebody
-and drop a real match. Here the sort is stable, and so the extra row and the dropped match are left out of it. Of the
-errors the released code prints nine numbers, of which three say anything: it gives all predictions the probability 1,
-so that its p- and brier-variants are the plain ones.
+do these functions.
+
+Paths are paired as the released code does (`traj_mapping`). It adds a row and a column of zeros to its costs (ids begin
+at 1) and then drops the first match, `matches[1:]`, as the one of those two. With a stable sort it always is; an
+unstable one (numpy's default, which differs with version and processor) can pair the zeros with somebody and drop a
+real match. Here the sort is stable, and so the extra row and the dropped match are left out of it.
+
+Of the errors the released code prints nine numbers, of which three say anything: it gives all predictions the
+probability 1, so that its p- and brier-variants are the plain ones.
 """
 
 from __future__ import annotations

@@ -40,7 +40,6 @@ class Task:
         summary: result → its numbers by name, as JSON holds them.
         whole_recordings: whether whole recordings are followed, so that attributes within them are of no use.
         needs_meta: whether the truth is in the scenarios' meta files.
-        looks_ahead: whether predictions have a horizon.
     """
 
     name: TaskName
@@ -54,7 +53,6 @@ class Task:
     summary: Callable[[Any], dict[str, Any]]
     whole_recordings: bool = False
     needs_meta: bool = False
-    looks_ahead: bool = True
 
 
 Kind = TypeVar("Kind")

@@ -12,14 +12,7 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import conventions, quaternions
 from deepaccident_devkit.geometry.conventions import LAST_ROW, inverses
-from deepaccident_devkit.support.arrays import (
-    FloatArray,
-    FrozenArrays,
-    as_numbers,
-    checked,
-    checked_number,
-    readonly,
-)
+from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, as_numbers, checked, checked_number, readonly
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion

@@ -1,11 +1,8 @@
 """Transforms between frames of moments and agents, and BEV feature maps in another frame, with gradients.
 
-The sibling of `geometry.conventions` and `motion.warping`, for whole batches. Nothing here depends on the
-handedness, so long as all that goes in has the same. Products are written as sums, because `autocast` would
-round a matrix product to bfloat16, and metres need more digits than that.
-
-The torch sibling of `motion.warping`, for whole batches. Maps lie [row = y ascending, column = x ascending], and
-transforms have the maps' handedness; nothing here depends on which it is.
+The sibling of `geometry.conventions` and `motion.warping`, for whole batches. Maps lie [row = y ascending, column = x
+ascending], and transforms have the maps' handedness; nothing here depends on which it is. Products are written as sums,
+because `autocast` would round a matrix product to bfloat16, and metres need more digits than that.
 """
 
 from __future__ import annotations

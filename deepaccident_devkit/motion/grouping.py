@@ -19,15 +19,7 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.exact.peaks import nearest_peaks
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, to_orientation
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.support.arrays import (
-    AnyArray,
-    FloatArray,
-    IntArray,
-    ShortRepr,
-    as_numbers,
-    checked,
-    readonly,
-)
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray, ShortRepr, as_numbers, checked, readonly
 from deepaccident_devkit.support.text import settle_choices
 
 LABEL_LOGIT: Final = 10.0

@@ -6,13 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from deepaccident_devkit.errors import (
-    DeepAccidentError,
-    MissingExtraError,
-    ReleaseError,
-    SomeFailedError,
-    WorkerError,
-)
+from deepaccident_devkit.errors import DeepAccidentError, MissingExtraError, ReleaseError, SomeFailedError, WorkerError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

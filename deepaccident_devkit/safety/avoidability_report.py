@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.accidents.outcomes import (
-    MOST_MARGIN,
-    OUTCOMES,
-    Braking,
-    Outcomes,
-    delta_v_ranges,
-    undisturbed,
-)
+from deepaccident_devkit.accidents.outcomes import MOST_MARGIN, OUTCOMES, Braking, Outcomes, delta_v_ranges, undisturbed
 from deepaccident_devkit.accidents.recorded import Skipped, accident_of, each_scenario, reasons_text, those_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.reports import Report, Row

@@ -8,13 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.testing.breakages import (
-        BREAKAGES,
-        Breakage,
-        BrokenRelease,
-        break_release,
-        broken_release,
-    )
+    from deepaccident_devkit.testing.breakages import BREAKAGES, Breakage, BrokenRelease, break_release, broken_release
     from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
 
 _HOMES = {

@@ -4,6 +4,8 @@ import re
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
 from deepaccident_devkit.evaluation.results import FORMAT_VERSION
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_VERSION
 from deepaccident_devkit.motion import label_folder
@@ -29,3 +31,26 @@ def test_every_package_of_the_reference_says_what_is_public() -> None:
     packages = [import_module(name) for name in ("deepaccident_devkit", *sorted(names))]
     silent = [each.__name__ for each in packages if hasattr(each, "__path__") and not hasattr(each, "__all__")]
     assert (len(packages) > 20, silent) == (True, [])
+
+
+@pytest.mark.parametrize("task", ["accident", "detection", "motion", "warning"])
+def test_tasks_import_by_their_old_paths(task: str) -> None:
+    old, new = (import_module(f"deepaccident_devkit.evaluation.{place}{task}") for place in ("metrics.", ""))
+    assert [getattr(old, name) for name in new.__all__] == [getattr(new, name) for name in new.__all__]
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "home"),
+    [
+        ("render.safety", "save_safety_report", "safety.page"),
+        ("render", "render_town_map", "maps.pictures"),
+        ("evaluation.warning", "PreventedResult", "safety.prevention_result"),
+        ("evaluation.runs", "with_prevented", "safety.prevention"),
+    ],
+)
+def test_what_rooms_have_now_imports_from_the_core(place: str, name: str, home: str) -> None:
+    core, room = (import_module(f"deepaccident_devkit.{each}") for each in (place, home))
+    assert getattr(core, name) is getattr(room, name)
+    assert name in dir(core)
+    with pytest.raises(AttributeError, match=f"module 'deepaccident_devkit.{place}' has no attribute 'nothing'"):
+        core.nothing  # noqa: B018 - asked for alone

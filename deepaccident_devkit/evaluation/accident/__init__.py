@@ -22,11 +22,12 @@ from deepaccident_devkit.evaluation.accident_truth import (
     accident_context,
     box_truth,
     checked_facts,
+    compared_facts,
     foreseen_accident,
 )
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
-from deepaccident_devkit.evaluation.predictions import Prediction, checked_prediction, compared_labels
+from deepaccident_devkit.evaluation.predictions import Prediction, checked_prediction
 from deepaccident_devkit.evaluation.task import Task, protocol_of
 from deepaccident_devkit.motion import MotionLabels
 
@@ -151,10 +152,7 @@ ACCIDENT: Final = Task(
     kinds=("motion", "accident"),
     protocols=PROTOCOLS,
     evaluator=AccidentEvaluator,
-    truth=lambda dataset, token, rules, form, horizon: (
-        compared_labels(dataset, token, rules, form, horizon),
-        accident_context(dataset, token, horizon),
-    ),
+    truth=compared_facts,
     counts=sample_counts,
     result=lambda counts, protocol: protocol.result(counts),
     summary=AccidentResult.as_dict,

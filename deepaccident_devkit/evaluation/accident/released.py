@@ -42,12 +42,7 @@ from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.exact.outlines import pair_gaps
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import to_orientation
-from deepaccident_devkit.motion import (
-    MotionHeads,
-    MotionLabels,
-    predict_instances,
-    trajectories,
-)
+from deepaccident_devkit.motion import MotionHeads, MotionLabels, predict_instances, trajectories
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 

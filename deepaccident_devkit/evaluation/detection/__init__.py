@@ -218,5 +218,4 @@ DETECTION: Final = Task(
     counts=sample_counts,
     result=detection_result,
     summary=DetectionResult.as_dict,
-    looks_ahead=False,
 )

@@ -23,10 +23,7 @@ import numpy as np
 from deepaccident_devkit.errors import ResultsError, TokenError, shortened
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results.motion import (
-    MotionContents,
-    MotionForm,
-)
+from deepaccident_devkit.evaluation.results.motion import MotionContents, MotionForm
 from deepaccident_devkit.evaluation.results.records import (
     LENGTH_FIRST,
     RESULTS_FILE,

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Final
 
-from deepaccident_devkit.evaluation.accident_truth import AccidentContext, accident_context, checked_facts
+from deepaccident_devkit.evaluation.accident_truth import AccidentContext, checked_facts, compared_facts
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.predictions import Prediction, compared_labels
+from deepaccident_devkit.evaluation.predictions import Prediction
 from deepaccident_devkit.evaluation.task import Task, TaskResult, protocol_of
-from deepaccident_devkit.evaluation.warning.anticipation import (
-    AnticipationResult,
-    CleanWarnings,
-)
+from deepaccident_devkit.evaluation.warning.anticipation import AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.field import FieldResult, FieldWarnings
-from deepaccident_devkit.evaluation.warning.recordings import (
-    PART,
-    parts_of,
-    sample_counts,
-)
+from deepaccident_devkit.evaluation.warning.recordings import PART, parts_of, sample_counts
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import IntArray
 
@@ -131,10 +125,7 @@ WARNING: Final = Task(
     kinds=("motion", "accident"),
     protocols=WARNING_PROTOCOLS,
     evaluator=WarningEvaluator,
-    truth=lambda dataset, token, rules, form, horizon: (
-        compared_labels(dataset, token, rules, form, horizon),
-        accident_context(dataset, token, horizon, references=True),
-    ),
+    truth=partial(compared_facts, references=True),
     counts=_counts,
     result=lambda counts, protocol: protocol.result(counts, references=True),
     summary=TaskResult.as_dict,

@@ -14,13 +14,7 @@ from deepaccident_devkit.synth.spec.catalogue import (
     read_design,
     read_spec,
 )
-from deepaccident_devkit.synth.spec.model import (
-    ActorSpec,
-    BackgroundSpec,
-    MeetSpec,
-    ScenarioSpec,
-    View,
-)
+from deepaccident_devkit.synth.spec.model import ActorSpec, BackgroundSpec, MeetSpec, ScenarioSpec, View
 
 __all__ = [
     "DESIGN_NUMBERS",

@@ -13,13 +13,7 @@ from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.synth.roads import ARMS, Arm
 from deepaccident_devkit.synth.spec.checks import LEADERS, check_scenario, meeting_roles, usual_lanes
-from deepaccident_devkit.synth.spec.model import (
-    ActorSpec,
-    Items,
-    Part,
-    Role,
-    ScenarioSpec,
-)
+from deepaccident_devkit.synth.spec.model import ActorSpec, Items, Part, Role, ScenarioSpec
 from deepaccident_devkit.synth.spec.reading import parse_yaml, read_part
 
 _EXCHANGED: dict[Role, Role] = {

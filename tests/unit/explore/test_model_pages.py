@@ -23,12 +23,7 @@ from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.breakdowns import tokens_by_value
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
-from deepaccident_devkit.evaluation.runs import (
-    EvaluationRun,
-    default_selection,
-    evaluate_results,
-    save_run,
-)
+from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.explore import Explorer, make_app
 from deepaccident_devkit.explore.background import Jobs

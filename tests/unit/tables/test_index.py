@@ -18,12 +18,7 @@ from click.testing import CliRunner
 from tiny_index import INDEX, OTHER, THIRD, contents, edit, label, opened
 
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import (
-    BrokenReleaseError,
-    DatarootError,
-    IndexStoreError,
-    NotAvailableError,
-)
+from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError, NotAvailableError
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables import indexing

@@ -1,13 +1,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.traffic.driving import (
-    Temper,
-    can_stop,
-    free_acceleration,
-    hardest_braking,
-    interaction,
-)
+from deepaccident_devkit.synth.traffic.driving import Temper, can_stop, free_acceleration, hardest_braking, interaction
 from deepaccident_devkit.synth.traffic.rights import find_rights
 from deepaccident_devkit.synth.traffic.simulate import simulate
 

@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth.roads import (
-    FIRST_BUILDING,
-    POLE,
-    ROAD_CODES,
-    SIDEWALK,
-    TREE,
-    Hump,
-    Junction,
-    RoadSpec,
-)
+from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, ROAD_CODES, SIDEWALK, TREE, Hump, Junction, RoadSpec
 from deepaccident_devkit.synth.roads.layout import OUTWARD
 from deepaccident_devkit.synth.world import LAMP_COLORS, random_world
 
