@@ -31,6 +31,7 @@ from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.v2x import Link
 
 _ALONE = "single"
+_SHIPPED = "tiny"
 _LINK = ("latency", "pose_noise", "packet_loss", "seed")
 """Their names as parameters of a verb."""
 _RELEASED_HORIZON = Baseline().horizon
@@ -90,7 +91,7 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
     agents see. The files motion/, accident.json and detection.json are what `deepaccident evaluate` takes.
     """
     if not Path(model).exists():  # before PyTorch is asked for
-        model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, "tiny"))
+        model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, _SHIPPED))
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
     seed, link = options["seed"], _link_of(options)
@@ -127,7 +128,7 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
         refuse_unused("with --agents single, which has no partners", *(name for name in _LINK if name != "seed"))
     need_room("model", "a trained model")
     use_threads_sparingly()
-    from deepaccident_devkit.model import PredictConfig, checked_device, load_model, predict_results
+    from deepaccident_devkit.model import PredictConfig, checked_device, load_model, predict_results, scores_text
 
     device = checked_device(options["device"])
     network = load_model(Path(model)).to(device)
@@ -141,8 +142,11 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
         workers=options["workers"] or 0,
         images_cache=options["images_cache"],
     )
-    for task, path in predict_results(network, dataset, tokens, options["out"], config, progress=True).items():
+    paths = predict_results(network, dataset, tokens, options["out"], config, progress=True)
+    for task, path in paths.items():
         click.echo(f"{task}: {len(tokens):,} samples in {path}")
+    if model == _SHIPPED and "scored" in network.notes:
+        click.echo(scores_text(network, dataset, tokens, paths["motion"]))
 
 
 def _samples(dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, options: dict[str, Any]) -> list[str]:

@@ -50,7 +50,14 @@ from deepaccident_devkit.evaluation.runs import (
 from deepaccident_devkit.evaluation.runs.bundles import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.further import with_further
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
-from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, SampleList, ScopeName, TaskName
+from deepaccident_devkit.evaluation.runs.setups import (
+    TASK_PROTOCOLS,
+    EvaluationSetup,
+    SampleList,
+    ScopeName,
+    TaskName,
+    label_rules,
+)
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.release.fingerprints import digest_of
@@ -137,7 +144,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @_selection_parameters
     @click.option(
         "--protocol",
-        type=WordChoice(protocols),
+        type=WordChoice(protocols, label_rules(task)),
         default=protocols[0],
         show_default=True,
         help="Rules of the metrics; docs/protocols.md describes them.",
@@ -184,11 +191,17 @@ def _task_verb(task: TaskName) -> click.Command:
 def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any) -> None:
     out: Path | None = options["out"]
     _refuse_unused(setup, options)
-    if out is not None:
-        checked_target(out, overwrite=options["overwrite"])  # before the release is indexed
-    opened = read_results(results)
-    dataset = DeepAccident(**release_of(options), **engine_of(options))
     selection = _selection_of(setup, options)
+    opened = read_results(results)
+    stated = {
+        **selection.as_dict(),
+        "task": setup.task,
+        "protocol": setup.protocol,
+        "results": str(opened.path),
+    }
+    if out is not None:
+        checked_target(out, overwrite=options["overwrite"], asked=stated)  # before the release is indexed
+    dataset = DeepAccident(**release_of(options), **engine_of(options))
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})

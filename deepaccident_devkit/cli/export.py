@@ -26,7 +26,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.motion import PRESETS
 from deepaccident_devkit.rooms import added
-from deepaccident_devkit.support.text import choice, size_text
+from deepaccident_devkit.support.text import choice, counted, size_text
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
 from deepaccident_devkit.v2x.collisions import default_scenario
 
@@ -111,10 +111,8 @@ def run_export(
     done = export_release(dataset, out, form, **engine_of(release), progress=True)
     tally = done.tally
     linked_text = "".join(f", {count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
-    click.echo(
-        f"{done.folder}: {_counts(tally, 'written')}{linked_text}; {done.written} written now, {done.kept} were there "
-        "already"
-    )
+    units = f"{counted(done.written, form.unit_word)} written now, {done.kept:,} were there already"
+    click.echo(f"{done.folder}: {_counts(tally, 'written')}{linked_text}; {units}")
     for what, count in sorted(tally.left_out.items()):
         click.echo(f"left out: {count:,} {what}")
 

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
 from functools import partial
-from types import NoneType
+from types import MappingProxyType, NoneType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import click
@@ -96,16 +96,18 @@ def together(*parameters: Callable[[Any], Any]) -> Callable[[Function], Function
 class WordChoice(_Choice):
     """One of some words in any case of letters; the error of another one names the word that was probably meant."""
 
-    def __init__(self, words: Iterable[str]) -> None:
-        """Take the words."""
+    def __init__(self, words: Iterable[str], elsewhere: Mapping[str, str] = MappingProxyType({})) -> None:
+        """Take the words, and what to say of words that mean something in another place."""
         super().__init__(tuple(words), case_sensitive=False)
+        self.elsewhere = elsewhere
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The word in its own spelling."""
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter as error:
-            self.fail(f"{error.message.removesuffix('.')}{meant_text(value, self.choices)}", param, ctx)
+            meant = self.elsewhere.get(value) or meant_text(value, self.choices)
+            self.fail(f"{error.message.removesuffix('.')}{meant}", param, ctx)
 
 
 def field_option(

@@ -35,7 +35,7 @@ from deepaccident_devkit.selection import find
 from deepaccident_devkit.support.files import place_in, remove_in, remove_leftovers, temporary_of, write_bytes
 from deepaccident_devkit.support.json_text import parsed_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import differing_text, path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -167,13 +167,7 @@ class Manifest:
 
     def check(self, folder: Path, settings: Mapping[str, Any]) -> None:
         """Refuse other settings; raises ConfigError that names what differs."""
-        asked = json.loads(json.dumps(settings))  # tuples become lists, as in the file
-        changed = sorted(name for name in {*self.settings, *asked} if self.settings.get(name) != asked.get(name))
-        if changed:
-            text = "; ".join(
-                f"{name}: {shortened(repr(self.settings.get(name)))}, asked for {shortened(repr(asked.get(name)))}"
-                for name in changed
-            )
+        if text := differing_text(self.settings, settings):
             raise ConfigError(
                 f"{folder}: holds an export to {self.format} with other settings ({text}); choose another folder"
             )

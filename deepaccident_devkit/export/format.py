@@ -220,6 +220,8 @@ class Format(ABC):
 
     name: ClassVar[str]
     """One word, as on the command line."""
+    unit_word: ClassVar[str] = "scenario"
+    """What a unit is, for people."""
     channels: ClassVar[tuple[str, ...]] = CHANNELS
     """Sensors whose files decide what is written; tables and infos name files, there or not."""
     nothing: ClassVar[str] = "no chosen agent recorded one of these scenarios; choose other agents or scenarios"

@@ -51,6 +51,7 @@ class Parquet(Format):
     shard_scenarios: int = 32
 
     name: ClassVar[str] = "parquet"
+    unit_word: ClassVar[str] = "shard"
     channels: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:

@@ -176,6 +176,7 @@ class WebDataset(Format):
     shard_size: int = 10**9
 
     name: ClassVar[str] = "webdataset"
+    unit_word: ClassVar[str] = "shard"
 
     def __post_init__(self) -> None:
         """Check the choice and the size too."""

@@ -24,7 +24,13 @@ if TYPE_CHECKING:
     from deepaccident_devkit.model.inputs import ModelInputs, model_inputs
     from deepaccident_devkit.model.network import ModelConfig, Predictions, V2XFormer
     from deepaccident_devkit.model.presets import PRESETS, ModelChoice, load_model
-    from deepaccident_devkit.model.results import PredictConfig, SamplePrediction, predict_results, predictions
+    from deepaccident_devkit.model.results import (
+        PredictConfig,
+        SamplePrediction,
+        predict_results,
+        predictions,
+        scores_text,
+    )
     from deepaccident_devkit.model.training_loop import train
     from deepaccident_devkit.model.training_run import TrainConfig, checked_device
 
@@ -33,7 +39,7 @@ _HOMES = {
     **dict.fromkeys(("ModelInputs", "model_inputs"), "inputs"),
     **dict.fromkeys(("ModelConfig", "Predictions", "V2XFormer"), "network"),
     **dict.fromkeys(("PRESETS", "ModelChoice", "load_model"), "presets"),
-    **dict.fromkeys(("PredictConfig", "SamplePrediction", "predict_results", "predictions"), "results"),
+    **dict.fromkeys(("PredictConfig", "SamplePrediction", "predict_results", "predictions", "scores_text"), "results"),
     "TrainConfig": "training_run",
     "checked_device": "training_run",
     "train": "training_loop",
@@ -59,6 +65,7 @@ __all__ = [
     "predict_results",
     "predictions",
     "read_weights",
+    "scores_text",
     "train",
     "write_weights",
 ]

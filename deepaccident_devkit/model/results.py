@@ -17,13 +17,23 @@ from tqdm.auto import tqdm
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, ResultsWriter, foreseen_accident
+from deepaccident_devkit.evaluation import (
+    Accident,
+    DetectedBoxes,
+    MotionEvaluator,
+    MotionOutput,
+    ResultsWriter,
+    foreseen_accident,
+    read_results,
+)
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.export.torch import V2XDataset, collate
 from deepaccident_devkit.model.detection import decode_detections, detected_boxes
 from deepaccident_devkit.model.inputs import mirrored_boxes, model_inputs
 from deepaccident_devkit.model.motion import MotionMaps
 from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.motion import motion_labels
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
@@ -191,6 +201,21 @@ def predict_results(
             writers["accident"].add(found.token, found.accidents)
             writers["detection"].add(found.token, found.boxes)
     return paths
+
+
+def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path: Path) -> str:
+    """IoU and VPQ of motion results at samples, beside what the notes of shipped weights expect of another release."""
+    rules = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)
+    evaluator, results = MotionEvaluator(rules, trajectories=False), read_results(path)
+    for token in tokens:
+        predicted: Any = results.prediction(token)
+        evaluator.update(token, predicted, motion_labels(dataset, token, model.config.labels))
+    here, told = evaluator.compute().ranges["100x100"], model.notes["scored"]
+    expected = "IoU {iou:.1%}, VPQ {vpq:.1%}".format_map(told["scores"])
+    return (
+        f"motion, labels {rules.labels}: IoU {here.iou:.1f}%, VPQ {here.pq:.1f}% here; {expected} on "
+        f"{told['synth']['scenarios']} synthetic scenarios that the training had not seen, with agents {told['agents']}"
+    )
 
 
 def _meta(model: V2XFormer, dataset: Dataset, config: PredictConfig) -> dict[str, Any]:

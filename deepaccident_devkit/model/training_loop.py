@@ -54,6 +54,7 @@ from deepaccident_devkit.render.training import save_training
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import differing_text
 
 logger = logging.getLogger(__name__)
 RUN: Final = "run.json"
@@ -153,12 +154,9 @@ def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
             there = parsed_json(read_bytes(path, "bundle"))
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path}: cannot be read ({fault_text(error)}); remove it, or train elsewhere") from error
-        told = json.loads(json.dumps(notes))
-        differing = [name for name in told if there.get(name) != told[name]] if isinstance(there, dict) else [RUN]
-        if differing:
+        if text := differing_text(there if isinstance(there, dict) else {}, notes):
             raise ConfigError(
-                f"{path}: is of another run, its {', '.join(differing)} differ; give the same options to go on with "
-                "it, or another folder"
+                f"{path}: is of another run ({text}); give the same options to go on with it, or another folder"
             )
         return
     write_bytes(path, json.dumps(notes, indent=1).encode())

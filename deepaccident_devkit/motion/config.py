@@ -270,7 +270,8 @@ class MotionLabelConfig:
             ChoiceError: no such preset.
             ConfigError: no such field, or an impossible value.
         """
-        preset = PRESETS[choice("preset", name, PRESETS)]
+        told = {one: f"; {one!r} is a protocol of labels: give protocol={one!r}" for one in LABEL_PROTOCOLS}
+        preset = PRESETS[choice("preset", name, PRESETS, elsewhere=told)]
         unknown = sorted(set(changes) - set(cls.__dataclass_fields__))
         if unknown:
             raise ConfigError(

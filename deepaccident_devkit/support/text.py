@@ -1,14 +1,16 @@
 """Text for people and by them: columns, numbers, words in any case, paths, what was probably meant."""
 
 import base64
+import json
 import math
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from html import escape
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Final, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, shortened
@@ -131,10 +133,35 @@ def spelled(value: Any, words: Iterable[str]) -> Any:
     return value
 
 
-def choice(name: str, value: object, words: Collection[Word], *, error: type[DeepAccidentError] = ChoiceError) -> Word:
+def differing_text(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
+    """`training/steps: 2, asked for 3; …`: which values differ from those asked for; empty if none does."""
+    has, wanted = dict(_leaves(there)), dict(_leaves(json.loads(json.dumps(asked))))  # tuples are lists in a file
+    changed = sorted(name for name in {*has, *wanted} if has.get(name) != wanted.get(name))
+    return "; ".join(
+        f"{name}: {shortened(repr(has.get(name)))}, asked for {shortened(repr(wanted.get(name)))}" for name in changed
+    )
+
+
+def _leaves(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, f"{above}{name}/")
+        else:
+            yield f"{above}{name}", value
+
+
+def choice(
+    name: str,
+    value: object,
+    words: Collection[Word],
+    *,
+    error: type[DeepAccidentError] = ChoiceError,
+    elsewhere: Mapping[str, str] = MappingProxyType({}),
+) -> Word:
     """The one of some words, None perhaps among them, that a caller means, in its own spelling; else ChoiceError.
 
-    Small letters may stand for capital ones. `error` is another kind of error.
+    Small letters may stand for capital ones. `error` is another kind of error; `elsewhere` says of words that mean
+    something in another place what to do with them.
     """
     lowered = value.lower() if isinstance(value, str) else None
     for word in words:
@@ -142,7 +169,8 @@ def choice(name: str, value: object, words: Collection[Word], *, error: type[Dee
             return word
     expected = [word for word in words if word is not None]
     none = ", or None" if len(expected) < len(words) else ""
-    raise error(f"{name}: expected one of {', '.join(expected)}{none}, found {value!r}{meant_text(value, expected)}")
+    meant = elsewhere.get(lowered or "") or meant_text(value, expected)
+    raise error(f"{name}: expected one of {', '.join(expected)}{none}, found {value!r}{meant}")
 
 
 def settle_choices(

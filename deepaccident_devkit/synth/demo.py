@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -230,8 +231,10 @@ def _accident_and_before(release: DeepAccident) -> tuple[ScenarioRecord, FrameRe
 
 @contextmanager
 def _step(bar: tqdm[Any], name: str) -> Iterator[None]:
-    """Name a step on the bar, and move the bar to its end."""
+    """Name a step on the bar, and move the bar to its end; a log gets a line at its beginning."""
     bar.set_description_str(name)
+    if bar.disable or not sys.stdout.isatty():
+        click.echo(f"{name}: some {_STEPS[name]:.0f} s")
     end = sum(list(_STEPS.values())[: list(_STEPS).index(name) + 1])
     yield
     bar.update(end - bar.n)

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.errors import ConfigError, shortened
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.parallel import Places, Progress, Store
 from deepaccident_devkit.release.store.members import SPLIT_FILE_FOLDER
 from deepaccident_devkit.support.files import is_writable_folder, place_in, remove_in, temporary_of, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import differing_text, path_of
 from deepaccident_devkit.synth.plan import ScenarioPlan, SynthConfig, plan_scenarios, plan_splits
 from deepaccident_devkit.synth.scenario import RecordingJob, forget_scenario, parts_of, record_scenario
 from deepaccident_devkit.synth.sensors.caster import require_embree
@@ -126,14 +126,11 @@ def _write_or_compare(path: Path, config: SynthConfig) -> None:
         write_bytes(path, json.dumps(wanted, indent=1).encode())
         return
     there = _parsed(path)
-    for name, value in wanted.items():
-        found = there.get(name)
-        if found != value:
-            differs = "spec" if name == "spec" else f"{name}: {shortened(repr(found))} there, {value!r} asked for"
-            raise ConfigError(
-                f"{path.parent}: holds an unfinished release of another configuration ({differs}); ask for the same "
-                "to finish it, or remove the folder"
-            )
+    if differs := "spec" if there.get("spec") != wanted["spec"] else differing_text(there, wanted):
+        raise ConfigError(
+            f"{path.parent}: holds an unfinished release of another configuration ({differs}); ask for the same to "
+            "finish it, or remove the folder"
+        )
 
 
 def _parsed(path: Path) -> dict[str, Any]:

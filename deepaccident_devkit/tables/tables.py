@@ -234,7 +234,8 @@ class OpenTables:
                     f"{', '.join(absent[:3])}{', …' if len(absent) > 3 else ''}; pass missing='skip' to go without them"
                 )
             return here.intersection(listed)
-        split = choice("split", split, (*SPLITS, *MINI_SPLITS))
+        unsplit = f"; for scenarios whose split is unknown {self._own_split_text().removeprefix('or ')}"
+        split = choice("split", split, (*SPLITS, *MINI_SPLITS), elsewhere={"unknown": unsplit})
         if split in MINI_SPLITS:
             if split not in self._split_files:
                 raise NotAvailableError(

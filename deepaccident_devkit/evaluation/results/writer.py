@@ -20,6 +20,7 @@ from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, checked_prediction
 from deepaccident_devkit.evaluation.results.motion import HEADS, MEMBER, MotionForm
+from deepaccident_devkit.evaluation.results.reader import read_results
 from deepaccident_devkit.evaluation.results.records import (
     ENTRY_RECORDS,
     FORMAT,
@@ -39,7 +40,7 @@ from deepaccident_devkit.motion import predict_instances
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing, replacing_folder
 from deepaccident_devkit.support.reading import file_checksum
-from deepaccident_devkit.support.text import choice, path_of
+from deepaccident_devkit.support.text import choice, differing_text, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
@@ -162,7 +163,15 @@ class ResultsWriter:
         with _told(self.path):
             empty = self.task == "motion" and self.path.is_dir() and not any(self.path.iterdir())
             if not empty and (self.path.exists() or self.path.is_symlink()):
-                raise ResultsError(f"{self.path}: is there already; choose another path, or remove it")
+                raise ResultsError(f"{self.path}: is there already{self._other()}; choose another path, or remove it")
+
+    def _other(self) -> str:
+        """How the notes of results that are there differ, in brackets; empty where nothing is known."""
+        try:
+            there = read_results(self.path)
+        except ResultsError:
+            return ""
+        return f" ({differing_text(there.meta, self._header['meta']) or 'of other samples'})"
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.support.json_text import Record, as_record, parsed_json
 from deepaccident_devkit.support.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import differing_text, path_of
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
 SUMMARY_FILE: Final = "metrics_summary.json"
@@ -396,8 +396,12 @@ def save_run(
     return target
 
 
-def checked_target(folder: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+def checked_target(
+    folder: str | os.PathLike[str], *, overwrite: bool = False, asked: Mapping[str, Any] | None = None
+) -> Path:
     """The path of a folder that a bundle can be written to; changes nothing.
+
+    `asked` are values of the new summary: a message says which of them differ from those of the bundle that is there.
 
     Raises:
         ResultsError: something lies there that is no bundle, or one that is not to be replaced, or one with files that
@@ -420,7 +424,12 @@ def checked_target(folder: str | os.PathLike[str], *, overwrite: bool = False) -
     if foreign:
         raise ResultsError(f"{target}: holds {foreign[0]}, which is not of its evaluation; move it, or choose another")
     if not overwrite:
-        raise ResultsError(f"{target}: holds an evaluation; pass overwrite=True (--overwrite) to replace it")
+        there = {**bundle.summary, "results": bundle.summary["results"]["path"]}
+        text = differing_text({name: there[name] for name in asked or {}}, asked or {})
+        raise ResultsError(
+            f"{target}: holds an evaluation{f' ({text})' if text else ''}; pass overwrite=True (--overwrite) to "
+            "replace it, or choose another folder"
+        )
     return target
 
 

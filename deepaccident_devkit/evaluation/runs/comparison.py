@@ -42,6 +42,9 @@ _SETUP: Final = ("task", "protocol", "switches", "horizon", "settings")
 _SHOWN: Final = 3
 _ROUNDING: Final = 1e-9
 """Differences that differ by at most this share of them count as equal."""
+_IMPOSSIBLE: Final = "no decision is possible with"
+_TOO_FEW: Final = "too few"
+"""What a table says instead of that, and explains below."""
 _POWER: Final = 0.8
 """The chance that the stated number of scenarios decides a difference."""
 
@@ -133,7 +136,9 @@ class Comparison(Report):
         percent = f"{self.resampling.confidence:.0%}"
         rows: list[Sequence[str]] = [("number", "a", "b", "b − a", f"{percent} interval", "p", "decision")]
         rows += [_text_row(each) for each in shown]
-        return "\n".join([*head, "", columns_text(rows), "", *self.notes()])
+        few = [each.decision for each in shown if each.decision.startswith(_IMPOSSIBLE)]
+        told = [f"{_TOO_FEW}: {few[-1]}"] if few else []  # the first headline, tested alone, needs fewer
+        return "\n".join([*head, "", columns_text(rows), "", *told, *self.notes()])
 
     def notes(self) -> list[str]:
         """Notes for readers of the table."""
@@ -172,7 +177,7 @@ def _text_row(each: ComparedNumber) -> tuple[str, ...]:
         "–" if each.difference is None else f"{each.difference:+.3f}",
         interval,
         "–" if each.adjusted_p is None else f"{each.adjusted_p:.3f}",
-        each.decision,
+        _TOO_FEW if each.decision.startswith(_IMPOSSIBLE) else each.decision,
     )
 
 
@@ -279,6 +284,12 @@ def _clusters(evaluator: Evaluator[Any], tokens: list[str]) -> Clusters:
 
 
 def _check_rules(one: Bundle, other: Bundle) -> None:
+    tasks = [bundle.setup.task for bundle in (one, other)]
+    if tasks[0] != tasks[1]:
+        raise EvaluationError(
+            f"{one.folder} is an evaluation of the task {tasks[0]}, {other.folder} one of {tasks[1]}; compare two of "
+            "the same task"
+        )
     stated = [{name: bundle.summary.get(name) for name in _SETUP} for bundle in (one, other)]
     cells = [_cells(bundle) for bundle in (one, other)]
     if all(cells):
@@ -471,7 +482,7 @@ def undecided(test: PairedTest, at: int, together: int, scenarios: int) -> str:
     if not test.resampling.resamples:
         return "not tested: no resamples were asked for, or the protocol has none"
     if test.swaps.least_p > level:
-        return f"no decision is possible with {_too_few(test, level)} are needed"
+        return f"{_IMPOSSIBLE} {_too_few(test, level)} are needed"
     from scipy.special import ndtri
 
     deviations = float(test.errors[at]) / difference * (ndtri(1 - level / 2) + ndtri(_POWER))

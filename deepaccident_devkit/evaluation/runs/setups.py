@@ -27,7 +27,7 @@ from deepaccident_devkit.evaluation.predictions import compared_labels
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.task import FrozenDict, Task, TaskName, switched
 from deepaccident_devkit.evaluation.warning.evaluator import WARNING
-from deepaccident_devkit.motion import MotionLabels, samples
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabels, samples
 from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
@@ -107,6 +107,12 @@ class SampleSelection:
         within = f" (the last {self.horizon:g} s)" if self.samples == "evaluate" else ""
         whose = "all agents" if self.agents is None else f"agents {', '.join(self.agents)}"
         return f"split {self.split}, samples {self.samples}{within}, scope {self.scope}, {whose}"
+
+
+def label_rules(task: TaskName) -> dict[str, str]:
+    """What to say of the name of a protocol of labels that is given as a protocol of a task."""
+    given = "; choose the labels by the switch labels={0!r} (--switch labels={0})" if task == "motion" else ""
+    return {name: f"; {name!r} is a protocol of labels{given.format(name)}" for name in LABEL_PROTOCOLS}
 
 
 def scenario_of(token: str) -> str:
@@ -254,7 +260,8 @@ class EvaluationSetup:
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
         settle_choices(self, {"task": tuple(TASKS)})
-        protocol = choice(f"protocol of {self.task}", self.protocol, TASKS[self.task].protocols)
+        protocols = TASKS[self.task].protocols
+        protocol = choice(f"protocol of {self.task}", self.protocol, protocols, elsewhere=label_rules(self.task))
         object.__setattr__(self, "protocol", protocol)
         if not 0 < self.horizon <= _LONGEST_HORIZON:
             raise ConfigError(f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}")

@@ -88,8 +88,9 @@ def list_context(explorer: Explorer, choices: Choices, found: Found) -> dict[str
         "total": len(explorer.scenarios),
         "entries": entries(explorer, shown, choices.sort),
         "facets": [
-            {"name": name, "counts": counts, "open": place < _OPEN or name in choices.facets}
+            {"name": name, "counts": values, "open": place < _OPEN or name in choices.facets}
             for place, (name, counts) in enumerate(found.counts.items())
+            if (values := [each for each in counts if each["count"] or each["chosen"]])  # others would find nothing
         ],
         "chosen": _chosen(choices),
         "sorts": [(name, title, _sort_waits(explorer, name)) for name, title in sorts],
