@@ -14,13 +14,11 @@ DOCS = Path(__file__).parents[1] / "docs"
 NOT_FOR_USERS = {"accidents", "cli", "dataset", "deepaccident", "exact", "overview", "parallel", "rooms", "support"}
 NOT_FOR_USERS |= {"tables"}
 """Command line, base of the facade, and what only the devkit itself calls."""
+CONFIGURATION = loaded_script("docs/conf.py")
 
 
 def documented() -> set[str]:
-    pages = [path.read_text(encoding="utf-8") for path in (DOCS / "api").glob("*.md")]
-    assert pages
-    lines = re.compile(r"^\.\. automodule:: deepaccident_devkit\.(\S+)", re.MULTILINE)
-    return {name for page in pages for name in lines.findall(page)}
+    return {name for listed in CONFIGURATION.REFERENCE.values() for name in listed}
 
 
 def test_every_public_module_is_on_an_api_page() -> None:
@@ -39,12 +37,19 @@ def test_every_package_of_the_evaluation_is_on_an_api_page() -> None:
     assert public - documented() == set()
 
 
-@pytest.mark.parametrize("folder", [DOCS, DOCS / "api"], ids=lambda folder: folder.name)
-def test_every_page_is_listed(folder: Path) -> None:
+def test_every_page_is_listed() -> None:
     """The build would tell, too, but takes half a minute."""
-    index = (folder / "index.md").read_text(encoding="utf-8")
-    listed = set(re.findall(r"^[\w/.]+$", index, re.MULTILINE))
-    assert {path.stem for path in folder.glob("*.md")} - listed == {"index"}
+    listed = set(re.findall(r"^[\w/.]+$", (DOCS / "index.md").read_text(encoding="utf-8"), re.MULTILINE))
+    assert {path.stem for path in DOCS.glob("*.md")} - listed == {"index"}
+
+
+def test_the_reference_lists_each_name_once(tmp_path: Path) -> None:
+    CONFIGURATION.write_reference(tmp_path)
+    pages = [path.read_text(encoding="utf-8") for path in tmp_path.glob("*.md")]
+    names = [name for page in pages for line in re.findall(":members: (.+)", page) for name in line.split(", ")]
+    assert len(names) == len(set(names)) > 300
+    index = (tmp_path / "index.md").read_text(encoding="utf-8")
+    assert {path.stem for path in tmp_path.glob("*.md")} - set(re.findall(r"^\w+$", index, re.MULTILINE)) == {"index"}
 
 
 SECTION = "Sums.\n\nArgs:\n    first: one.\n\n    second: two."
@@ -73,5 +78,4 @@ SECTION = "Sums.\n\nArgs:\n    first: one.\n\n    second: two."
     ids=["code", "code over a line", "doctest", "fence", "indented code", "section", "table"],
 )
 def test_docstrings_become_the_sites_markup(text: str, restructured: str) -> None:
-    module = loaded_script("docs/markdown_docstrings.py")
-    assert "\n".join(module.restructured(text.split("\n"))) == restructured
+    assert "\n".join(CONFIGURATION.restructured(text.split("\n"))) == restructured

@@ -1,12 +1,10 @@
-"""Measure the accident tables of docs/protocols.md: `python docs/make_accident_tables.py`, from a checkout."""
+"""Accidents through the protocols: golden ones, and the labels themselves as predictions."""
 
-import re
 import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
-
+from benchmarks.pages.marks import TESTS, number, put, table
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.accident import PROTOCOLS, AccidentEvaluator, AccidentResult, accident_context
 from deepaccident_devkit.evaluation.predictions import MotionOutput
@@ -15,8 +13,6 @@ from deepaccident_devkit.motion import MotionHeads
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
-HERE = Path(__file__).parent
-PAGE, TESTS = HERE / "protocols.md", HERE.parent / "tests"
 RELEASE = SynthConfig(scenarios=24, frames=40, seed=12, sensors=False)
 HORIZON = 2.0
 PAPER_CHOICES: tuple[tuple[str, object], ...] = (
@@ -27,7 +23,7 @@ PAPER_CHOICES: tuple[tuple[str, object], ...] = (
 )
 
 
-def main() -> None:
+def main(_release: Path | None = None) -> None:
     """Write all tables into the page."""
     put("accident-golden", golden_table())
     put("accident-perfect", perfect_table())
@@ -50,7 +46,7 @@ def golden_table() -> str:
         for evaluator in evaluators.values():
             evaluator.update(f"sample {index}", output, label)
     rows = {name: evaluator.compute() for name, evaluator in evaluators.items()}
-    return table(rows, "protocol, or the choice of `paper` that is changed")
+    return accident_table(rows, "protocol, or the choice of `paper` that is changed")
 
 
 def perfect_table() -> str:
@@ -70,30 +66,20 @@ def perfect_table() -> str:
             for (_, given), evaluator in evaluators.items():
                 evaluator.update(token, outputs[given], label, context)
     rows = {f"`{name}`, {given}": each.compute() for (name, given), each in evaluators.items()}
-    return table(rows, "protocol, and how the labels are given", ("meta", "another", "none"))
+    return accident_table(rows, "protocol, and how the labels are given", ("meta", "another", "none"))
 
 
-def table(rows: dict[str, AccidentResult], what: str, names: tuple[str, ...] = ()) -> str:
+def accident_table(rows: dict[str, AccidentResult], what: str, names: tuple[str, ...] = ()) -> str:
     """One line a result, with the truths that name somebody of `names`."""
     head = [what, "truths", "TP", "FP", "FN at 10 m", "APA (%)", "id", "position (m)", "time (s)", *names]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    lines = []
     for name, result in rows.items():
         at = result.within[10.0]
-        errors = (_number(value, 2) for value in (result.id_error, result.position_error, result.time_error))
+        errors = (number(value, 2) for value in (result.id_error, result.position_error, result.time_error))
         named = (result.truths[each] for each in names)
-        numbers = (result.positives, at.tp, at.fp, at.fn, _number(100 * result.apa, 1), *errors, *named)
-        lines.append(f"| {name} | {' | '.join(map(str, numbers))} |")
-    return "\n".join(lines)
-
-
-def put(marker: str, text: str) -> None:
-    """Replace what stands between two markers of the page."""
-    begin, end = f"<!-- {marker} -->", f"<!-- end of {marker} -->"
-    page = PAGE.read_text(encoding="utf-8")
-    pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
-    if not pattern.search(page):
-        raise SystemExit(f"{PAGE}: has no {begin}")
-    PAGE.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", page), encoding="utf-8")
+        numbers = (result.positives, at.tp, at.fp, at.fn, number(100 * result.apa, 1), *errors, *named)
+        lines.append([name, *map(str, numbers)])
+    return table(head, lines)
 
 
 def _evaluated(dataset: DeepAccident) -> list[str]:
@@ -106,11 +92,3 @@ def _evaluated(dataset: DeepAccident) -> list[str]:
             frame = f"{scenario['num_frames'] - back:03d}"
             result += [f"{scenario['token']}/{agent}/{frame}" for agent in AGENTS]
     return result
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None or np.isnan(value) else f"{value:.{digits}f}"
-
-
-if __name__ == "__main__":
-    main()

@@ -1,19 +1,18 @@
-"""Write the page of the model from docs/model_study.json: `python docs/make_model_page.py`; `--check` only compares.
+"""Write the page of the model from study.json: `python docs/make_tables.py model`.
 
-docs/model_study.py measures the numbers. No number of the page stands here, and its sentences follow from them.
+study.py measures the numbers. No number of the page stands here, and its sentences follow from them.
 """
 
 import json
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from model_study_numbers import PATHS
+from benchmarks.cooperation.numbers import PATHS
+from benchmarks.pages.marks import DOCS
 
-HERE = Path(__file__).parent
-SUMMARY, PAGE = HERE / "model_study.json", HERE / "model.md"
+SUMMARY, PAGE = Path(__file__).with_name("study.json"), DOCS / "model.md"
 NAMES = {name: said for name, (_, _, said) in PATHS.items()}
 """Numbers → how tables call them."""
 PERCENT = ("iou_30", "vpq_30", "iou_100", "vpq_100", "map")
@@ -153,7 +152,7 @@ MEASURED = """
 REPEAT = """
 ## How to repeat it
 
-    python docs/model_study.py WORKDIR --publish && python docs/make_model_page.py
+    python -m benchmarks.cooperation.study WORKDIR --publish && python docs/make_tables.py model
 """
 WEIGHTS = """
 ## The weights that ship
@@ -289,8 +288,8 @@ def _how(summary: Summary) -> list[str]:
         fill(trials, 120),
         "",
         fill(
-            f"Fingerprints of the releases: {prints}. docs/model_study.json has all numbers, and "
-            "docs/model_study_counts.json.gz the counts of each sample, except those of detection.",
+            f"Fingerprints of the releases: {prints}. benchmarks/cooperation/study.json has all numbers, and "
+            "benchmarks/cooperation/counts.json.gz the counts of each sample, except those of detection.",
             120,
         ),
     ]
@@ -346,17 +345,8 @@ def _text(value: float, name: str) -> str:
 
 
 def main() -> None:
-    """Write or compare."""
+    """Write it."""
     summary = json.loads(SUMMARY.read_text(encoding="utf-8"))
     if summary["smoke"]:
         raise SystemExit(f"{SUMMARY}: is of another protocol; its numbers are for no page")
-    made = page(summary)
-    if "--check" in sys.argv[1:]:
-        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != made:
-            raise SystemExit(f"{PAGE}: does not say what {SUMMARY} does; run python docs/make_model_page.py")
-        return
-    PAGE.write_text(made, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    PAGE.write_text(page(summary), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Measure the tables of motion and detection of docs/protocols.md; run it from a checkout."""
+"""Motion and detection through the protocols: golden predictions, and simple ones of a synthetic release."""
 
 import sys
 import tempfile
@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from make_accident_tables import RELEASE, TESTS, put
 
+from benchmarks.pages.accident import RELEASE
+from benchmarks.pages.marks import TESTS, number, put
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.detection import (
     DETECTION_PROTOCOLS,
@@ -32,7 +33,7 @@ METRICS = ("IoU 30x30", "VPQ 30x30", "VPQ 100x100", "minADE (m)", "minFDE (m)", 
 Given = tuple[str, MotionOutput, MotionLabels]
 
 
-def main() -> None:
+def main(_release: Path | None = None) -> None:
     """Write all tables into the page."""
     sys.path.insert(0, str(TESTS))
     put("detection-golden", golden_detection())
@@ -225,8 +226,8 @@ def _cells(result: DetectionResult) -> list[str]:
     points = [result.mean_average_precision, by_class.get("car", np.nan), by_class.get("pedestrian", np.nan)]
     return [
         str(result.truths.sum()),
-        *(_number(value, 2) for value in points),
-        *(_number(value, 3) for value in result.mean_errors.values()),
+        *(number(value, 2) for value in points),
+        *(number(value, 3) for value in result.mean_errors.values()),
     ]
 
 
@@ -244,11 +245,3 @@ def _switched(change: Mapping[str, object]) -> str:
 
 def _text(value: object) -> str:
     return "∞" if value == np.inf else str(value).replace("inf", "∞")
-
-
-def _number(value: float, digits: int) -> str:
-    return "–" if np.isnan(value) else f"{value:.{digits}f}"
-
-
-if __name__ == "__main__":
-    main()

@@ -1,18 +1,11 @@
-"""Make the tables of docs/baselines.md: `python docs/make_baseline_tables.py [FOLDER]`, from a checkout; some minutes.
+"""What the baselines foresee, by who cooperates and over which link; by the functions of the commands."""
 
-All numbers are of the functions of `deepaccident predict`, `evaluate` and `evaluate compare`. FOLDER keeps the
-releases and predictions, so that an interrupted call goes on.
-"""
-
-import sys
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import make_accident_tables
-from make_accident_tables import HERE, put
-
+from benchmarks.pages.marks import put, table
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline, predict_results
 from deepaccident_devkit.evaluation.breakdowns import Group
@@ -74,11 +67,10 @@ Views = Mapping[str, Mapping[str, Evaluated]]
 """View → agents, or agents and link → evaluations."""
 
 
-def main() -> None:
-    """Write all tables into the page."""
-    make_accident_tables.PAGE = HERE / "baselines.md"
+def main(_release: Path | None = None) -> None:
+    """Write all tables."""
     with tempfile.TemporaryDirectory() as made:
-        folder = Path(sys.argv[1] if len(sys.argv) > 1 else made)
+        folder = Path(made)
         views = {name: evaluated_view(folder / name, config) for name, config in RELEASES.items()}
         linked = [f"{agents}, {link}" for agents in LINKED for link in LINKS]
         put("size", size_text(views))
@@ -153,14 +145,3 @@ def compared(base: Evaluated, other: Evaluated) -> dict[str, tuple[float, float]
     }
     found = {name: numbers[evaluation][path] for name, (evaluation, path) in NUMBERS.items()}
     return {name: (each.low or 0.0, each.high or 0.0) for name, each in found.items()}
-
-
-def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
-    """A Markdown table."""
-    columns = list(head)
-    rows = [columns, ["---"] * len(columns), *lines]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,9 @@
-"""The protocol of docs/model_study.py: what is made, trained and compared; committed before the first test run."""
+"""The protocol of benchmarks/cooperation: what is made, trained and compared; committed before the first test run."""
 
 from dataclasses import dataclass
 from typing import Any, Final
 
-from model_study_rows import Row
+from benchmarks.cooperation.rows import Row
 
 HEADLINE: Final = (
     "IoU 100x100 on the test release, of the arm `all` with all agents less that of the arm `single` with the ego "

@@ -1,4 +1,4 @@
-"""Numbers that show how similar generated scenarios are to the real release, for docs/make_synth_page.py."""
+"""Numbers that show how similar generated scenarios are to the real release."""
 
 import tempfile
 from collections.abc import Callable, Sequence

@@ -1,9 +1,9 @@
-"""Measure whether cooperation helps a small model: `python docs/model_study.py WORKDIR`, from a checkout.
+"""Measure whether cooperation helps a small model: `python -m benchmarks.cooperation.study WORKDIR`, from a checkout.
 
-It takes less than three hours of two cores. What is compared stands in docs/model_study_protocol.py. Each stage is
+It takes less than three hours of two cores. What is compared stands in protocol.py. Each stage is
 skipped if its output is in WORKDIR, and one that broke off goes on: the same command ends what was begun. `--only` does
 one stage, `--smoke` a tiny version of all in minutes (in a WORKDIR of its own), `--publish` copies the summary and the
-counts to docs/, from which docs/make_model_page.py makes the page of the model, and the weights into the package.
+counts beside this file, from which `python docs/make_tables.py model` makes the page, and the weights into the package.
 """
 
 import argparse
@@ -21,8 +21,9 @@ from statistics import mean, median
 from typing import Any, Final
 
 import torch
-from model_study_numbers import differences, row_numbers
-from model_study_protocol import (
+
+from benchmarks.cooperation.numbers import differences, row_numbers
+from benchmarks.cooperation.protocol import (
     ARMS,
     COMPARED,
     HEADLINE_NUMBER,
@@ -33,8 +34,7 @@ from model_study_protocol import (
     ReleasePlan,
     rows_of,
 )
-from model_study_rows import RowJob, count_results, evaluators_of, opened, write_counts, write_results
-
+from benchmarks.cooperation.rows import RowJob, count_results, evaluators_of, opened, write_counts, write_results
 from deepaccident_devkit import __version__
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.model.checkpoint import FINAL, read_weights, write_weights
@@ -50,8 +50,8 @@ from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 HERE: Final = Path(__file__).parent
-SUMMARY: Final = "model_study.json"
-COUNTS: Final = "model_study_counts.json.gz"
+SUMMARY: Final = "study.json"
+COUNTS: Final = "counts.json.gz"
 _SCORES: Final = "scores.json"
 WEIGHTS: Final = SHIPPED_WEIGHTS["tiny"].name
 _NOT_SHIPPED: Final = ("num_batches_tracked", "frustum")
@@ -268,7 +268,7 @@ def weights(study: Study) -> dict[str, Any]:
     path = study.folder / "shipped" / WEIGHTS
     synth = _synth(study, SHIPPED)
     made = {
-        "command": "python docs/model_study.py WORKDIR --publish",
+        "command": "python -m benchmarks.cooperation.study WORKDIR --publish",
         "protocol": asdict(study.protocol),
         "arm": arm,
         "seed": seed,
@@ -499,7 +499,7 @@ def main() -> None:
     parser.add_argument("workdir", type=Path)
     parser.add_argument("--only", choices=STAGES, help="this stage alone")
     parser.add_argument("--smoke", action="store_true", help="all of it, tiny")
-    parser.add_argument("--publish", action="store_true", help="copy summary and counts to docs/")
+    parser.add_argument("--publish", action="store_true", help="copy all to where it is published")
     parser.add_argument("--device", default="cpu", help="of the models; a GPU is named in the summary")
     given = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes to come

@@ -1,4 +1,4 @@
-"""The rows of docs/model_study.py: what predicts, with which data, and how its results are written and counted."""
+"""The rows of benchmarks/cooperation: what predicts, with which data, and how its results are written and counted."""
 
 import gzip
 import json
@@ -11,8 +11,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import torch
-from model_study_numbers import Evaluators, HiddenActors, scene_of
 
+from benchmarks.cooperation.numbers import Evaluators, HiddenActors, scene_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, ResultsWriter, read_results

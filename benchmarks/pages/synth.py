@@ -1,12 +1,9 @@
-"""Measure the tables of docs/synth.md: `python docs/make_synth_page.py`, from a checkout; takes minutes.
+"""What the generator makes: pairs of each design, what agents see of them, and a release like the real scenario.
 
-The measured values are kept in docs/synth_statistics.json; `--tables` makes the tables from them again. `--real DIR`
-measures the real scenario under DIR too; without it, its numbers do not change.
+The measured values are kept in synth.json; `main` measures again, the real scenario only where it is given.
 """
 
-import argparse
 import json
-import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -14,8 +11,9 @@ from statistics import median
 from typing import TypedDict
 
 import numpy as np
-import synth_beside
 
+from benchmarks.pages import synth_beside
+from benchmarks.pages.marks import put
 from deepaccident_devkit.release import Labels
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.plan import plan_scenarios
@@ -28,8 +26,7 @@ from deepaccident_devkit.tables.build import accident_type
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS, frame_timestamp
 from deepaccident_devkit.v2x import accident_visible_mask, pair_in_view
 
-HERE = Path(__file__).parent
-PAGE, MEASURED = HERE / "synth.md", HERE / "synth_statistics.json"
+MEASURED = Path(__file__).with_suffix(".json")
 SEEDS = 20
 """Pairs of each design."""
 STEP, EVALUATED, OBSERVED = 5, 4, 3
@@ -220,17 +217,6 @@ def tables(measured: Measured) -> dict[str, str]:
     }
 
 
-def with_tables(page: str, measured: Measured) -> str:
-    """The page with the tables between its markers."""
-    for marker, text in tables(measured).items():
-        begin, end = f"<!-- {marker} -->", f"<!-- end of {marker} -->"
-        pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
-        if not pattern.search(page):
-            raise SystemExit(f"{PAGE}: has no {begin}")
-        page = pattern.sub(f"{begin}\n\n{text}\n\n{end}", page)
-    return page
-
-
 def measured() -> Measured:
     """The values of the last measurement."""
     content: Measured = json.loads(MEASURED.read_text(encoding="utf-8"))
@@ -256,24 +242,14 @@ def _ends(values: Sequence[float]) -> str:
     return f"{min(values):.0f}–{max(values):.0f}"
 
 
-def main() -> None:
-    """Measure (not with `--tables`), and write the tables into the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tables", action="store_true", help="only make the tables again")
-    parser.add_argument("--beside", action="store_true", help="measure only what is compared with the real scenario")
-    parser.add_argument("--real", type=Path, metavar="DIR", help="a release with one real scenario to measure too")
-    options = parser.parse_args()
+def main(release: Path | None = None) -> None:
+    """Measure, and write the tables."""
     content = measured()
-    if options.real:
-        content["real"] = synth_beside.measure_real(options.real)
-    if not options.tables:
-        content["generated"] = synth_beside.measure_generated()
-    if not options.tables and not options.beside:
-        with ProcessPoolExecutor(WORKERS) as executor:
-            content["pairs"] = list(executor.map(measure, range(SEEDS * len(DESIGN_NUMBERS)), chunksize=4))
+    if release is not None:
+        content["real"] = synth_beside.measure_real(release)
+    content["generated"] = synth_beside.measure_generated()
+    with ProcessPoolExecutor(WORKERS) as executor:
+        content["pairs"] = list(executor.map(measure, range(SEEDS * len(DESIGN_NUMBERS)), chunksize=4))
     save(content)
-    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8"), content), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    for name, text in tables(content).items():
+        put(name, f"\n{text}\n")

@@ -1,14 +1,8 @@
-"""Put what the commands of docs/safety.md print onto the page: `python docs/make_safety_page.py [RELEASE]`.
-
-RELEASE is a folder to take in place of a new synthetic release, if it was made by the page's first command. It takes
-some five minutes on two cores, most of it for that release. The picture of the report needs chromium and the extra
-`test`.
-"""
+"""What the commands of docs/safety.md print, and its pictures, of which that of the report needs chromium."""
 
 import os
 import re
 import shlex
-import sys
 import tempfile
 from collections.abc import Callable
 from itertools import dropwhile, takewhile
@@ -18,9 +12,10 @@ from textwrap import fill
 from click.testing import CliRunner
 from PIL import Image
 
+from benchmarks.pages.marks import DOCS
 from deepaccident_devkit.cli import deepaccident
 
-PAGE = Path(__file__).parent / "safety.md"
+PAGE = DOCS / "safety.md"
 IMAGES = PAGE.parent / "images"
 RELEASE, OUT = "accidents", "out"
 """What DATAROOT and OUT on the page are here."""
@@ -39,13 +34,12 @@ SHOWN = 3
 """Rows of a long table that the page has."""
 
 
-def main() -> None:
-    """Write the outputs and the pictures."""
-    release = Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else None
+def main(release: Path | None = None) -> None:
+    """Write the outputs and the pictures; a release is one that the page's first command made."""
     with tempfile.TemporaryDirectory() as name:
         os.chdir(name)
         if release is not None:
-            Path(RELEASE).symlink_to(release, target_is_directory=True)
+            Path(RELEASE).symlink_to(release.resolve(), target_is_directory=True)
         page = with_outputs(PAGE.read_text(encoding="utf-8"), made=release is not None)
         for picture, source in PICTURES.items():
             keep(Path(OUT, source), IMAGES / picture)
@@ -133,7 +127,3 @@ def keep(source: Path, picture: Path) -> None:
     image.thumbnail((WIDTH, WIDTH))
     image.save(picture, quality=80)
     print(f"{picture.name}: {picture.stat().st_size / 1000:.0f} kB")
-
-
-if __name__ == "__main__":
-    main()

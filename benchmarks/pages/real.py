@@ -1,12 +1,11 @@
-"""Measure the docs' tables that need a real scenario: `python docs/make_real_tables.py DATAROOT`, from a checkout."""
+"""What a real scenario says of velocities, of jittering sensors, and of the size of its index."""
 
-import re
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.pages.marks import put
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables.boxes import decoded_velocities, displacement_velocities, world_centers
@@ -14,19 +13,19 @@ from deepaccident_devkit.tables.build import scenario_boxes
 from deepaccident_devkit.tables.scan import read_scenario, scan_scenario
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, CHANNELS, VELOCITY_FRAMES
 
-HERE = Path(__file__).parent
-CONVENTIONS, BENCHMARKS = HERE / "conventions.md", HERE.parent / "benchmarks" / "README.md"
 LEAST_SPEED = 1.0
 BYTES_A_SAMPLE, BOXES_A_SAMPLE = 310e9 / 285e3, 8.6e6 / 285e3
 
 
-def main() -> None:
-    """Write all tables into their pages."""
+def main(release: Path | None = None) -> None:
+    """Write all tables."""
+    if release is None:
+        raise SystemExit("real: give the folder of a release with a real scenario, --release DIR")
     with tempfile.TemporaryDirectory() as folder:
-        dataset = DeepAccident("v1", sys.argv[1], index_dir=folder, verbose=False)
-        put(CONVENTIONS, "velocity-real", velocity_table(Path(sys.argv[1])))
-        put(CONVENTIONS, "calibration-real", calibration_table(dataset))
-        put(BENCHMARKS, "index-real", index_table(dataset))
+        dataset = DeepAccident("v1", release, index_dir=folder, verbose=False)
+        put("velocity-real", velocity_table(release))
+        put("calibration-real", calibration_table(dataset))
+        put("index-real", index_table(dataset))
 
 
 def velocity_table(root: Path) -> str:
@@ -88,19 +87,3 @@ def index_table(dataset: DeepAccident) -> str:
     ):
         lines.append(f"| {words} | {value:,.0f} | {value / BYTES_A_SAMPLE:.2%} |")
     return "\n".join(lines)
-
-
-def put(path: Path, name: str, table: str) -> None:
-    """Replace what stands between a table's two marks."""
-    page = path.read_text(encoding="utf-8")
-    marks = f"<!-- {name} -->\n", f"<!-- /{name} -->"
-    changed, count = re.subn(
-        f"{re.escape(marks[0])}.*?{re.escape(marks[1])}", f"{marks[0]}{table}\n{marks[1]}", page, flags=re.DOTALL
-    )
-    if count != 1:
-        raise SystemExit(f"{path}: expected the marks of {name} once, found {count}")
-    path.write_text(changed, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""The numbers of docs/model_study.py: actors that the ego cannot see, a row's numbers, and differences of two rows."""
+"""The numbers of the study: actors that the ego cannot see, a row's numbers, and differences of two rows."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence

@@ -1,6 +1,5 @@
-"""Render the pictures of docs/motion_labels.md and measure its tables: `python docs/make_label_pictures.py`."""
+"""A made moment, the left turn of an ego, and the cells of its labels and of a release's in which protocols differ."""
 
-import re
 import tempfile
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.pages.marks import put
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.motion import (
@@ -19,13 +19,10 @@ from deepaccident_devkit.motion import (
     MotionLabels,
     motion_labels_from_boxes,
 )
-from deepaccident_devkit.render import detached_figure, draw_motion_map
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import CATEGORIES
 from deepaccident_devkit.v2x import future_egomotion
 
-HERE = Path(__file__).parent
-IMAGES, PAGE = HERE / "images", HERE / "motion_labels.md"
 RELEASE = SynthConfig(scenarios=4, frames=40, seed=11, sensors=False)
 MAPS = ("segmentation", "instance", "centerness", "offset", "flow")
 SPLIT = "train"
@@ -160,70 +157,11 @@ CIRCUMSTANCES = {
 }
 
 
-def main() -> None:
-    IMAGES.mkdir(exist_ok=True)
+def main(_release: Path | None = None) -> None:
+    """Write the tables."""
     with tempfile.TemporaryDirectory() as folder:
         release = DeepAccident(dataroot=make_release(Path(folder) / "release", RELEASE), verbose=False)
-        draw_labels(release, IMAGES / "motion_labels.png")
-        measured = f"{table_of_the_turn()}\n{table_of_the_release(release)}"
-    draw_turn("instance", range(5), IMAGES / "labels_released_clean.png")
-    draw_turn("flow", range(4), IMAGES / "labels_released_clean_flow.png")
-    draw_half_cell(IMAGES / "labels_half_cell.png")
-    text = PAGE.read_text(encoding="utf-8")
-    between = re.compile(r"(<!-- measured by docs/make_label_pictures.py -->\n).*(<!-- end of measured -->)", re.DOTALL)
-    PAGE.write_text(between.sub(lambda found: f"{found[1]}\n{measured}\n{found[2]}", text), encoding="utf-8")
-
-
-def draw_labels(release: DeepAccident, path: Path) -> None:
-    """The ego's labels 2 s before the accident, the earliest whose last frame is the impact."""
-    accident = next(scenario for scenario in release.scenario if scenario["collision"])
-    sample = release.get_sample(accident, "ego_vehicle", frame=RELEASE.frames - 20)
-    figure = release.render_motion_labels(sample, fig=detached_figure((16.5, 12)))
-    figure.axes[0].set(xlim=(-22, 33), ylim=(-28, 27))
-    figure.savefig(path, dpi=72)
-
-
-def draw_turn(name: Any, frames: range, path: Path) -> None:
-    """A map of the turn under both protocols, a column a frame, all warped to the present."""
-    figure = detached_figure((3.5 * len(frames) + 0.4, 5.0))
-    panels = figure.subplots(2, len(frames), sharex=True, sharey=True)
-    for row, config in zip(panels, (RELEASED, CLEAN), strict=True):
-        labels = turn(config).to_present()
-        for frame, ax in zip(frames, row, strict=True):
-            draw_motion_map(labels, name, frame, marked=COLLIDING, ax=ax)
-            _draw_outlines(frame, ax)
-            ax.set(**SHOWN)
-            ax.tick_params(labelsize=12)
-        row[0].set_ylabel(config.protocol, fontsize=18)
-    for frame, ax in zip(frames, panels[0], strict=True):
-        ax.set_title(f"+{frame * STEP:.1f} s" if frame else "present", fontsize=18)
-    figure.savefig(path, dpi=80)
-
-
-def draw_half_cell(path: Path) -> None:
-    """Some cells of the present frame of the turn under both protocols, with the grid's lines."""
-    figure = detached_figure((14, 4.4))
-    for ax, config in zip(figure.subplots(1, 2, sharey=True), (RELEASED, CLEAN), strict=True):
-        draw_motion_map(turn(config), "instance", 0, marked=COLLIDING, ax=ax)
-        _draw_outlines(0, ax)
-        ax.set(xlim=(-3.5, 13), ylim=(-8.5, 2.5))
-        ax.set_xticks(np.arange(-3, 13.1, 0.5), minor=True)
-        ax.set_yticks(np.arange(-8.5, 2.6, 0.5), minor=True)
-        ax.grid(which="both", color="#b0b0b0", linewidth=0.5)
-        ax.set_title(config.protocol, fontsize=18)
-        ax.set_xlabel("x forward (m)", fontsize=14)
-        ax.set_ylabel("y left (m)", fontsize=14)
-        ax.tick_params(labelsize=12)
-    figure.savefig(path, dpi=80)
-
-
-def _draw_outlines(frame: int, ax: Any) -> None:
-    """What is really there, in the present ego frame."""
-    for actor in ACTORS:
-        length, width, _ = actor.size
-        corners = np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * (length, width, 0) / 2
-        x, y, _ = (actor.pose(frame) @ corners).T
-        ax.plot(x, y, color="#f5a000", linewidth=1.2, zorder=2)
+        put("label-cells", f"\n{table_of_the_turn()}\n{table_of_the_release(release)}\n")
 
 
 def table_of_the_turn() -> str:
@@ -279,7 +217,3 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
     numbers = len(MAPS)
     rule = ["---"] * (len(head) - numbers) + ["--:"] * numbers
     return "".join(f"| {' | '.join(row)} |\n" for row in [head, rule, *rows])
-
-
-if __name__ == "__main__":
-    main()
