@@ -30,8 +30,6 @@ RELEASED, CLEAN = (MotionLabelConfig(protocol=name) for name in ("released", "cl
 CLOSE = 0.01
 """Centerness, and cells of offset and flow, that are taken for equal: turned by nothing they differ in the last bit."""
 STEP = 0.5
-SHOWN = {"xlim": (-6, 40), "ylim": (-15, 13)}
-"""Metres, of the pictures of the turn."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -120,7 +120,7 @@ CUTS: dict[str, Callable[[str], str]] = {
 def keep(source: Path, picture: Path) -> None:
     """A figure, or the table of accidents on the report's page, as a small WebP."""
     if source.suffix == ".html":
-        from make_pictures import page_picture  # selenium, which tests of the text do without
+        from docs.make_pictures import page_picture  # selenium, which tests of the text do without
 
         source = page_picture(source.resolve(), "all-accidents")
     image = Image.open(source).convert("RGB")
