@@ -27,6 +27,7 @@ include_patterns = [
     "schema/**.md",
     "tutorials/*.md",
     "benchmarks/*.md",
+    "ARCHITECTURE.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "SECURITY.md",
@@ -132,7 +133,8 @@ def _directive(name: str, seen: set[str]) -> str:
         return f".. automodule:: {path}\n   :members:\n   :exclude-members: escaped, shortened"
     members = [each for each in public if each not in seen]
     seen.update(public)
-    return f".. automodule:: {path}\n   :members: {', '.join(members)}\n   :imported-members:"
+    shown = f"\n   :members: {', '.join(members)}" if members else ""  # an empty list would be all
+    return f".. automodule:: {path}{shown}\n   :imported-members:"
 
 
 _CODE_SPAN = re.compile(r"(?<![`\\])`([^`]+)`(?!`)")
