@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError, ResultsError
+from deepaccident_devkit.errors import NotAvailableError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.splits import save_selection
 from deepaccident_devkit.v2x import Link
@@ -69,18 +69,9 @@ def test_predict_of_scenarios_without_an_accident_names_the_scope(da_motion: Dee
 
 
 def test_predict_takes_every_half_second_of_all_scenarios(da_motion: DeepAccident, tmp_path: Path) -> None:
-    root = da_motion.dataroot
-    words = (
-        "constant_velocity",
-        root,
-        *["--split", "train", "--task", "detection", "--samples", "all", "--workers", "1"],
-    )
-    run(*words, "--out", tmp_path)
+    options = "--split train --task detection --samples all --workers 1"
+    run("constant_velocity", da_motion.dataroot, *options.split(), "--out", tmp_path)
     assert list(read_results(tmp_path / "detection.json").tokens) == da_motion.samples("train", "all")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, tmp_path: Path) -> None:
@@ -94,10 +85,3 @@ def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, t
     assert run(*words).count("which were there already") == 3
     with pytest.raises(ResultsError, match=r"accident\.json: is there already; choose another path, or remove it"):
         run(*words, "--task", "accident", "--agents", "all")
-
-
-def test_a_model_that_is_not_there_is_named() -> None:
-    with pytest.raises(
-        ChoiceError, match=r"MODEL.*: expected one of constant_velocity, .*did you mean 'constant_velocity'"
-    ):
-        run("constant_velocty", "release", "--out", "out")

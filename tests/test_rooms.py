@@ -173,7 +173,7 @@ def test_without_a_room(room: str, releases: Path, tmp_path: Path) -> None:
     assert named.keys() == set(ASKED[room])
     sentence = f"needs the room `{room}`, which this installation lacks; install the whole devkit"
     assert [text for text in named.values() if sentence not in text] == []
-    tests = ("unit/test_selection.py", "unit/accidents/test_contact.py", "unit/geometry/test_boxes.py")
+    tests = ("unit/selection/test_selection.py", "unit/accidents/test_contact.py", "unit/geometry/test_boxes.py")
     assert passed(folder, releases, (room,), *tests) > 40
 
 
