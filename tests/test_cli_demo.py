@@ -93,7 +93,7 @@ def test_a_folder_of_somebody_else_is_refused(name: str, tmp_path: Path) -> None
 @pytest.mark.slow
 def test_ego_sees_the_crash_coming_and_five_agents_see_it_earlier(tmp_path: Path) -> None:
     (tmp_path / "accident.yaml").write_text(demo.SCENARIO)
-    config = replace(demo._RELEASE, scenarios=1, sensors=False, spec=tmp_path / "accident.yaml")
+    config = replace(demo.RELEASE, scenarios=1, sensors=False, spec=tmp_path / "accident.yaml")
     da = DeepAccident(dataroot=make_release(tmp_path / "release", config, workers=1), verbose=False)
     (accident,) = da.scenario
     assert (accident["weather"], accident["time_of_day"]) == ("Clear", "Noon")

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_results
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.cli.process import _Stream
+from deepaccident_devkit.cli.process import Stream
 
 HOSTILE = "town\x1b[31m\x07\x9b\u202e\udcff"
 SHOWN = r"town\u001b[31m\u0007\u009b\u202e\udcff"
@@ -27,7 +27,7 @@ OUTPUTS = {"closed pipe": 141, "full": 2, "latin-1": 0, "ascii": 0, "none": 0}
 def shown(*texts: str, encoding: str = "utf-8") -> str:
     """What a terminal of an encoding gets."""
     beneath = io.BytesIO()
-    stream = _Stream(io.TextIOWrapper(beneath, encoding, newline=""))
+    stream = Stream(io.TextIOWrapper(beneath, encoding, newline=""))
     for text in texts:
         assert stream.write(text) == len(text)
     stream.flush()
@@ -60,7 +60,7 @@ def test_a_letter_that_the_terminal_lacks_is_replaced(encoding: str) -> None:
 
 def test_a_stream_without_an_encoding_or_a_descriptor_will_do() -> None:
     beneath = io.StringIO()
-    _Stream(beneath).write(HOSTILE)
+    Stream(beneath).write(HOSTILE)
     assert beneath.getvalue() == SHOWN
 
 

@@ -7,10 +7,10 @@ from deepaccident_devkit.synth.sensors.lidar import (
     AIR_OF_WEATHER,
     RANGE_NOISE,
     Air,
-    _cast_all,
-    _returns,
+    cast_all,
     intensity,
     ray_directions,
+    returns,
     scan,
 )
 from deepaccident_devkit.synth.solids import Block
@@ -111,7 +111,7 @@ def test_the_own_body_is_met_where_it_is(world, rig_of):
     np.testing.assert_array_equal(scene.face_owner[face] == agent.row, met)
     np.testing.assert_allclose(distance[met], lidar.distance[met], atol=1e-4)
     assert (face[met] == lidar.face[met]).mean() > 0.99
-    rows, everywhere, _ = _cast_all(scene, lidar, pose)
+    rows, everywhere, _ = cast_all(scene, lidar, pose)
     np.testing.assert_array_equal(everywhere[lidar.body[met]], lidar.distance[met])
     assert len(rows) == len(ray_directions())
 
@@ -123,10 +123,10 @@ def test_more_gets_lost_in_rain_and_of_what_comes_back_weak(world, bare, rig_of)
     assert rain < 0.95 * clear
     reach = np.repeat(np.array([5.0, 30.0, 69.0], dtype=np.float32), 10_000)
     luck = np.tile(np.linspace(0, 1, 10_000, dtype=np.float32), 3)
-    kept = _returns(reach, luck, DRY).reshape(3, -1).mean(axis=1)
+    kept = returns(reach, luck, DRY).reshape(3, -1).mean(axis=1)
     expected = 1 - 0.4 * np.maximum(1 - np.exp(-0.03 * np.array([5.0, 30.0, 69.0])) / 0.8, 0)
     np.testing.assert_allclose(kept, expected, atol=1e-3)
-    assert not _returns(np.array([70.1, np.inf], dtype=np.float32), np.ones(2, dtype=np.float32), DRY).any()
+    assert not returns(np.array([70.1, np.inf], dtype=np.float32), np.ones(2, dtype=np.float32), DRY).any()
 
 
 def test_rain_sends_rays_back(world, rig_of):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.synth.sensors.annotate import _ahead
+from deepaccident_devkit.synth.sensors.annotate import gone_on
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 PEDESTRIAN = CATEGORIES.index("pedestrian")
@@ -63,7 +63,7 @@ def recount(sighting):
 def test_nobody_goes_on_by_more_than_a_little_until_points_are_counted():
     """Who is slow, as far as it goes in 3 ms; who is fast, no farther than the noise of a point can hide."""
     velocity = np.array([[0.0, 0, 0], [2.0, 0, 0], [0, -30.0, 0]])
-    np.testing.assert_allclose(_ahead(velocity), [[0, 0, 0], [0.006, 0, 0], [0, -0.012, 0]], atol=1e-12)
+    np.testing.assert_allclose(gone_on(velocity), [[0, 0, 0], [0.006, 0, 0], [0, -0.012, 0]], atol=1e-12)
 
 
 def test_exact_calib_is_ideal(hilly_world, rig_of, others):
