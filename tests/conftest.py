@@ -73,7 +73,7 @@ def made_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     out = tmp_path_factory.mktemp("demo") / "of a reader"
     demo = importlib.import_module("deepaccident_devkit.synth.demo")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "_RELEASE", replace(demo._RELEASE, frames=12, image_size=(64, 36)))
+        patch.setattr(demo, "RELEASE", replace(demo.RELEASE, frames=12, image_size=(64, 36)))
         result = CliRunner().invoke(demo.demo, [str(out)], catch_exceptions=False)
     assert result.exit_code == 0
     return out, result.output

@@ -18,10 +18,10 @@ TASKS = {
 """Task and results → protocols."""
 
 
-def deepaccident(*arguments: object, status: int = 0) -> str:
+def deepaccident(*arguments: object) -> str:
     command = [sys.executable, "-m", "deepaccident_devkit.cli", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == status, done.stderr
+    assert done.returncode == 0, done.stderr
     return done.stdout
 
 
@@ -55,31 +55,22 @@ def test_results_are_valid_and_of_the_split(release: Path, folder: Path, name: s
     [(task, name, protocol) for (task, name), protocols in TASKS.items() for protocol in protocols],
 )
 def test_each_evaluation_is_verified(release: Path, folder: Path, task: str, name: str, protocol: str) -> None:
-    out = folder / f"{task}_{name}_{protocol}"
-    text = deepaccident(
-        *("evaluate", task, release, "--results", folder / "all" / name, "--split", "train"),
-        *("--protocol", protocol, "--out", out, "--resamples", 0),
-    )
-    assert f"{task}, protocol {protocol}" in text
+    out, results = folder / f"{task}_{name}_{protocol}", ("--results", folder / "all" / name)
+    options = ("--split", "train", "--protocol", protocol, "--out", out, "--resamples", 0)
+    assert f"{task}, protocol {protocol}" in deepaccident("evaluate", task, release, *results, *options)
     summary = json.loads((out / "metrics_summary.json").read_text())
     assert (summary["task"], summary["protocol"], summary["counts"]["samples"]) == (task, protocol, 20)
     assert (out / "report.html").stat().st_size > 50_000
-    assert "all numbers are equal" in deepaccident(
-        "evaluate", "verify", out, "--dataroot", release, "--results", folder / "all" / name
-    )
+    verified = deepaccident("evaluate", "verify", out, "--dataroot", release, *results)
+    assert "all numbers are equal" in verified
 
 
 def test_five_agents_are_compared_with_one(release: Path, folder: Path) -> None:
-    bundles = []
-    for agents in ("single", "all"):
-        bundles.append(folder / f"compared_{agents}")
-        results = folder / agents / "motion"
-        deepaccident(
-            *("evaluate", "motion", release, "--results", results, "--split", "train", "--out", bundles[-1]),
-            *("--resamples", 0),
-        )
+    bundles = [folder / f"compared_{agents}" for agents in ("single", "all")]
+    for agents, bundle in zip(("single", "all"), bundles, strict=True):
+        options = ("--results", folder / agents / "motion", "--split", "train", "--out", bundle, "--resamples", 0)
+        deepaccident("evaluate", "motion", release, *options)
     text = deepaccident("evaluate", "compare", *bundles, "--out", folder / "compared.json")
     assert "motion, protocol released: 20 samples of 1 scenarios" in text
     numbers = {each["number"]: each for each in json.loads((folder / "compared.json").read_text())["numbers"]}
-    quality = numbers["ranges/100x100/pq"]
-    assert quality["b"] > quality["a"]
+    assert numbers["ranges/100x100/pq"]["b"] > numbers["ranges/100x100/pq"]["a"]

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -22,29 +23,20 @@ from deepaccident_devkit.support.files import temporary_of
 LINE = "interrupted; no file is half-written, and the same command can be run again"
 KILLED = "error: a worker process was killed ("
 SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143}
-PROMISED, ALLOWED = 2.0, 10.0
-"""Seconds until a verb has ended; and on a machine that does other things too."""
+LONGEST = 120.0
+"""Seconds until a verb has ended, however much else the machine does: what hangs ends here."""
 Process = subprocess.Popen[str]
-
-
-def ctrl_c_counts() -> None:
-    """As in a terminal: a runner in the background ignores it, and so would its children."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 @contextmanager
 def started(*words: object) -> Iterator[Process]:
     """A verb in a process group of its own, as a shell makes it, with its handlers in place."""
     command = [sys.executable, "-m", "deepaccident_devkit.cli", *map(str, words)]
-    with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        start_new_session=True,
-        preexec_fn=ctrl_c_counts,  # noqa: PLW1509 - no thread of this process holds a lock for it
-    ) as process:
+    how: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
+    # as in a terminal: a runner in the background ignores Ctrl-C, and so would its children
+    how |= {"start_new_session": True, "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    with subprocess.Popen(command, **how) as process:
         wait_for(lambda: process.poll() is not None or catches(process.pid, signal.SIGTERM))
         try:
             yield process
@@ -55,21 +47,16 @@ def started(*words: object) -> Iterator[Process]:
 
 def lines_of(process: Process) -> list[str]:
     """What a verb says on stderr until it ends, without the states of progress bars."""
-    _, said = process.communicate(timeout=120)
+    _, said = process.communicate(timeout=LONGEST)
     return [line for line in said.replace("\r", "\n").splitlines() if line.strip() and "%|" not in line]
 
 
 def stopped(process: Process, number: signal.Signals) -> list[str]:
-    """The lines of a verb to whose whole group a signal is sent; within the promised time, and no process is left."""
+    """The lines of a verb to whose whole group a signal is sent; no process is left."""
     own = workers_of(process.pid)
-    begin = time.monotonic()
     os.killpg(process.pid, number)
     lines = lines_of(process)
-    seconds = time.monotonic() - begin
-    if seconds > PROMISED:
-        print(f"{number.name}: ended after {seconds:.1f} s")
-    assert seconds < ALLOWED
-    wait_for(lambda: not any(map(is_running, own)), seconds=5)
+    wait_for(lambda: not any(map(is_running, own)))
     return lines
 
 
@@ -134,9 +121,7 @@ def test_a_killed_worker_is_named_alike_by_every_verb(words: tuple[object, ...],
         wait_for(lambda: len(workers_of(process.pid)) == 2)
         os.kill(workers_of(process.pid)[0], signal.SIGKILL)
         lines = lines_of(process)
-    assert process.returncode == 2, lines
-    assert len(lines) == 1
-    assert lines[0].startswith(KILLED)
+    assert (process.returncode, [line.startswith(KILLED) for line in lines]) == (2, [True]), lines
     assert not [name for name in leftovers(tmp_path) if temporary_of(name)]
 
 
@@ -160,18 +145,15 @@ def test_ten_moments(number: signal.Signals, status: int, release_root_b: Path, 
         begin = time.monotonic()
         assert lines_of(process) == []
         whole = time.monotonic() - begin
-    ended = []
     for moment in range(10):
         out = tmp_path / str(moment)
         with started(*words, out) as process:
             time.sleep(whole * moment / 9)
-            lines = stopped(process, number)
-            ended.append(process.returncode)
-        assert (lines, process.returncode) in [([LINE], status), ([], 0)], moment  # at the end there is nothing to stop
+            ended = (stopped(process, number), process.returncode)
+        assert ended in [([LINE], status), ([], 0)], moment  # at the end there is nothing to stop
         with started(*words, out, "--check") as process:  # removes locks that were left at the very end, too
             assert lines_of(process) == []
         assert files(out) == files(tmp_path / "whole")
-    assert ended.count(status) > 3, ended  # by the load of the machine
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -184,7 +166,8 @@ IN_A_LIBRARY = """
 
     def verb():
         try:
-            time.sleep(60)
+            print("begun", flush=True)
+            time.sleep(600)
         except BaseException:
             {then}
 
@@ -192,91 +175,81 @@ IN_A_LIBRARY = """
 """
 
 
+def scripted(script: str) -> Process:
+    """A process that runs a script."""
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("then", ["time.sleep(60)", "raise ImportError('numpy')", "pass"])
+@pytest.mark.parametrize("then", ["time.sleep(600)", "raise ImportError('numpy')", "pass"])
 def test_a_library_that_takes_the_exception(then: str) -> None:
-    script = textwrap.dedent(IN_A_LIBRARY).format(then=then)
-    with subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True) as process:
-        wait_for(lambda: catches(process.pid, signal.SIGTERM))
-        time.sleep(0.2)
-        begin = time.monotonic()
+    with scripted(IN_A_LIBRARY.format(then=then)) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
         process.terminate()
-        assert process.communicate(timeout=ALLOWED)[1].splitlines() == [LINE]
-        assert process.returncode == 143
-        assert time.monotonic() - begin < ALLOWED
+        said = process.communicate(timeout=LONGEST)[1]
+    assert (said.splitlines(), process.returncode) == ([LINE], 143)
 
 
 @pytest.mark.slow
 def test_a_second_signal_ends_at_once() -> None:
-    script = textwrap.dedent(IN_A_LIBRARY).format(then="print('tidying', flush=True); time.sleep(60)")
-    with subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+    """Not only when the first one's time is over."""
+    with scripted(IN_A_LIBRARY.format(then="print('tidying', flush=True); time.sleep(600)")) as process:
         assert process.stdout is not None
-        wait_for(lambda: catches(process.pid, signal.SIGTERM))
-        time.sleep(0.2)
-        process.terminate()
-        process.stdout.readline()
-        begin = time.monotonic()
-        time.sleep(0.3)
-        process.terminate()
-        process.wait(timeout=ALLOWED)
-        assert time.monotonic() - begin < 1.2
-        assert process.returncode == 143
+        for _ in range(2):
+            process.stdout.readline()
+            process.terminate()
+        process.wait(timeout=LONGEST)
+    assert process.returncode == 143
 
 
-def test_other_signals_end_nothing() -> None:
-    """Such as that of a terminal whose size changes."""
-    script = """
-        import signal, time
-        from deepaccident_devkit.cli.process import run_interruptibly
-
-        def verb():
-            signal.signal(signal.SIGUSR1, lambda *_: None)
-            signal.raise_signal(signal.SIGUSR1)
-            time.sleep(1.8)
-            print("whole")
-
-        run_interruptibly(verb)
+ENDS = {
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("whole\n", "")
+    import signal
+    from deepaccident_devkit.cli.process import run_interruptibly
 
+    def verb():  # a signal such as that of a terminal whose size changes ends nothing
+        signal.signal(signal.SIGUSR1, lambda *_: None)
+        signal.raise_signal(signal.SIGUSR1)
+        print("whole")
 
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_amid_the_end_of_python_changes_nothing(number: signal.Signals) -> None:
-    """The verb has done its work: this runs last of what is to run at the end."""
-    script = f"""
-        import atexit, os
-        from deepaccident_devkit.cli.process import run_interruptibly
-
-        atexit.register(lambda: (os.kill(os.getpid(), {int(number)}), print("went on")))
-        run_interruptibly(lambda: print("whole"))
+    run_interruptibly(verb)
+    """: ("whole\n", [], 0),
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("whole\nwent on\n", "")
+    import atexit, os
+    from deepaccident_devkit.cli.process import run_interruptibly
+
+    # the verb has done its work: this runs last of what is to run at the end
+    atexit.register(lambda: (os.kill(os.getpid(), {number}), print("went on")))
+    run_interruptibly(lambda: print("whole"))
+    """: ("whole\nwent on\n", [], 0),
+    """
+    import os, time
+    from deepaccident_devkit.cli.process import run_interruptibly
+
+    class Last:  # Python ignores what a `__del__` raises, and would say so
+        def __del__(self):
+            os.kill(os.getpid(), {number})
+            time.sleep(0.01)
+
+    def verb():
+        Last()
+        try:
+            time.sleep(600)
+        finally:
+            print("tidied up", flush=True)
+
+    run_interruptibly(verb)
+    """: ("tidied up\n", [LINE], None),
+}
+"""A script that gets a signal, by what it is sent amid → what it prints, what it says, its status."""
 
 
 @pytest.mark.parametrize(("number", "status"), SIGNALS.items())
-def test_a_signal_amid_what_python_calls_in_between(number: signal.Signals, status: int) -> None:
-    """Python ignores what a `__del__` raises, and would say so."""
-    script = f"""
-        import os, time
-        from deepaccident_devkit.cli.process import run_interruptibly
-
-        class Last:
-            def __del__(self):
-                os.kill(os.getpid(), {int(number)})
-                time.sleep(0.01)
-
-        def verb():
-            Last()
-            try:
-                time.sleep(60)
-            finally:
-                print("tidied up", flush=True)
-
-        run_interruptibly(verb)
-    """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr.splitlines(), done.returncode) == ("tidied up\n", [LINE], status)
+@pytest.mark.parametrize(("script", "ends"), ENDS.items(), ids=["another signal", "Python's end", "in between"])
+def test_a_signal_amid(number: signal.Signals, status: int, script: str, ends: tuple[Any, ...]) -> None:
+    with scripted(script.format(number=int(number))) as process:
+        printed, said = process.communicate(timeout=LONGEST)
+    *told, usual = ends
+    assert (printed, said.splitlines(), process.returncode) == (*told, status if usual is None else usual)

@@ -40,32 +40,26 @@ def towns(root: Path) -> tuple[str, str]:
 def test_a_file_for_each_town_that_has_a_map(root: Path, tmp_path: Path) -> None:
     seen, unseen = towns(root)
     made = run(root, "--out", tmp_path / "maps")
-    assert made.exit_code == 0
-    path = tmp_path / "maps" / f"{seen}.geojson"
+    (path,) = (tmp_path / "maps").iterdir()
+    assert (made.exit_code, path.name) == (0, f"{seen}.geojson")
     assert f"{path}: " in made.stdout
     assert "m² of road, from 20 pictures of 2 scenarios (0 missing, 0 damaged)" in made.stdout
     assert f"left out: {unseen}: none of its 2 scenarios has a readable file" in made.stderr
-    assert [each.name for each in path.parent.iterdir()] == [path.name]
     assert len(json.loads(path.read_text(encoding="utf-8"))["features"]) > 1
 
 
 def test_one_town_as_json(root: Path, tmp_path: Path) -> None:
     seen, unseen = towns(root)
     told = json.loads(run(root, "--out", tmp_path, "--where", f"town={seen}", "--json").stdout)[seen]
-    assert told["path"] == str(tmp_path / f"{seen}.geojson")
-    assert (told["scenarios"], told["looks"], told["missing"], told["damaged"]) == (2, 20, 0, 0)
-    failed = run(root, "--out", tmp_path, "--where", f"town={unseen}")
-    assert isinstance(failed.exception, NotAvailableError)
+    wanted = {"path": str(tmp_path / f"{seen}.geojson"), "scenarios": 2, "looks": 20, "missing": 0, "damaged": 0}
+    assert told.items() >= wanted.items()
+    assert isinstance(run(root, "--out", tmp_path, "--where", f"town={unseen}").exception, NotAvailableError)
 
 
 def test_scenarios_may_be_chosen(root: Path, tmp_path: Path) -> None:
     seen, _ = towns(root)
     made = run(root, "--out", tmp_path, "--where", f"town={seen}", "--where", "collision=true")
-    assert "from 10 pictures of 1 scenarios" in made.stdout
-    assert "left out" not in made.stderr
-    nothing = run(root, "--out", tmp_path, "--where", "length=900..999")
-    assert nothing.exit_code == 2
-    assert "no scenario matches --where" in nothing.output
+    assert ("from 10 pictures of 1 scenarios" in made.stdout, "left out" in made.stderr) == (True, False)
 
 
 def test_a_release_without_bev_cameras(da_b: DeepAccident, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from click import Group
 from click.testing import CliRunner
 from test_words import TOP
 
@@ -35,11 +34,8 @@ def parsed(path: Path) -> dict:
 
 def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
     citation = parsed(TOP / "CITATION.cff")
-    assert citation["version"] == __version__
-    paper = citation["preferred-citation"]
-    readme = " ".join((TOP / "README.md").read_text(encoding="utf-8").split())
-    assert paper["title"] in readme
-    assert paper["url"] in readme
+    paper, readme = citation["preferred-citation"], " ".join((TOP / "README.md").read_text(encoding="utf-8").split())
+    assert (citation["version"], paper["title"] in readme, paper["url"] in readme) == (__version__, True, True)
 
 
 def test_the_hooks_are_checks_of_ci() -> None:
@@ -57,34 +53,30 @@ def test_the_workflow_runs_ci_on_every_python() -> None:
 
 @pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.name)
 def test_the_templates_ask_for_commands_that_exist(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
-    commands = re.findall(r"`deepaccident ([^`]*)`", text)
+    commands = re.findall(r"`deepaccident ([^`]*)`", path.read_text(encoding="utf-8"))
     assert ("--version --all" in commands) == (path.name != "config.yml")
-    for command in commands:
-        verb = command.split()[0]
-        words = [verb, "--help"] if isinstance(deepaccident, Group) and not verb.startswith("-") else command.split()
+    for verb, *options in map(str.split, commands):
+        words = [verb, *options] if verb.startswith("-") else [verb, "--help"]
         result = CliRunner().invoke(deepaccident, words)
         assert result.exit_code == 0
-        assert all(word in result.output for word in command.split()[1:] if word.startswith("--") and verb[0] != "-")
+        assert (
+            verb.startswith("-") or [word for word in options if word[:2] == "--" and word not in result.output] == []
+        )
 
 
 def slow_tests() -> dict[str, list[ast.FunctionDef]]:
     """File → its test functions that are marked slow, themselves, by their class or by the whole file."""
 
     def marked(where: ast.AST) -> bool:
-        return "mark.slow" in "".join(ast.unparse(each) for each in getattr(where, "decorator_list", ()))
+        marks = [each.value for each in getattr(where, "body", ()) if "pytestmark" in ast.unparse(each)[:10]]
+        return any("mark.slow" in ast.unparse(each) for each in (*marks, *getattr(where, "decorator_list", ())))
 
     found: dict[str, list[ast.FunctionDef]] = {}
     for path in sorted((TOP / "tests").rglob("test_*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        named = [
-            each for each in tree.body if isinstance(each, ast.Assign) and "pytestmark" in ast.unparse(each.targets)
-        ]
-        whole = any("mark.slow" in ast.unparse(each.value) for each in named)
         for room in (tree, *(each for each in tree.body if isinstance(each, ast.ClassDef))):
             tests = [each for each in room.body if isinstance(each, ast.FunctionDef) and each.name.startswith("test_")]
-            slow = [test for test in tests if whole or marked(room) or marked(test)]
-            if slow:
+            if slow := [test for test in tests if marked(tree) or marked(room) or marked(test)]:
                 found.setdefault(path.relative_to(TOP).as_posix(), []).extend(slow)
     return found
 
@@ -101,12 +93,12 @@ def test_the_list_of_slow_tests_is_complete() -> None:
 def test_no_parity_and_no_property_is_slow() -> None:
     slow = slow_tests()
     assert [name for name in slow if name.startswith(("tests/parity/", "tests/property/"))] == []
-    decorators = {
-        f"{name}::{test.name}": " ".join(ast.unparse(each) for each in test.decorator_list)
+    marks = {
+        f"{name}::{each.name}": " ".join(map(ast.unparse, each.decorator_list))
         for name, tests in slow.items()
-        for test in tests
+        for each in tests
     }
-    assert [name for name, text in decorators.items() if re.search(r"\bgiven\(|golden", text)] == []
+    assert [name for name, text in marks.items() if re.search(r"\bgiven\(|golden", text)] == []
 
 
 @pytest.fixture(scope="module")
@@ -138,16 +130,10 @@ def test_a_wheel_holds_the_package_and_nothing_else(distributions: Path) -> None
     [wheel] = distributions.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    assert {name for name in names if ".dist-info/" not in name} == package_files()
-    assert "deepaccident_devkit/py.typed" in names
-    assert {name.rpartition("/")[2] for name in names if ".dist-info/" in name} == {
-        "LICENSE",
-        "METADATA",
-        "RECORD",
-        "WHEEL",
-        "entry_points.txt",
-        "top_level.txt",
-    }
+    facts = {name for name in names if ".dist-info/" in name}
+    assert names - facts == package_files() > {"deepaccident_devkit/py.typed"}
+    told = ("LICENSE", "METADATA", "RECORD", "WHEEL", "entry_points.txt", "top_level.txt")
+    assert {name.rpartition("/")[2] for name in facts} == {*told}
 
 
 @pytest.mark.slow
@@ -177,16 +163,12 @@ def test_a_strangers_type_checker_reads_the_types(distributions: Path, tmp_path:
     pytest.importorskip("mypy")
     environment = tmp_path / "environment"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-    [installed] = environment.glob("lib/python*/site-packages")
-    [wheel] = distributions.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        for name in archive.namelist():
-            archive.extract(name, installed)
+    [installed], [wheel] = environment.glob("lib/python*/site-packages"), distributions.glob("*.whl")
+    shutil.unpack_archive(wheel, installed, "zip")
     (installed / "libraries.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
     (tmp_path / "stranger.py").write_text(STRANGER, encoding="utf-8")
     command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", environment / "bin" / "python"]
     found = subprocess.run([*command, "stranger.py"], cwd=tmp_path, capture_output=True, text=True, check=False).stdout
     assert re.search(r'Revealed type is "numpy\.ndarray\[', found), found
-    assert "def (" in found
-    assert '"Boxes" has no attribute "no_such_field"' in found
+    assert ("def (" in found, '"Boxes" has no attribute "no_such_field"' in found) == (True, True)
     assert found.rstrip().endswith("Found 1 error in 1 file (checked 1 source file)")

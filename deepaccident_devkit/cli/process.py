@@ -125,7 +125,7 @@ def _say_so() -> None:
         os.write(2, _LINE)  # and not sys.stderr, which an interrupted print may hold
 
 
-class _Stream:
+class Stream:
     """Shows what the stream beneath it can show, and never fails: what it cannot write is lost, and noted.
 
     Control characters are shown as JSON escapes, so that JSON stays the same document; a letter that the encoding
@@ -142,12 +142,14 @@ class _Stream:
         return getattr(self._beneath, name)
 
     def write(self, text: str) -> int:
+        """Show a text, as far as the stream can."""
         start = "" if (bar := _OF_BARS.match(text)) is None else bar[0]
         shown, encoding = start + escaped(text[len(start) :]), self._beneath.encoding or "utf-8"
         self._try(self._beneath.write, shown.encode(encoding, "replace").decode(encoding))
         return len(text)
 
     def flush(self) -> None:
+        """Pass on what was written."""
         self._try(self._beneath.flush)
 
     def _try(self, output: Callable[..., object], *text: str) -> None:
@@ -170,7 +172,7 @@ def lasting_streams() -> Iterator[None]:
     given = (sys.stdin, sys.stdout, sys.stderr)
     # one that was closed leads into nothing, so that no file of ours takes its number
     sys.stdin, out, err = (each or Path(os.devnull).open("r+", encoding="utf-8") for each in given)  # noqa: SIM115
-    sys.stdout, sys.stderr = cast("TextIO", shown := _Stream(out)), cast("TextIO", _Stream(err))
+    sys.stdout, sys.stderr = cast("TextIO", shown := Stream(out)), cast("TextIO", Stream(err))
     try:
         yield
     except SystemExit as ended:

@@ -71,7 +71,7 @@ background: {vehicles: [6, 12], two_wheelers: [2, 6], parked: [3, 9], walking: [
 weather: Clear
 time_of_day: Noon
 """
-_RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1)
+RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1)
 _MARK: Final = ".deepaccident_demo"
 """The file by which the demo knows a folder as its own."""
 _SCENARIO_FILE: Final = "accident.yaml"
@@ -265,7 +265,7 @@ def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
         return
     if not scenario.exists():
         write_bytes(scenario, SCENARIO.encode())
-    config = replace(_RELEASE, spec=scenario)
+    config = replace(RELEASE, spec=scenario)
     make_release(root, config, workers=workers or 2, progress=lambda share: bar.update(share * _STEPS["recording"]))
 
 

@@ -6,9 +6,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from deepaccident_devkit.taxonomy import CAMERAS
 from fault_injection.place import Place
 
-Apply = Callable[[Place, np.random.Generator], str]
+Apply = Callable[[Place, np.random.Generator], None]
+Matrix = Callable[[np.ndarray], np.ndarray]
 Only = Literal["accident", "normal"]
 
 
@@ -20,7 +22,7 @@ class Mutation:
         name: its name in the table.
         group: what kind of file it damages.
         title: what it does, in a phrase.
-        apply: damages a scenario; returns what was done.
+        apply: damages a scenario.
         deep: whether only the sensors' files show it.
         harmless: why it cannot be found, or need not be; None for a fault.
         beyond: why `validate` need not find this fault; None if it must.
@@ -63,11 +65,40 @@ class Group:
         return enter
 
 
+def in_file(kind: str, change: Callable[[bytes, np.random.Generator], bytes]) -> Apply:
+    """Change the bytes of a file of a kind (`ENDINGS`, or `Camera` for any of them) at a frame of an agent."""
+
+    def apply(place: Place, rng: np.random.Generator) -> None:
+        drawn = str(rng.choice(CAMERAS)) if kind == "Camera" else kind
+        path = place.file(place.any_agent(rng), drawn, place.any_frame(rng))
+        place.write(path, change(path.read_bytes(), rng))
+
+    return apply
+
+
+def in_calib(
+    key: str, edit: Matrix | None = None, *, drawn: Callable[[np.random.Generator], Matrix] | None = None, always: bool
+) -> Apply:
+    """Edit a matrix of an agent's calib at a frame or always: as it is said or `drawn`; `{}` stands for a camera."""
+
+    def apply(place: Place, rng: np.random.Generator) -> None:
+        agent, frames = place.any_agent(rng), place.frames if always else [place.any_frame(rng)]
+        matrix = key.format(rng.choice(CAMERAS)) if "{}" in key else key
+        place.edit_calib(agent, frames, matrix, edit or drawn(rng))
+
+    return apply
+
+
 def cut(content: bytes, rng: np.random.Generator, *, end: int | None = None) -> bytes:
     """The beginning of a file: at least a byte stays and two go."""
     return content[: rng.integers(1, (end or len(content)) - 1)]
 
 
-def garbage(rng: np.random.Generator, size: int) -> bytes:
-    """Random bytes."""
-    return rng.integers(0, 256, size=max(size, 16), dtype=np.uint8).tobytes()
+def emptied(*_: object) -> bytes:
+    """Nothing."""
+    return b""
+
+
+def garbage(content: bytes, rng: np.random.Generator) -> bytes:
+    """As many random bytes, sixteen at least."""
+    return rng.integers(0, 256, size=max(len(content), 16), dtype=np.uint8).tobytes()

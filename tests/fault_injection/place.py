@@ -1,6 +1,6 @@
 """A scenario of a release that mutations may change, and that can be put back as it was."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -57,16 +57,43 @@ class Place(ScenarioEditor):
             if content != self.before[path]
         }
 
-    def take_next(self, agent: str, kind: str, frame: int) -> str:
-        """Replace an agent's file of a kind (`ENDINGS`) by the next frame's; says what was done."""
-        self.write(self.file(agent, kind, frame), self.file(agent, kind, frame + 1).read_bytes())
-        return f"{agent} {frame}"
+    def take_next(self, agent: str, kind: str, frame: int) -> None:
+        """Replace an agent's file of a kind (`ENDINGS`) by the next frame's."""
+        self.take(agent, kind, frame, agent, frame + 1)
 
-    def one_frame_early(self, agent: str, kind: str) -> str:
-        """Replace all of an agent's files of a kind but the last by the next frame's; says what was done."""
+    def take(self, agent: str, kind: str, frame: int, other: str, other_frame: int) -> None:
+        """Replace an agent's file of a kind by another's or that of another frame."""
+        self.write(self.file(agent, kind, frame), self.file(other, kind, other_frame).read_bytes())
+
+    def moving_takes_next(self, rng: np.random.Generator, kind: str) -> None:
+        """Replace a file of a kind of an agent that moves just then by the next frame's."""
+        frame = int(rng.choice(self.frames[:-1]))
+        self.take_next(self.moving_agent(rng, frame), kind, frame)
+
+    def one_frame_early(self, agent: str, kind: str) -> None:
+        """Replace all of an agent's files of a kind but the last by the next frame's."""
         for frame in self.frames[:-1]:
             self.take_next(agent, kind, frame)
-        return agent
+
+    def exchange_agents(self, agents: tuple[str, str], kind: str, frames: Sequence[int]) -> None:
+        """Exchange two agents' files of a kind."""
+        one, other = agents
+        for frame in frames:
+            self.exchange(self.file(one, kind, frame), self.file(other, kind, frame))
+
+    def edit_any_row(self, rng: np.random.Generator, edit: Callable[[list[str]], object]) -> None:
+        """Edit the words of a box line of an agent's label at a frame."""
+        agent, frame = self.any_agent(rng), self.any_frame(rng)
+        rows = self.rows(agent, frame)
+        edit(self.any_row(rng, rows))
+        self.write_rows(agent, frame, rows)
+
+    def remove_row(self, agent: str, frames: Sequence[int], actor: int) -> None:
+        """Remove an actor's line from an agent's labels."""
+        for frame in frames:
+            rows = self.rows(agent, frame)
+            rows.remove(self.row_of(rows, actor))
+            self.write_rows(agent, frame, rows)
 
     # ---- victims; call these before changing anything
 

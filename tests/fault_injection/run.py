@@ -36,7 +36,7 @@ class Outcome:
     Attributes:
         job: the mutation and its seed.
         token: the scenario that was mutated.
-        done: what was done to it.
+        changed: files that it changed, added or removed.
         errors: codes of the new findings that are errors, sorted.
         warnings: codes of the new warnings, sorted.
         code_ran: whether a pickle of the release ran its own code.
@@ -44,7 +44,7 @@ class Outcome:
 
     job: Job
     token: str
-    done: str
+    changed: tuple[str, ...]
     errors: tuple[str, ...]
     warnings: tuple[str, ...]
     code_ran: bool
@@ -72,7 +72,7 @@ def places(root: Path) -> dict[str, Place]:
     return {scenario.token: Place(root, scenario) for scenario in find_release(root).scenarios}
 
 
-def mutate(job: Job, of: dict[str, Place]) -> tuple[Place, str]:
+def mutate(job: Job, of: dict[str, Place]) -> Place:
     """Apply a mutation to the first scenario with a victim for it, in an order that its seed chooses."""
     mutation, rng = MUTATIONS[job.name], seeded(job.name, job.seed)
     fitting = sorted(token for token in of if mutation.only is None or token.split("/")[0].endswith(mutation.only))
@@ -80,9 +80,11 @@ def mutate(job: Job, of: dict[str, Place]) -> tuple[Place, str]:
         place = of[str(token)]
         assert set(place.sightings) == set(place.agents)  # looked at while all is well
         try:
-            return place, mutation.apply(place, rng)
+            mutation.apply(place, rng)
         except NoVictimError:
             assert not place.changes()
+        else:
+            return place
     raise NoVictimError(f"{job.name}: nobody in {', '.join(fitting)} is what it needs; try another seed of RELEASE")
 
 
@@ -109,8 +111,9 @@ def _start(root: Path, folder: Path) -> None:
 def _outcome(job: Job) -> Outcome:
     from deepaccident_devkit.validation import validate_release
 
-    place, done = mutate(job, _OWN)
+    place = mutate(job, _OWN)
     try:
+        changed = tuple(place.changes())
         kind = MUTATIONS[job.name]
         scenarios = None if kind.group == "release" else [place.token]
         report = validate_release(place.root, deep=kind.deep, workers=1, scenarios=scenarios)
@@ -119,15 +122,12 @@ def _outcome(job: Job) -> Outcome:
         place.restore()
         shutil.rmtree(marker(place.root), ignore_errors=True)
         shutil.rmtree(place.root / ".deepaccident", ignore_errors=True)
-    codes = {
-        severity: tuple(sorted({finding.code for finding in report.findings if finding.severity == severity}))
-        for severity in ("error", "warning")
-    }
+    told = {(finding.severity, finding.code) for finding in report.findings}
     return Outcome(
         job=job,
         token=place.token,
-        done=done,
-        errors=codes["error"],
-        warnings=codes["warning"],
+        changed=changed,
+        errors=tuple(sorted(code for severity, code in told if severity == "error")),
+        warnings=tuple(sorted(code for severity, code in told if severity == "warning")),
         code_ran=code_ran,
     )

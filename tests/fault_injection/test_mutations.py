@@ -18,29 +18,29 @@ def own_places(healthy_release: Path, release_copy: Path) -> dict[str, Place]:
     return places(release_copy)
 
 
-@pytest.mark.parametrize("name", MUTATIONS)
-def test_a_mutation_changes_files_and_depends_on_its_seed_alone(own_places, name):
-    place, done = mutate(Job(name, SEED), own_places)
+def applied(name: str, of: dict[str, Place]) -> tuple[str, dict[str, bytes | None]]:
+    """The scenario that a mutation damages, and the changed files, which are put back."""
+    place = mutate(Job(name, SEED), of)
     changes = place.changes()
     place.restore()
+    return place.token, changes
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_a_mutation_changes_files_and_depends_on_its_seed_alone(own_places, name):
+    token, changes = applied(name, own_places)
     assert changes
-    assert done
-    again, done_again = mutate(Job(name, SEED), own_places)
-    changes_again = again.changes()
-    again.restore()
-    assert (again.token, done_again, changes_again) == (place.token, done, changes)
+    assert applied(name, own_places) == (token, changes)
 
 
 def test_restoring_brings_every_file_back(own_places, healthy_release):
     for name in MUTATIONS:
-        place, _ = mutate(Job(name, 0), own_places)
-        place.restore()
+        applied(name, own_places)
     assert contents(next(iter(own_places.values())).root) == contents(healthy_release)
 
 
 def test_every_mutation_says_what_it_does():
-    assert all(mutation.title for mutation in MUTATIONS.values())
-    assert len({mutation.title for mutation in MUTATIONS.values()}) == len(MUTATIONS)
+    assert len({mutation.title for mutation in MUTATIONS.values()} - {""}) == len(MUTATIONS)
 
 
 def contents(root: Path) -> dict[str, bytes]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from refusals import assert_refused
 from tiny_format import TinyFormat
 
 from deepaccident_devkit import DeepAccident
@@ -55,8 +56,7 @@ def half_an_export(dataset: DeepAccident, folder: Path) -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TinyFormat, "write", write)
-        with pytest.raises(KeyboardInterrupt):
-            an_export(dataset, folder)
+        assert_refused((lambda: an_export(dataset, folder), KeyboardInterrupt, ()))
 
 
 def labels(dataset: DeepAccident, folder: Path) -> None:
@@ -82,8 +82,7 @@ def a_release(_: DeepAccident, folder: Path, left: float = math.inf) -> None:
 
 
 def half_a_release(dataset: DeepAccident, folder: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        a_release(dataset, folder, 1)
+    assert_refused((lambda: a_release(dataset, folder, 1), KeyboardInterrupt, ()))
 
 
 def an_index(dataset: DeepAccident, folder: Path) -> None:
@@ -102,7 +101,7 @@ WRITERS: dict[str, tuple[Writer, Writer]] = {
     "an index": (an_index, an_index),
 }
 """What is made → what an earlier call left, and what is called then."""
-USERS_OWN = ("out", "release", "release/.deepaccident", "release/.deepaccident/v1")
+USERS_OWN = {"out", "release", "release/.deepaccident", "release/.deepaccident/v1"}
 """Folders that the user named, or may have put elsewhere."""
 
 
@@ -133,22 +132,17 @@ def test_a_link_in_any_place_leads_nothing_out(small: DeepAccident, tmp_path: Pa
     places = {name: path / name for path in (done, begun) for name in spots(path)}
     if what == "a release":
         places |= {name.replace("out", ".out.unfinished/release", 1): path for name, path in places.items()}
+    elif what == "an index":
+        places = {name: path for name, path in places.items() if "/.deepaccident/" in name}
     refused = 0
-    for number, (name, real) in enumerate(sorted(places.items())):
-        if name in USERS_OWN or (what == "an index" and "/.deepaccident/" not in name):
-            continue
-        target = outside / str(number)
+    for number, name in enumerate(sorted(places.keys() - USERS_OWN)):
         if not dangling:
-            shutil.copytree(real, target) if real.is_dir() else target.touch()
-            for path in (target, *target.rglob("*")):
-                if not path.is_dir():
-                    path.unlink()
-                    path.write_bytes(PRECIOUS)
+            precious_copy(places[name], outside / str(number))
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(begun, folder, symlinks=True)
         remove_in(folder, name)
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).symlink_to(target)
+        (folder / name).symlink_to(outside / str(number))
         before = states(outside)
         try:
             go(small, folder)
@@ -156,6 +150,14 @@ def test_a_link_in_any_place_leads_nothing_out(small: DeepAccident, tmp_path: Pa
             refused += isinstance(error, OutputFolderError)
         assert states(outside) == before, name
     assert refused
+
+
+def precious_copy(real: Path, target: Path) -> None:
+    """The same files and folders, of which each file is precious."""
+    shutil.copytree(real, target) if real.is_dir() else target.touch()
+    for path in (each for each in (target, *target.rglob("*")) if not each.is_dir()):
+        path.unlink()
+        path.write_bytes(PRECIOUS)
 
 
 ATTACKS = {
@@ -182,18 +184,17 @@ ATTACKS = {
 def test_a_journal_removes_nothing_outside(small: DeepAccident, tmp_path: Path, attack: str, of_another: bool) -> None:
     """Its lines are paths of which an unfinished export removes those that it does not write again."""
     half_an_export(small, tmp_path)
-    out, outside = tmp_path / EXPORT, tmp_path / "outside"
+    out, outside, line = tmp_path / EXPORT, tmp_path / "outside", ATTACKS[attack]
     outside.mkdir()
     (outside / "precious").write_bytes(PRECIOUS)
     (out / "linked").symlink_to(outside)
     (journal,) = (tmp_path / PARTS).glob("*normal*.paths")
-    line = ATTACKS[attack]
     content = line if isinstance(line, bytes) else line.format(outside=outside).encode()
     (journal.with_name("another.paths") if of_another else journal).write_bytes(content + b"\0")
     before = states(outside)
     if attack == "a link to a folder":
-        with pytest.raises(OutputFolderError, match="linked: a symbolic link, which no devkit makes; remove"):
-            an_export(small, tmp_path)
+        told = ("linked: a symbolic link, which no devkit makes; remove",)
+        assert_refused((lambda: an_export(small, tmp_path), OutputFolderError, told))
     else:
         an_export(small, tmp_path)
         assert {path.name for path in out.iterdir()} >= {"tiny.manifest.json", "counts.json"}
@@ -213,20 +214,17 @@ def test_a_journal_is_a_new_file(small: DeepAccident, tmp_path: Path) -> None:
 
 
 def test_no_link_can_wait_for_a_temporary_file(tmp_path: Path) -> None:
-    names = [temporary_path(tmp_path / "a").name for _ in range(100)]
-    numbers = [int(re.split(r"[-.]", name)[-2]) for name in names]
+    numbers = [int(re.split(r"[-.]", temporary_path(tmp_path / "a").name)[-2]) for _ in range(100)]
     assert len(set(numbers)) > 90
     assert not {after - before for before, after in pairwise(numbers)} & {1, -1}
 
 
 def test_a_demo_uses_no_folder_behind_a_link(tmp_path: Path) -> None:
-    out, outside = tmp_path / "demo", tmp_path / "outside"
-    for folder in (out, outside):
-        folder.mkdir()
-    (out / ".deepaccident_demo").write_text(f"{__version__}\n")
-    (out / "release").symlink_to(outside)
-    result = CliRunner().invoke(demo, [str(out)])
-    assert isinstance(result.exception, OutputFolderError)
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (tmp_path / ".deepaccident_demo").write_text(f"{__version__}\n")
+    (tmp_path / "release").symlink_to(outside)
+    assert isinstance(CliRunner().invoke(demo, [str(tmp_path)]).exception, OutputFolderError)
     assert not list(outside.iterdir())
 
 
@@ -245,19 +243,18 @@ def test_a_cache_is_not_left(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", ["/absolute", "..", "a/../b", "link/b", "a/link/b", "", "."])
 def test_what_leads_out_is_refused(tmp_path: Path, path: str) -> None:
-    root, outside = tmp_path / "root", tmp_path / "outside"
+    root, outside, named = (tmp_path / name for name in ("root", "outside", "named"))
     for folder in (root / "a", outside / "b"):
         folder.mkdir(parents=True)
-    for link in (root / "link", root / "a" / "link", tmp_path / "named"):
-        link.symlink_to(root if link.name == "named" else outside)
-    for use in (place_in, remove_in):
-        with pytest.raises(OutputFolderError, match=r"a symbolic link|is no path below it"):
-            use(root, path)
-    assert place_in(tmp_path / "named", "a/b/c") == tmp_path / "named" / "a" / "b" / "c"
-    assert place_in(root, "link") == root / "link"
-    with pytest.raises(OutputFolderError, match=r"link: a symbolic link, .*; remove it, or give another folder than "):
-        place_in(root, "link", opened=True)
+    for link, target in ((root / "link", outside), (root / "a" / "link", outside), (named, root)):
+        link.symlink_to(target)
+    linked = ("link: a symbolic link, ", "; remove it, or give another folder than ")
+    assert_refused(
+        (lambda: place_in(root, path), OutputFolderError, r"a symbolic link|is no path below it"),
+        (lambda: remove_in(root, path), OutputFolderError, r"a symbolic link|is no path below it"),
+        (lambda: place_in(root, "link", opened=True), OutputFolderError, linked),
+    )
+    assert (place_in(named, "a/b/c"), place_in(root, "link")) == (named / "a" / "b" / "c", root / "link")
     for name in ("link", "a", "not there", "a/not/there"):
         remove_in(root, name)
-    assert not list(root.iterdir())
-    assert (outside / "b").is_dir()
+    assert ([*root.iterdir()], (outside / "b").is_dir()) == ([], True)

@@ -27,12 +27,11 @@ class Speeds(Report):
 def test_all_forms_have_the_same_numbers(tmp_path: Path) -> None:
     report = Speeds(speeds={HOSTILE: 1.5, "b": None})
     assert json.loads(report.to_json()) == report.to_dict() == {"speeds": {HOSTILE: 1.5, "b": None}}
-    speeds, empty = report.to_csv(tmp_path / "new")
-    assert speeds.read_text() == f"name,m/s\n{HOSTILE},1.5\nb,\n"
-    assert empty.read_text() == "name\n"
+    tables = [path.read_text() for path in report.to_csv(tmp_path / "new")]
+    assert tables == [f"name,m/s\n{HOSTILE},1.5\nb,\n", "name\n"]
     assert report.to_text() == f"speeds\nname{' ' * 25}m/s\n{HOSTILE}  1.5\nb\n\nempty\nname"
     page = Page(report.to_html())
-    assert (len(page.all("table")), len(page.all("tr")), page.all("script")) == (2, 4, [])
+    assert [len(page.all(tag)) for tag in ("table", "tr", "script")] == [2, 4, 0]
     assert HOSTILE in page.text
 
 

@@ -112,6 +112,7 @@ class _Worker:
         self._from_fork, writing = os.pipe()
         self._process = os.fork()
         self._seconds = 0.0
+        self._is_gone = False
         self._buffer = b""
         if self._process == 0:
             for end in (self._to_fork, self._from_fork):
@@ -132,6 +133,7 @@ class _Worker:
                 continue
             more = os.read(self._from_fork, 1 << 16) if ready else b""
             if not more:
+                self._is_gone = bool(ready)
                 return None
             self._buffer += more
         answer, _, self._buffer = self._buffer.partition(b"\n")
@@ -139,13 +141,11 @@ class _Worker:
 
     def ended(self) -> dict[str, str]:
         """Why there was no answer."""
-        for _ in range(20):  # a process that dies of a signal needs a moment
-            process, status = os.waitpid(self._process, os.WNOHANG)
-            if process:
-                self._process = 0
-                return {"verdict": "crash", "detail": f"exit status {os.waitstatus_to_exitcode(status)}"}
-            time.sleep(0.01)
-        return {"verdict": "hang", "detail": f"no answer in {self._seconds:g} s of work"}
+        if not self._is_gone:
+            return {"verdict": "hang", "detail": f"no answer in {self._seconds:g} s of work"}
+        _, status = os.waitpid(self._process, 0)  # however long its death takes
+        self._process = 0
+        return {"verdict": "crash", "detail": f"exit status {os.waitstatus_to_exitcode(status)}"}
 
     def stop(self) -> None:
         """End it."""

@@ -218,7 +218,7 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
         actor_id[agent.row] = OWN_ACTOR_ID
         agent_velocity[0] = world_velocity[agent.row]
         lidar_yaw[agent.row], lidar_velocity[agent.row] = 0.0, 0.0
-    size, ahead = scene.actors.size[rows], np.zeros((len(rows), 3)) if exact else _ahead(lidar_velocity[rows])
+    size, ahead = scene.actors.size[rows], np.zeros((len(rows), 3)) if exact else gone_on(lidar_velocity[rows])
     counted = Boxes.from_arrays(lidar_center[rows] + ahead, size, lidar_yaw[rows], frame="lidar")
     return Labels(
         raw=False,
@@ -235,7 +235,7 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
     )
 
 
-def _ahead(velocity: FloatArray) -> FloatArray:
+def gone_on(velocity: FloatArray) -> FloatArray:
     """How far (N, 3), metres, actors with velocities (N, 3) have moved on when points are counted."""
     way = COUNTED_LATER * velocity
     return np.asarray(way * np.minimum(1.0, MOST_AHEAD / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)))

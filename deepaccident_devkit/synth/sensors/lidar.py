@@ -208,12 +208,12 @@ def scan(
     If `boxed`, only rays are followed that may pass through a label box. Then all points in boxes are there, equal to
     the bit, but only few points outside the boxes.
     """
-    cast = _cast_boxed if boxed else _cast_all
+    cast = _cast_boxed if boxed else cast_all
     rows, distance, face = cast(scene, lidar, ground_from_lidar)
     normal, even = _random_numbers()
     noise, luck, wet = rng.integers(0, _NUMBERS - len(ray_directions()), 3)
     reach = distance.astype(np.float32)
-    returned = _returns(reach, even[luck + rows], air)
+    returned = returns(reach, even[luck + rows], air)
     if air.drops:
         drop = np.flatnonzero(even[wet + rows] < air.drops)
         place = _NEAREST_DROP + (_FARTHEST_DROP - _NEAREST_DROP) * even[luck + rows[drop]]
@@ -234,7 +234,7 @@ def _brightness(reach: AnyArray, air: Air) -> Float32Array:
     return np.asarray(np.exp(-(_ATTENUATION + air.attenuation) * reach), dtype=np.float32)
 
 
-def _cast_all(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
+def cast_all(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
     """The rows of all rays; how far they go, correct up to `RANGE`; and what they meet."""
     setting, rays = scene.setting, turned_rays(ground_from_lidar.rotation)
     pose = ground_from_lidar.matrix.tobytes()
@@ -248,7 +248,7 @@ def _cast_all(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntAr
 
 
 def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
-    """The same as `_cast_all`, for only the rays that may pass through a box."""
+    """The same as `cast_all`, for only the rays that may pass through a box."""
     setting = scene.setting
     near, others = rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar), setting.parked)
     wanted = near | others
@@ -280,7 +280,7 @@ def _others(rows: IntArray, lidar: Lidar) -> IntArray:
     return rows if lidar.row is None else rows[rows != lidar.row]
 
 
-def _returns(reach: Float32Array, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
+def returns(reach: Float32Array, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
     """Which rays (N,) return, by the distance in metres at which they met something: of the weak ones fewer."""
     near = np.minimum(reach, RANGE)
     lost = _LOST_DARK * np.maximum(1 - _brightness(near, air) / _SURE, 0) + air.lost * (near / RANGE) ** 2

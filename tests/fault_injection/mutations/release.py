@@ -1,5 +1,6 @@
 """Splits, folders, and what a partial release lacks."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,159 +10,153 @@ from fault_injection.kinds import Group
 from fault_injection.place import ENDINGS, Place
 
 GROUP = Group("release")
+PARTIAL = "a partial download: users unpack some sensors only (docs/format.md, Tree)"
 
 
 def _line(place: Place) -> bytes:
     return place.token.replace("/", " ").encode() + b"\n"
 
 
-def _append(place: Place, name: str, line: bytes) -> str:
+def _append(place: Place, name: str, line: bytes) -> None:
     path = place.root / name
     place.write(path, path.read_bytes() + line)
-    return f"{name}: {line.decode().strip()}"
 
 
-def _drop(place: Place, name: str, line: bytes | None = None) -> None:
-    path = place.root / name
-    place.write(path, path.read_bytes().replace(line or _line(place), b""))
-
-
-def _twin(line: bytes) -> bytes:
-    words = (b"_accident ", b"_normal ")
-    return line.replace(*(words if words[0] in line else words[::-1]))
-
-
-@GROUP.kind()
-def scenario_in_two_splits(place: Place, rng: np.random.Generator) -> str:
-    """A second split file lists the scenario."""
-    return _append(place, str(rng.choice(["val.txt", "test.txt"])), _line(place))
-
-
-@GROUP.kind()
-def twins_in_two_splits(place: Place, rng: np.random.Generator) -> str:
-    """The scenario is listed in another split than its twin."""
-    for name in ("train.txt", "train_mini.txt"):
-        _drop(place, name)
-    return _append(place, str(rng.choice(["val.txt", "test.txt"])), _line(place))
-
-
-@GROUP.kind()
-def split_line_twice(place: Place, rng: np.random.Generator) -> str:
-    """A split file lists the scenario twice."""
-    return _append(place, str(rng.choice(["train.txt", "train_mini.txt"])), _line(place))
-
-
-@GROUP.kind()
-def scenario_in_no_split(place: Place, rng: np.random.Generator) -> str:
-    """No split file lists the scenario."""
-    for name in ("train.txt", "train_mini.txt"):
-        _drop(place, name)
-    return "train.txt lacks it"
-
-
-@GROUP.kind()
-def scenario_in_two_folders(place: Place, rng: np.random.Generator) -> str:
-    """The scenario is in a split folder too (layout B)."""
-    for path in _files(place):
-        place.write(place.root / "val" / path.relative_to(place.root), path.read_bytes())
-    return "copied to val/"
+def _drop(place: Place, *lines: bytes) -> None:
+    """Drop lines from the files of train."""
+    for path in (place.root / "train.txt", place.root / "train_mini.txt"):
+        for line in lines:
+            place.write(path, path.read_bytes().replace(line, b""))
 
 
 def _files(place: Place) -> list[Path]:
-    files = [place.scenario.meta_path]
-    for agent in place.agents:
-        files += [place.file(agent, kind, frame) for kind in ("label", "calib") for frame in place.frames]
-    return files
+    kinds = [(agent, kind) for agent in place.agents for kind in ("label", "calib")]
+    return [place.scenario.meta_path, *(place.file(*each, frame) for each in kinds for frame in place.frames)]
 
 
-@GROUP.kind()
-def type_folder_unpacked_beside(place: Place, rng: np.random.Generator) -> str:
-    """An agent's files are in a folder beside the scenario type's, as a second download is unpacked."""
-    name = place.scenario.scenario_type + str(rng.choice(["-001", " (1)", " 2", "-20240101T000000Z-001"]))
+def _list_with_its_twin_elsewhere(place: Place, rng: np.random.Generator) -> None:
+    _drop(place, _line(place))
+    _append(place, str(rng.choice(["val.txt", "test.txt"])), _line(place))
+
+
+def _copy_to_val(place: Place, rng: np.random.Generator) -> None:
+    for path in _files(place):
+        place.write(place.root / "val" / path.relative_to(place.root), path.read_bytes())
+
+
+def _unpack_beside(place: Place, rng: np.random.Generator) -> None:
+    kind = place.scenario.scenario_type
+    name = kind + str(rng.choice(["-001", " (1)", " 2", "-20240101T000000Z-001"]))
     agent = place.any_agent(rng)
     for path in _files(place):
         if agent in path.parts:
-            below = path.relative_to(place.root / place.scenario.scenario_type)
-            place.write(place.root / name / below, path.read_bytes())
+            place.write(place.root / name / path.relative_to(place.root / kind), path.read_bytes())
             place.remove(path)
-    return f"{name}: {agent}"
 
 
-@GROUP.kind()
-def split_line_of_one_word(place: Place, rng: np.random.Generator) -> str:
-    """A split file has a line with a single word."""
-    return _append(place, str(rng.choice(["train.txt", "val.txt"])), place.scenario.name.encode() + b"\n")
-
-
-@GROUP.kind()
-def split_file_garbage(place: Place, rng: np.random.Generator) -> str:
-    """A split file is no text."""
-    place.write(place.root / "val.txt", bytes(range(256)))
-    return "val.txt"
-
-
-@GROUP.kind(harmless="a partial download lacks scenarios that the split files list")
-def split_lists_absent_scenario(place: Place, rng: np.random.Generator) -> str:
-    """A split file lists a scenario that is not there."""
-    return _append(place, "train.txt", b"type1_subtype2_normal Town07_type001_subtype0002_scenario00099\n")
-
-
-@GROUP.kind()
-def agents_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """All folders of two vehicles are exchanged."""
+def _exchange_agents(place: Place, rng: np.random.Generator) -> None:
     one, other = (str(agent) for agent in rng.choice(place.agents[:4], size=2, replace=False))
     for kind in ENDINGS:
-        for frame in place.frames:
-            place.exchange(place.file(one, kind, frame), place.file(other, kind, frame))
-    return f"{one} and {other}"
+        place.exchange_agents((one, other), kind, place.frames)
 
 
-@GROUP.kind(harmless="a partial download: a scenario without one of the agents is valid (docs/format.md, Tree)")
-def agent_removed(place: Place, rng: np.random.Generator) -> str:
-    """All files of an agent are absent."""
-    agent = place.any_agent(rng)
-    for kind in ENDINGS:
-        place.remove_folder(place.folder(agent, kind))
-    return agent
-
-
-@GROUP.kind(harmless="a partial download: users unpack some sensors only (docs/format.md, Tree)")
-def sensor_removed(place: Place, rng: np.random.Generator) -> str:
-    """All files of one sensor are absent in all agents."""
-    channel = str(rng.choice(CHANNELS))
-    for agent in place.agents:
-        place.remove_folder(place.folder(agent, channel))
-    return channel
-
-
-@GROUP.kind(harmless="a partial download: users unpack some sensors only (docs/format.md, Tree)")
-def all_sensors_removed(place: Place, rng: np.random.Generator) -> str:
-    """All sensors of all agents are absent; only labels and calib are there."""
-    for agent in place.agents:
-        for channel in CHANNELS:
-            place.remove_folder(place.folder(agent, channel))
-    return "labels and calib stay"
-
-
-@GROUP.kind(harmless="the real test split has no labels, no BEV arrays and sometimes no meta (docs/format.md, Tree)")
-def test_labels_removed(place: Place, rng: np.random.Generator) -> str:
-    """The scenario is of the test split, as its twin is, and has no labels, no BEV arrays and no meta."""
-    line = _line(place)
-    for name in ("train.txt", "train_mini.txt"):
-        _drop(place, name)
-        _drop(place, name, _twin(line))
-    _append(place, "test.txt", line + _twin(line))
-    for agent in place.agents:
-        for kind in ("label", BEV_CAMERA):
+def _remove_folders(place: Place, agents: Sequence[str], kinds: Sequence[str]) -> None:
+    for agent in agents:
+        for kind in kinds:
             place.remove_folder(place.folder(agent, kind))
+
+
+def _to_the_test_split(place: Place, rng: np.random.Generator) -> None:
+    line, words = _line(place), (b"_accident ", b"_normal ")
+    twin = line.replace(*(words if words[0] in line else words[::-1]))
+    _drop(place, line, twin)
+    _append(place, "test.txt", line + twin)
+    _remove_folders(place, place.agents, ("label", BEV_CAMERA))
     place.remove(place.scenario.meta_path)
-    return "moved to test.txt"
 
 
-@GROUP.kind(harmless="split files can be in their own folder (docs/format.md, Tree)")
-def split_files_moved(place: Place, rng: np.random.Generator) -> str:
-    """The split files are under split_txt_files/."""
+def _move_split_files(place: Place, rng: np.random.Generator) -> None:
     for path in sorted(place.root.glob("*.txt")):
         place.write(place.root / "split_txt_files" / path.name, path.read_bytes())
         place.remove(path)
-    return "split_txt_files/"
+
+
+GROUP.add(
+    {
+        "scenario_in_two_splits": (
+            "A second split file lists the scenario.",
+            lambda place, rng: _append(place, str(rng.choice(["val.txt", "test.txt"])), _line(place)),
+        ),
+        "twins_in_two_splits": (
+            "The scenario is listed in another split than its twin.",
+            _list_with_its_twin_elsewhere,
+        ),
+        "split_line_twice": (
+            "A split file lists the scenario twice.",
+            lambda place, rng: _append(place, str(rng.choice(["train.txt", "train_mini.txt"])), _line(place)),
+        ),
+        "scenario_in_no_split": ("No split file lists the scenario.", lambda place, _: _drop(place, _line(place))),
+        "scenario_in_two_folders": ("The scenario is in a split folder too (layout B).", _copy_to_val),
+        "type_folder_unpacked_beside": (
+            "An agent's files are in a folder beside the scenario type's, as a second download is unpacked.",
+            _unpack_beside,
+        ),
+        "split_line_of_one_word": (
+            "A split file has a line with a single word.",
+            lambda place, rng: _append(
+                place, str(rng.choice(["train.txt", "val.txt"])), place.scenario.name.encode() + b"\n"
+            ),
+        ),
+        "split_file_garbage": (
+            "A split file is no text.",
+            lambda place, _: place.write(place.root / "val.txt", bytes(range(256))),
+        ),
+    },
+)
+GROUP.add(
+    {
+        "split_lists_absent_scenario": (
+            "A split file lists a scenario that is not there.",
+            lambda place, _: _append(
+                place, "train.txt", b"type1_subtype2_normal Town07_type001_subtype0002_scenario00099\n"
+            ),
+        ),
+    },
+    harmless="a partial download lacks scenarios that the split files list",
+)
+GROUP.add({"agents_exchanged": ("All folders of two vehicles are exchanged.", _exchange_agents)})
+GROUP.add(
+    {
+        "agent_removed": (
+            "All files of an agent are absent.",
+            lambda place, rng: _remove_folders(place, [place.any_agent(rng)], list(ENDINGS)),
+        ),
+    },
+    harmless="a partial download: a scenario without one of the agents is valid (docs/format.md, Tree)",
+)
+GROUP.add(
+    {
+        "sensor_removed": (
+            "All files of one sensor are absent in all agents.",
+            lambda place, rng: _remove_folders(place, place.agents, [str(rng.choice(CHANNELS))]),
+        ),
+        "all_sensors_removed": (
+            "All sensors of all agents are absent; only labels and calib are there.",
+            lambda place, _: _remove_folders(place, place.agents, CHANNELS),
+        ),
+    },
+    harmless=PARTIAL,
+)
+GROUP.add(
+    {
+        "test_labels_removed": (
+            "The scenario is of the test split, as its twin is, and has no labels, no BEV arrays and no meta.",
+            _to_the_test_split,
+        ),
+    },
+    harmless="the real test split has no labels, no BEV arrays and sometimes no meta (docs/format.md, Tree)",
+)
+GROUP.add(
+    {"split_files_moved": ("The split files are under split_txt_files/.", _move_split_files)},
+    harmless="split files can be in their own folder (docs/format.md, Tree)",
+)

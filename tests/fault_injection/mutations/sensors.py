@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR
-from fault_injection.kinds import Apply, Group, cut, garbage
+from fault_injection.kinds import Apply, Group, Matrix, cut, emptied, garbage, in_file
 from fault_injection.place import Place
 
 IMAGES = Group("images", deep=True)
@@ -22,40 +22,25 @@ def _camera(rng: np.random.Generator) -> str:
     return str(rng.choice(CAMERAS))
 
 
-def _in_file(channel: str | None, change: Callable[[bytes, np.random.Generator], bytes]) -> Apply:
-    """Change the bytes of a file; channel None stands for any camera."""
-
-    def apply(place: Place, rng: np.random.Generator) -> str:
-        name = channel or _camera(rng)
-        agent, frame = place.any_agent(rng), place.any_frame(rng)
-        path = place.file(agent, name, frame)
-        place.write(path, change(path.read_bytes(), rng))
-        return f"{agent} {name} {frame}: {path.stat().st_size} bytes"
-
-    return apply
-
-
-def _in_image(change: Callable[[np.ndarray], np.ndarray]) -> Apply:
+def _in_image(change: Matrix) -> Apply:
     """Change the pixels of an image of any camera."""
-    return _in_file(None, lambda content, _: _jpeg(change(_pixels(content))))
+    return in_file("Camera", lambda content, _: _jpeg(change(_pixels(content))))
 
 
 def _in_array(channel: str, change: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Apply:
     """Change the array of a point cloud or BEV file."""
 
-    def apply(place: Place, rng: np.random.Generator) -> str:
+    def apply(place: Place, rng: np.random.Generator) -> None:
         agent, frame = place.any_agent(rng), place.any_frame(rng)
         place.write_array(agent, channel, frame, change(place.array(agent, channel, frame), rng))
-        return f"{agent} {channel} {frame}"
 
     return apply
 
 
-def _of_agent(place: Place, rng: np.random.Generator, channel: str) -> str:
+def _of_agent(place: Place, rng: np.random.Generator, channel: str) -> None:
     """Replace an agent's file by another agent's of the same frame."""
     (agent, other), frame = place.two_agents(rng), place.any_frame(rng)
-    place.write(place.file(agent, channel, frame), place.file(other, channel, frame).read_bytes())
-    return f"{agent} {channel} {frame}: {other}'s"
+    place.take(agent, channel, frame, other, frame)
 
 
 def _two_frames(place: Place, rng: np.random.Generator) -> tuple[int, int]:
@@ -65,24 +50,19 @@ def _two_frames(place: Place, rng: np.random.Generator) -> tuple[int, int]:
             return one, other
 
 
-def _of_frame(place: Place, rng: np.random.Generator, channel: str) -> str:
+def _of_frame(place: Place, rng: np.random.Generator, channel: str) -> None:
     """Replace a moving agent's file by its own of another frame."""
     agent, (frame, other) = place.moving_agent(rng), _two_frames(place, rng)
-    place.write(place.file(agent, channel, frame), place.file(agent, channel, other).read_bytes())
-    return f"{agent} {channel} {frame}: {other}'s"
+    place.take(agent, channel, frame, agent, other)
 
 
-def _exchange_frames(place: Place, rng: np.random.Generator, channel: str) -> str:
-    agent, (frame, other) = place.moving_agent(rng), _two_frames(place, rng)
-    place.exchange(place.file(agent, channel, frame), place.file(agent, channel, other))
-    return f"{agent} {channel}: {frame} and {other}"
+def _exchange_frames(place: Place, rng: np.random.Generator, channel: str) -> None:
+    agent, frames = place.moving_agent(rng), _two_frames(place, rng)
+    place.exchange(*(place.file(agent, channel, frame) for frame in frames))
 
 
-def _exchange_agents(place: Place, rng: np.random.Generator, channel: str) -> str:
-    one, other = place.two_agents(rng)
-    for frame in place.frames:
-        place.exchange(place.file(one, channel, frame), place.file(other, channel, frame))
-    return f"{channel} of {one} and {other}"
+def _exchange_agents(place: Place, rng: np.random.Generator, channel: str) -> None:
+    place.exchange_agents(place.two_agents(rng), channel, place.frames)
 
 
 def _jpeg(image: np.ndarray) -> bytes:
@@ -113,19 +93,19 @@ def _zeros(content: bytes, rng: np.random.Generator) -> bytes:
 
 IMAGES.add(
     {
-        "image_cut": ("An image file ends at a random byte.", _in_file(None, cut)),
+        "image_cut": ("An image file ends at a random byte.", in_file("Camera", cut)),
         "image_ends_early": (
             "A part of an image's coded data before its end marker is gone; decoders do not report this.",
-            _in_file(None, _ends_early),
+            in_file("Camera", _ends_early),
         ),
-        "image_emptied": ("An image file is empty.", _in_file(None, lambda *_: b"")),
+        "image_emptied": ("An image file is empty.", in_file("Camera", emptied)),
         "image_zeros": (
             "A part of an image's coded data is zero bytes; decoders do not report this.",
-            _in_file(None, _zeros),
+            in_file("Camera", _zeros),
         ),
         "image_garbage": (
             "An image file holds random bytes.",
-            _in_file(None, lambda content, rng: garbage(rng, len(content))),
+            in_file("Camera", garbage),
         ),
         "image_size": ("An image has half the size of the others.", _in_image(lambda pixels: pixels[::2, ::2])),
     },
@@ -136,17 +116,31 @@ IMAGES.add(
 )
 
 
-@IMAGES.kind()
-def image_of_camera(place: Place, rng: np.random.Generator) -> str:
-    """An image is another camera's of the same agent and frame."""
+def _of_camera(place: Place, rng: np.random.Generator) -> None:
     agent, frame = place.any_agent(rng), place.any_frame(rng)
-    one, other = (str(camera) for camera in rng.choice(CAMERAS, size=2, replace=False))
-    place.write(place.file(agent, one, frame), place.file(agent, other, frame).read_bytes())
-    return f"{agent} {frame}: {one} is {other}"
+    one, other = (place.file(agent, str(camera), frame) for camera in rng.choice(CAMERAS, size=2, replace=False))
+    place.write(one, other.read_bytes())
+
+
+def _of_twin(place: Place, rng: np.random.Generator) -> None:
+    twins = {"accident": "normal", "normal": "accident"}
+    of_type = place.scenario.scenario_type
+    kind = of_type.rsplit("_", 1)[1]
+    (agent, other), (frame, other_frame), camera = place.two_agents(rng), _two_frames(place, rng), _camera(rng)
+    path = place.file(other, camera, other_frame).relative_to(place.root / of_type)
+    twin = place.root / of_type.replace(kind, twins[kind]) / path
+    place.write(place.file(agent, camera, frame), twin.read_bytes())
+
+
+def _exchange_cameras(place: Place, rng: np.random.Generator) -> None:
+    agent, cameras = place.any_agent(rng), rng.choice(CAMERAS, size=2, replace=False)
+    for frame in place.frames:
+        place.exchange(*(place.file(agent, str(camera), frame) for camera in cameras))
 
 
 IMAGES.add(
     {
+        "image_of_camera": ("An image is another camera's of the same agent and frame.", _of_camera),
         "image_of_agent": (
             "An image is another agent's of the same camera and frame.",
             lambda place, rng: _of_agent(place, rng, _camera(rng)),
@@ -157,42 +151,20 @@ IMAGES.add(
         ),
     },
 )
-
-
-@IMAGES.kind(beyond=_LOOK)
-def image_of_twin(place: Place, rng: np.random.Generator) -> str:
-    """An image is replaced by one of another agent and frame from the scenario's twin."""
-    twins = {"accident": "normal", "normal": "accident"}
-    kind = place.scenario.scenario_type.rsplit("_", 1)[1]
-    (agent, other), (frame, other_frame), camera = place.two_agents(rng), _two_frames(place, rng), _camera(rng)
-    path = place.file(other, camera, other_frame)
-    twin = (
-        place.root
-        / place.scenario.scenario_type.replace(kind, twins[kind])
-        / path.relative_to(place.root / place.scenario.scenario_type)
-    )
-    place.write(place.file(agent, camera, frame), twin.read_bytes())
-    return f"{agent} {camera} {frame}: {other}'s {other_frame} of the twin"
-
-
-@IMAGES.kind(beyond=_LOOK)
-def images_of_two_frames_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """Two images of a moving camera are exchanged."""
-    return _exchange_frames(place, rng, _camera(rng))
-
-
-@IMAGES.kind(beyond=_LOOK)
-def images_of_two_cameras_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """All images of two cameras of an agent are exchanged."""
-    agent = place.any_agent(rng)
-    one, other = (str(camera) for camera in rng.choice(CAMERAS, size=2, replace=False))
-    for frame in place.frames:
-        place.exchange(place.file(agent, one, frame), place.file(agent, other, frame))
-    return f"{agent}: {one} and {other}"
-
-
 IMAGES.add(
     {
+        "image_of_twin": (
+            "An image is replaced by one of another agent and frame from the scenario's twin.",
+            _of_twin,
+        ),
+        "images_of_two_frames_exchanged": (
+            "Two images of a moving camera are exchanged.",
+            lambda place, rng: _exchange_frames(place, rng, _camera(rng)),
+        ),
+        "images_of_two_cameras_exchanged": (
+            "All images of two cameras of an agent are exchanged.",
+            _exchange_cameras,
+        ),
         "images_of_two_agents_exchanged": (
             "All images of one camera of two agents are exchanged.",
             lambda place, rng: _exchange_agents(place, rng, _camera(rng)),
@@ -216,15 +188,15 @@ def _with_nan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 LIDARS.add(
     {
-        "lidar_cut": ("A point cloud's file ends at a random byte.", _in_file(LIDAR, cut)),
+        "lidar_cut": ("A point cloud's file ends at a random byte.", in_file(LIDAR, cut)),
         "lidar_with_more_bytes": (
             "Bytes follow the end of a point cloud's file.",
-            _in_file(LIDAR, lambda content, rng: content + garbage(rng, 100)),
+            in_file(LIDAR, lambda content, rng: content + garbage(bytes(100), rng)),
         ),
-        "lidar_emptied": ("A point cloud's file is empty.", _in_file(LIDAR, lambda *_: b"")),
+        "lidar_emptied": ("A point cloud's file is empty.", in_file(LIDAR, emptied)),
         "lidar_bit_flipped": (
             "A byte in the middle of a point cloud's file is wrong.",
-            _in_file(LIDAR, _bit_flipped),
+            in_file(LIDAR, _bit_flipped),
         ),
         "lidar_wrong_shape": (
             "A point cloud lacks the intensity.",
@@ -272,16 +244,15 @@ LIDARS.add(
 )
 
 
-def _all_flipped(place: Place, rng: np.random.Generator) -> str:
+def _all_flipped(place: Place, rng: np.random.Generator) -> None:
     agent = place.any_agent(rng)
     for frame in place.frames:
         place.write_array(agent, BEV_CAMERA, frame, place.array(agent, BEV_CAMERA, frame)[:, ::-1])
-    return agent
 
 
 BEVS.add(
     {
-        "bev_cut": ("A BEV file ends at a random byte.", _in_file(BEV_CAMERA, cut)),
+        "bev_cut": ("A BEV file ends at a random byte.", in_file(BEV_CAMERA, cut)),
         "bev_wrong_shape": ("A BEV array has half the rows.", _in_array(BEV_CAMERA, lambda picture, _: picture[::2])),
         "bev_channels_reversed": (
             "A BEV array's channels are in the reverse order.",

@@ -2,11 +2,12 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.splits import split_records
 from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.plan import _mini, plan_scenarios, plan_splits
+from deepaccident_devkit.synth.plan import plan_scenarios, plan_splits
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.taxonomy import TOWNS
 
@@ -28,21 +29,16 @@ def test_accidents_and_twins_by_turns_go_round_the_designs():
 
 def test_names_are_the_release_s_and_unique():
     plans = plans_of(scenarios=60)
-    assert len({plan.token for plan in plans}) == 60
-    assert len({plan.name for plan in plans}) == 30
+    assert (len({plan.token for plan in plans}), len({plan.name for plan in plans})) == (60, 30)
     towns = {plan.name.split("_")[0] for plan in plans}
-    assert towns <= set(TOWNS)
-    assert len(towns) > 4
-    number = 1 + plans[6].pair
-    assert plans[6].name.endswith(f"_type001_subtype{plans[6].traits.subtype:04d}_scenario{number:05d}")
+    assert (towns <= set(TOWNS), len(towns) > 4) == (True, True)
+    number = f"{plans[6].traits.subtype:04d}_scenario{1 + plans[6].pair:05d}"
+    assert plans[6].name.endswith(f"_type001_subtype{number}")
 
 
-def test_seeds_differ_and_repeat():
+def test_seeds_differ_and_repeat_and_more_scenarios_leave_the_first_as_they_are_but_for_splits():
     assert plans_of(seed=1) == plans_of(seed=1)
     assert [plan.name for plan in plans_of(seed=1)] != [plan.name for plan in plans_of(seed=2)]
-
-
-def test_more_scenarios_leave_the_first_as_they_are_but_for_splits():
     few, many = plans_of(scenarios=4), plans_of(scenarios=40)
     assert [plan.token for plan in few] == [plan.token for plan in many[:4]]
 
@@ -70,9 +66,13 @@ def test_a_view_that_is_asked_for_holds_for_every_draw():
 
 
 def test_a_house_hides_the_view_in_some_draws_where_none_is_asked_for():
-    views = Counter(plan.draw(np.random.default_rng(7)).view for plan in plans_of(scenarios=20, designs=(1, 2)))
-    assert views["open"] > 0
-    assert views["hidden"] > 0
+    plans = plans_of(scenarios=20, designs=(1, 2))
+    assert {plan.draw(np.random.default_rng(7)).view for plan in plans} == {"open", "hidden"}
+
+
+@pytest.mark.parametrize("scenarios", [22, 24, 25, 40])
+def test_no_split_is_empty_from_six_scenarios_on(scenarios):
+    assert {plan.split for plan in plans_of(scenarios=scenarios)} == {"train", "val", "test"}
 
 
 def test_the_first_three_pairs_of_a_small_release_fill_the_splits():
@@ -88,37 +88,19 @@ def test_a_large_release_is_split_by_the_official_procedure():
     plans = plans_of(scenarios=691)
     assert Counter(plan.split for plan in plans) == {"train": 483, "val": 104, "test": 104}, "the real release's counts"
     splits = plan_splits(plans)
-    assert set(splits.val) == {plan.token for plan in plans if plan.split == "val"}
-    assert set(splits.val_mini) < set(splits.val)
-    of_pair = {}
-    for plan in plans:
-        of_pair.setdefault(plan.pair, set()).add(plan.split)
-    assert all(len(names) == 1 for names in of_pair.values())
+    assert set(splits.val_mini) < set(splits.val) == {plan.token for plan in plans if plan.split == "val"}
+    assert len({(plan.pair, plan.split) for plan in plans}) == len({plan.pair for plan in plans})
 
 
 @pytest.mark.parametrize("scenarios", [*range(1, 50), 60, 120, 240, 691])
 def test_minis_are_whole_pairs_a_fifth_at_most_and_never_empty(scenarios):
     plans = plans_of(scenarios=scenarios)
-    splits = plan_splits(plans)
-    pair_of = {plan.token: plan.pair for plan in plans}
+    splits, pair_of = plan_splits(plans), {plan.token: plan.pair for plan in plans}
     for whole, mini in ((splits.train, splits.train_mini), (splits.val, splits.val_mini)):
-        assert set(mini) <= set(whole)
         pairs = {pair_of[token] for token in mini}
         assert set(mini) == {token for token in whole if pair_of[token] in pairs}
         assert len(pairs) == 1 or 5 * len(mini) <= len(whole)
         assert bool(mini) == bool(whole)
-
-
-def test_a_lone_accident_is_the_smallest_unit():
-    """Of a pair and a lone accident in train."""
-    plans = plans_of(scenarios=3)
-    tokens = [plan.token for plan in plans]
-    assert _mini(plans, tokens, tokens) == (tokens[2],)
-
-
-@pytest.mark.parametrize("scenarios", [22, 24, 25, 40])
-def test_no_split_is_empty_from_six_scenarios_on(scenarios):
-    assert {plan.split for plan in plans_of(scenarios=scenarios)} == {"train", "val", "test"}
 
 
 def test_unplanned_accidents_come_at_their_rate():
@@ -130,12 +112,9 @@ def test_unplanned_accidents_come_at_their_rate():
 
 def test_a_hidden_view_has_designs_that_a_house_can_hide_and_faster_cars():
     plans = plans_of(scenarios=6, view="hidden")
-    assert [plan.design for plan in plans[::2]] == [1, 7, 1]
     spec = plans[0].draw(np.random.default_rng(0))
-    assert spec.view == "hidden"
+    assert ([plan.design for plan in plans[::2]], spec.view) == ([1, 7, 1], "hidden")
     assert all(12 <= spec.actor(role).max_speed <= 14 for role in ("ego", "other"))
-    with pytest.raises(ConfigError, match=r"^view: hidden needs .* in 'unprotected left turn' it is on the side 'o"):
-        plans_of(view="hidden", designs=(3,))
 
 
 OWN = """\
@@ -147,35 +126,44 @@ actors:
 """
 
 
-def test_a_file_that_cannot_have_the_hidden_view_is_named_with_its_line(tmp_path):
-    path = tmp_path / "own.yaml"
-    path.write_text(OWN.replace("view: hidden\n", "").replace("from: south, turn: [left, right]", "from: east"))
-    with pytest.raises(
-        ConfigError, match=r"own.yaml:2: actors: view: hidden needs .*; choose other arms, or the view open"
-    ):
-        plans_of(spec=path, view="hidden")
+@pytest.fixture
+def own(tmp_path):
+    """Writes a scenario file."""
+
+    def write(text):
+        (tmp_path / "own.yaml").write_text(text)
+        return tmp_path / "own.yaml"
+
+    return write
 
 
-def test_an_own_file_takes_the_designs_place(tmp_path):
-    path = tmp_path / "own.yaml"
-    path.write_text(OWN + "meet: {actors: [ego, ego]}\n")
-    with pytest.raises(ConfigError, match="ego cannot meet itself"):
-        plans_of(spec=path)
-    path.write_text(OWN.replace("turn: right}", "turn: straight}", 1) + "meet: {}\n")
+def test_what_cannot_be_planned_is_refused(own):
+    opposite = OWN.replace("view: hidden\n", "").replace("from: south, turn: [left, right]", "from: east")
+    itself = OWN + "meet: {actors: [ego, ego]}\n"
+    needs = ("view: hidden needs ", "in 'unprotected left turn' it is on the side 'o")
+    assert_refused(
+        (lambda: plans_of(view="hidden", designs=(3,)), ConfigError, needs),
+        (
+            lambda: plans_of(spec=own(opposite), view="hidden"),
+            ConfigError,
+            ("own.yaml:2: actors: view: hidden needs ", "choose other arms, or the view open"),
+        ),
+        (lambda: plans_of(spec=own(itself)), ConfigError, ("ego cannot meet itself",)),
+    )
+
+
+def test_an_own_file_takes_the_designs_place(own):
+    path = own(OWN.replace("turn: right}", "turn: straight}", 1) + "meet: {}\n")
     plans = plans_of(spec=path, scenarios=40, unplanned=1.0)
-    assert {plan.design for plan in plans} == {None}
+    assert {(plan.design, plan.unplanned) for plan in plans} == {(None, False)}
     assert {plan.traits.subtype for plan in plans} == {1, 2}
-    assert not any(plan.unplanned for plan in plans)
     for plan in plans:
         spec = plan.draw(np.random.default_rng(plan.pair))
-        assert spec.road.signalized == (plan.traits.subtype == 1)
-        assert spec.view == "hidden"
+        assert (spec.road.signalized, spec.view) == (plan.traits.subtype == 1, "hidden")
 
 
-def test_a_file_in_which_nobody_meets_gives_normal_scenarios(tmp_path):
-    path = tmp_path / "own.yaml"
-    path.write_text(OWN)
-    plans = plans_of(spec=path, scenarios=5)
+def test_a_file_in_which_nobody_meets_gives_normal_scenarios(own):
+    plans = plans_of(spec=own(OWN), scenarios=5)
     assert [(plan.pair, plan.accident) for plan in plans] == [(k, False) for k in range(5)]
     assert len({plan.token for plan in plans}) == 5
 
@@ -185,23 +173,21 @@ def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built():
     config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3)
     plans = plan_scenarios(config)
     assert {plan.unplanned for plan in plans} == {True, False}
-    records = []
-    for plan in plans:
+
+    def record(plan):
         meta = build_scenario(config, plan).meta if plan.accident else None
-        collision = None if meta is None or meta.collision is None else {"agents": meta.collision.agents}
-        records.append(
-            {
-                "token": plan.token,
-                "name": plan.name,
-                "scenario_type": plan.scenario_type,
-                "designed_accident": plan.accident,
-                "weather": "Clear",
-                "collision": collision,
-                "road_type": meta and meta.road_type,
-                "spawn_side": meta and meta.spawn_side,
-            }
-        )
-    official, made = split_records(records), plan_splits(plans)
+        return {
+            "token": plan.token,
+            "name": plan.name,
+            "scenario_type": plan.scenario_type,
+            "weather": "Clear",
+            "designed_accident": plan.accident,
+            "collision": meta and meta.collision and {"agents": meta.collision.agents},
+            "road_type": meta and meta.road_type,
+            "spawn_side": meta and meta.spawn_side,
+        }
+
+    official, made = split_records([record(plan) for plan in plans]), plan_splits(plans)
     assert (made.train, made.val, made.test) == (official.train, official.val, official.test)
     assert set(official.train_mini) >= set(made.train_mini)
     assert (len(official.val_mini), len(made.val_mini)) == (0, 2), "the procedure leaves a small mini split empty"

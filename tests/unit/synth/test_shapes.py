@@ -27,13 +27,11 @@ def test_shapes_fill_their_boxes_and_keep_within(shape):
         size = np.array(MEDIAN_SIZES[category]) * factor
         corners = shape_of(category, tuple(size.tolist()), (0, 0, 0), (0, 0, 0), model).corners.reshape(-1, 3)
         half = size[:2] / 2 - INSET + 1e-9
-        assert (np.abs(corners[:, :2]) <= half).all()
-        assert corners[:, 2].min() >= BOX_CLEARANCE
-        assert corners[:, 2].max() <= BOX_CLEARANCE + size[2] - INSET + 1e-9
-        assert corners[:, 2].max() > 0.98 * size[2]
-        assert np.abs(corners[:, 0]).max() > (0.35 if category == "pedestrian" else 0.49) * size[0]
-        assert np.abs(corners[:, 1]).max() > 0.4 * size[1]
-        assert corners[:, 2].min() < 0.05
+        (x, y), (low, high) = np.abs(corners[:, :2]).max(axis=0), (corners[:, 2].min(), corners[:, 2].max())
+        assert (0.35 if category == "pedestrian" else 0.49) * size[0] < x <= half[0]
+        assert 0.4 * size[1] < y <= half[1]
+        assert BOX_CLEARANCE <= low < 0.05
+        assert 0.98 * size[2] < high <= BOX_CLEARANCE + size[2] - INSET + 1e-9
 
 
 def test_solids_are_convex_and_turned_outwards(shape):

@@ -51,22 +51,20 @@ def test_nothing_else_was_imported():
 """
 
 
-@pytest.mark.slow
-def test_a_foreign_project_has_the_fixtures_in_both_layouts(foreign) -> None:
-    (foreign.folder / "test_mine.py").write_text(FOREIGN)
-    ran = foreign.pytest()
-    assert "12 passed" in ran.stdout, ran.stdout + ran.stderr
+OFF = "def test_release(deepaccident_release): pass\n"
 
 
 @pytest.mark.slow
-def test_it_imports_nothing_until_a_fixture_is_asked_for(foreign) -> None:
-    (foreign.folder / "test_mine.py").write_text(LIGHT)
-    ran = foreign.pytest()
-    assert "1 passed" in ran.stdout, ran.stdout + ran.stderr
-
-
-@pytest.mark.slow
-def test_it_can_be_turned_off(foreign) -> None:
-    (foreign.folder / "test_mine.py").write_text("def test_release(deepaccident_release): pass\n")
-    ran = foreign.pytest("-p", "no:deepaccident")
-    assert "fixture 'deepaccident_release' not found" in ran.stdout, ran.stdout + ran.stderr
+@pytest.mark.parametrize(
+    ("code", "options", "told"),
+    [
+        (FOREIGN, (), "12 passed"),  # in both layouts
+        (LIGHT, (), "1 passed"),
+        (OFF, ("-p", "no:deepaccident"), "fixture 'deepaccident_release' not found"),
+    ],
+    ids=["fixtures", "imports nothing until a fixture is asked for", "turned off"],
+)
+def test_in_a_foreign_project(foreign, code: str, options: tuple[str, ...], told: str) -> None:
+    (foreign.folder / "test_mine.py").write_text(code)
+    ran = foreign.pytest(*options)
+    assert told in ran.stdout, ran.stdout + ran.stderr

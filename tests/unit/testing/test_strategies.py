@@ -36,9 +36,9 @@ def test_a_label_is_read_with_all_its_boxes_and_nothing_else(scratch: Path, text
     np.testing.assert_array_equal(labels.velocity[0], labels.agent_velocity[0])
 
 
-def test_labels_with_windows_lines_and_with_short_ones_are_drawn() -> None:
-    assert "\r\n" in find(label_texts(), lambda text: "\r\n" in text, settings=UNSHRUNK)
-    assert "\ncar\n" in find(label_texts(), lambda text: "\ncar\n" in text, settings=UNSHRUNK)
+@pytest.mark.parametrize("drawn", ["\r\n", "\ncar\n"])
+def test_labels_with_windows_lines_and_with_short_ones_are_drawn(drawn: str) -> None:
+    assert drawn in find(label_texts(), lambda text: drawn in text, settings=UNSHRUNK)
 
 
 @given(small_releases())
@@ -52,9 +52,9 @@ def test_a_small_release_can_be_written_and_opened(
     assert {scenario["num_frames"] for scenario in da.scenario} == {config.frames}
 
 
-def test_partial_releases_are_drawn() -> None:
-    for lacks in (lambda config: config.agents != AGENTS, lambda config: "val" not in config.splits):
-        assert lacks(find(small_releases(), lacks, settings=UNSHRUNK))
+@pytest.mark.parametrize("lacks", [lambda config: config.agents != AGENTS, lambda config: "val" not in config.splits])
+def test_partial_releases_are_drawn(lacks) -> None:
+    assert lacks(find(small_releases(), lacks, settings=UNSHRUNK))
 
 
 def test_without_hypothesis_they_say_what_to_install() -> None:

@@ -2,12 +2,14 @@
 
 import os
 import shutil
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
+from refusals import assert_refused
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError
@@ -81,51 +83,48 @@ def test_what_is_done_is_not_done_again(root: Path, tmp_path: Path, looked: list
     assert len(looked) == 9
 
 
-@pytest.mark.parametrize("change", ["deep", "version", "limits", "label", "image", "image gone", "another place"])
+CHANGES: dict[str, Callable[[Path, pytest.MonkeyPatch], object]] = {
+    "deep": lambda *_: None,
+    "version": lambda _, patch: patch.setattr(module, "__version__", "0.0"),
+    "limits": lambda _, patch: patch.setenv("DEEPACCIDENT_LIMITS", "label=1"),
+    "label": lambda root, _: os.utime(min(root.glob("**/label/*/*")), ns=(1, 1)),
+    "image": lambda root, _: os.utime(min(root.glob("**/Camera_Front/*/*")), ns=(1, 1)),
+    "image gone": lambda root, _: min(root.glob("**/Camera_Front/*/*")).unlink(),
+    "another place": lambda root, _: root.rename(root.with_name("moved")),
+}
+"""Files are changed in place, to the same size: only their own times tell."""
+
+
+@pytest.mark.parametrize("change", CHANGES)
 def test_what_was_found_in_other_files_or_ways_is_not_taken(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looked: list[str], change: str
 ) -> None:
-    """Files are changed in place, to the same size: only their own times tell."""
     parts = tmp_path / "parts"
     validate_release(small, workers=1, parts=parts)
     del looked[:]
-    (image, *_), (label, *_) = (sorted(small.glob(pattern)) for pattern in ("**/Camera_Front/*/*", "**/label/*/*"))
-    if change == "version":
-        monkeypatch.setattr(module, "__version__", "0.0")
-    elif change == "limits":
-        monkeypatch.setenv("DEEPACCIDENT_LIMITS", "label=1")
-    elif change in ("label", "image"):
-        path = label if change == "label" else image
-        os.utime(path, ns=(1, 1))
-    elif change == "image gone":
-        image.unlink()
-    elif change == "another place":
-        small = small.rename(tmp_path / "moved")
-    validate_release(small, workers=1, parts=parts, deep=change == "deep")
+    root = CHANGES[change](small, monkeypatch)
+    validate_release(root if change == "another place" else small, workers=1, parts=parts, deep=change == "deep")
     assert looked
 
 
 def test_a_check_survives_its_file(root: Path, small: Path) -> None:
-    (image, *_) = sorted(small.glob("**/Camera_Front/*/*"))
+    image = min(small.glob("**/Camera_Front/*/*"))
     image.rename(image.with_name("half \udcff.jpg"))
     for scenario in (*find_release(root).scenarios, *find_release(small).scenarios):
         check = check_scenario(scenario, deep=True)
         again = ScenarioCheck.of_json(check.to_json().encode())
-        assert again == check
-        assert list(again.velocity.fits) == list(check.velocity.fits)
+        assert (again, list(again.velocity.fits)) == (check, list(check.velocity.fits))
     assert "\udcff" in check.to_json().encode().decode("unicode_escape")
 
 
 def test_parts_need_a_folder(root: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="file is a file; give a folder"):
-        validate_release(root, parts=tmp_path / "file")
+    told = ("file is a file; give a folder",)
+    assert_refused((lambda: validate_release(root, parts=tmp_path / "file"), ConfigError, told))
 
 
 @pytest.mark.slow
-def test_the_verb_prints_the_same_report(root: Path, tmp_path: Path) -> None:
-    for options in (("--all",), ("--json",), ("--deep",)):
-        whole = run(root, *options)
-        for _ in range(2):
-            again = run(root, *options, "--parts", tmp_path)
-            assert (again.output, again.exit_code) == (whole.output, whole.exit_code)
+@pytest.mark.parametrize("option", ["--all", "--json", "--deep"])
+def test_the_verb_prints_the_same_report(root: Path, tmp_path: Path, option: str) -> None:
+    whole, *again = (run(root, option, *parts) for parts in ((), *[("--parts", tmp_path)] * 2))
+    assert [(each.output, each.exit_code) for each in again] == [(whole.output, whole.exit_code)] * 2

@@ -28,20 +28,23 @@ def test_impossible_junctions_are_refused(fields, sentence):
         RoadSpec(**fields)
 
 
-def test_everything_lies_outward_in_order():
-    for spec in (RoadSpec(), RoadSpec(lanes=2)):
-        assert spec.lanes_edge < spec.road_edge < spec.sidewalk_edge
-        assert spec.road_edge < spec.mouth < spec.crosswalk[1] < spec.stop_line[0] < spec.stop_line[1]
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_everything_lies_outward_in_order(lanes):
+    spec = RoadSpec(lanes=lanes)
+    assert spec.lanes_edge < spec.road_edge < spec.sidewalk_edge
+    assert spec.road_edge < spec.mouth < spec.crosswalk[1] < spec.stop_line[0] < spec.stop_line[1]
 
 
 def test_lane_0_is_the_rightmost():
     assert [RoadSpec(lanes=2).lane_center(lane) for lane in (0, 1)] == [5.25, 1.75]
 
 
-def test_who_has_a_yield_line():
-    assert RoadSpec().yielding_arms == ()
-    assert RoadSpec(signalized=False).yielding_arms == ("south", "north")
-    assert RoadSpec(kind="three-way", signalized=False).yielding_arms == ("south",)
+@pytest.mark.parametrize(
+    ("fields", "arms"),
+    [({}, ()), ({"signalized": False}, ("south", "north")), ({"kind": "three-way", "signalized": False}, ("south",))],
+)
+def test_who_has_a_yield_line(fields, arms):
+    assert RoadSpec(**fields).yielding_arms == arms
 
 
 def corners(places, length, width):
@@ -53,12 +56,11 @@ def corners(places, length, width):
 
 
 def test_a_parked_van_stands_on_its_strip(junction):
-    vans = corners(junction.parking_places(), 5.0, 2.1)
+    vans, spec = corners(junction.parking_places(), 5.0, 2.1), junction.spec
     assert np.isin(junction.ground_map().at(vans.reshape(-1, 2)), ROAD_CODES).all()
     beside = np.abs(vans).min(axis=2)
-    assert (beside > junction.spec.lanes_edge).all()
-    assert (beside < junction.spec.road_edge).all()
-    assert (np.abs(vans).max(axis=2) > junction.spec.stop_line[1] + 5).all()
+    assert spec.lanes_edge < beside.min() < beside.max() < spec.road_edge
+    assert np.abs(vans).max(axis=2).min() > spec.stop_line[1] + 5
 
 
 def test_slots_do_not_overlap_and_face_with_the_traffic():

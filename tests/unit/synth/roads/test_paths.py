@@ -55,11 +55,10 @@ def test_project_undoes_at(s, left):
 
 def test_at_goes_straight_on_beyond_the_ends():
     x, y, yaw, curvature = CIRCLE.at([-2.0, 42.0])
-    ends = CIRCLE.xy[[0, -1]]
-    ahead = np.column_stack([np.cos(CIRCLE.yaw[[0, -1]]), np.sin(CIRCLE.yaw[[0, -1]])]) * [[-2], [2]]
-    np.testing.assert_allclose(np.column_stack([x, y]), ends + ahead, atol=1e-12)
-    np.testing.assert_array_equal(yaw, CIRCLE.yaw[[0, -1]])
-    np.testing.assert_array_equal(curvature, 0)
+    ends, ahead = CIRCLE.xy[[0, -1]], CIRCLE.yaw[[0, -1]]
+    beyond = ends + np.column_stack([np.cos(ahead), np.sin(ahead)]) * [[-2], [2]]
+    np.testing.assert_allclose(np.column_stack([x, y]), beyond, atol=1e-12)
+    np.testing.assert_array_equal([yaw, curvature], [ahead, [0, 0]])
 
 
 def test_reversed_is_the_same_way_back():
@@ -74,10 +73,10 @@ def test_reversed_is_the_same_way_back():
 def test_a_lane_change_shifts_the_rest_and_bends_gently(offset):
     path = lane_change(straight((0.0, 0.0), 0.0, 100.0), 20.0, 35.0, offset)
     assert_consistent(path)
-    before, after = path.xy[path.xy[:, 0] < 20, 1], path.xy[path.xy[:, 0] > 55, 1]
-    np.testing.assert_allclose(before, 0, atol=1e-9)
-    np.testing.assert_allclose(after, offset, atol=1e-9)
-    assert (np.sign(np.diff(path.xy[:, 1]).round(12)) * np.sign(offset) >= 0).all()
+    x, y = path.xy.T
+    np.testing.assert_allclose(y[x < 20], 0, atol=1e-9)
+    np.testing.assert_allclose(y[x > 55], offset, atol=1e-9)
+    assert (np.sign(np.diff(y).round(12)) * np.sign(offset) >= 0).all()
     # of the quintic: 10/√3 · offset / length²
     np.testing.assert_allclose(np.abs(path.curvature).max(), 10 / np.sqrt(3) * 3.5 / 35**2, rtol=0.05)
 
@@ -95,39 +94,34 @@ def test_lines_meet_at_their_common_point():
     np.testing.assert_allclose(crossing(north, east), meeting[::-1], atol=1e-9)
 
 
-def test_paths_that_join_meet_where_they_have_come_near():
-    lane = straight((0.0, 0.0), 0.0, 120.0)
-    joining = lane_change(straight((0.0, 3.5), 0.0, 120.0), 30.0, 40.0, -3.5)
-    meeting = crossing(lane, joining, within=0.5)
-    x, y, _, _ = joining.at(meeting.s_b)
-    assert 30 < x < 70
-    assert 0.4 < y <= 0.5
-    assert abs(meeting.s_a - x) < 0.2
+LANE = straight((0.0, 0.0), 0.0, 120.0)
 
 
-def test_paths_beside_each_other_never_meet():
-    assert crossing(straight((0.0, 0.0), 0.0, 50.0), straight((0.0, 3.5), 0.0, 50.0)) is None
-    assert crossing(straight((0.0, 0.0), 0.0, 50.0), straight((60.0, -9.0), np.pi / 2, 20.0)) is None
+@pytest.mark.parametrize(
+    ("other", "within", "places"),
+    [
+        (lane_change(straight((0.0, 3.5), 0.0, 120.0), 30.0, 40.0, -3.5), 0.5, (30, 70, 0.4, 0.5)),  # it joins
+        (bent((5.0, -1.0), np.pi / 3, [(10.0, -0.25, -0.25)]), None, (5, 6, -0.01, 0.01)),  # the first of two counts
+    ],
+)
+def test_paths_meet_where_they_have_come_near(other, within, places):
+    meeting = crossing(LANE, other, **({} if within is None else {"within": within}))
+    x, y, _, _ = other.at(meeting.s_b)
+    left, right, low, high = places
+    assert (left < x < right, low < y <= high, abs(meeting.s_a - x) < 0.2) == (True, True, True)
 
 
-def test_the_first_of_two_crossings_counts():
-    snake = bent((0.0, -1.0), np.pi / 3, [(10.0, -0.25, -0.25)])
-    meeting = crossing(straight((-5.0, 0.0), 0.0, 40.0), snake)
-    x, y, _, _ = snake.at(meeting.s_b)
-    assert abs(y) < 1e-2
-    assert x < 1
-    assert abs(meeting.s_a - 5 - x) < 1e-2
+@pytest.mark.parametrize("other", [straight((0.0, 3.5), 0.0, 50.0), straight((60.0, -9.0), np.pi / 2, 20.0)])
+def test_paths_beside_each_other_never_meet(other):
+    assert crossing(straight((0.0, 0.0), 0.0, 50.0), other) is None
 
 
 @pytest.mark.parametrize("left", [True, False])
 @pytest.mark.parametrize("tangent", [3.0, 14.0])
 def test_it_ends_on_the_other_line(left, tangent):
-    path = bent((0.0, 0.0), 0.0, quarter_turn(tangent, left=left))
-    sign = 1 if left else -1
-    np.testing.assert_allclose(path.xy[-1], [tangent, sign * tangent], atol=1e-7)
-    np.testing.assert_allclose(path.yaw[-1], sign * np.pi / 2, atol=1e-12)
-    assert path.curvature[0] == 0
-    np.testing.assert_allclose(path.curvature[-1], 0, atol=1e-12)
+    path, sign = bent((0.0, 0.0), 0.0, quarter_turn(tangent, left=left)), 1 if left else -1
+    end = [*path.xy[-1], path.yaw[-1], path.curvature[0], path.curvature[-1]]
+    np.testing.assert_allclose(end, [tangent, sign * tangent, sign * np.pi / 2, 0, 0], atol=1e-7)
 
 
 def test_radius_and_corner_are_those_asked_for():

@@ -51,26 +51,23 @@ def test_nobody_starts_between_the_named_ones_and_the_junction(scene):
 
 def test_crosswalks_are_walked_over_while_their_arm_has_red(scene):
     junction, named, background = scene
-    crossing = [user for user in background if user.walks and user.span[1] > 0]
-    for user in crossing:
+    taken = {arm for each in named for arm in (each.route.from_arm, each.route.to_arm)}
+    for user in (each for each in background if each.walks and each.span[1] > 0):
         x, y, _, _ = user.path.at(user.path.length / 2)
         arm = max(junction.arms, key=lambda each: float(np.dot([x, y], OUTWARD[each])))
-        assert PLAN.state(arm, -7.0 + user.delay) == RED
-        assert all(arm not in (each.route.from_arm, each.route.to_arm) for each in named)
+        assert (PLAN.state(arm, -7.0 + user.delay), arm in taken) == (RED, False)
 
 
 def test_parked_vehicles_stand_on_their_own_slots():
     rng, junction = np.random.default_rng(4), Junction(SPEC.road)
     named = ActorSpec(role="parked", category="van", from_arm="east", side="left", start_distance=40.0)
     vehicles = parked_vehicles(rng, replace(SPEC, actors=(*SPEC.actors, named)), junction, [])
-    assert len(vehicles) == MANY.parked + 1
-    poses = np.array([vehicle.pose for vehicle in vehicles])
-    assert touching_pairs(poses[None], np.array([each.body.size[:2] for each in vehicles]), 0.3) == []
-    assert vehicles[0].body.category == "van"
-    x, y, yaw = vehicles[0].pose
-    assert x == pytest.approx(40.0, abs=3.5)
+    poses, size = (np.array(each) for each in zip(*((v.pose, v.body.size[:2]) for v in vehicles), strict=True))
+    assert (len(vehicles), touching_pairs(poses[None], size, 0.3)) == (MANY.parked + 1, [])
+    x, y, yaw = poses[0]
     assert y < -SPEC.road.lanes_edge  # who drives towards the junction from the east has the south on his left
-    assert abs(np.cos(yaw)) == pytest.approx(1.0)
+    assert (vehicles[0].body.category, abs(np.cos(yaw))) == ("van", pytest.approx(1.0))
+    assert x == pytest.approx(40.0, abs=3.5)
 
 
 def test_nobody_parks_where_one_steps_onto_the_road():

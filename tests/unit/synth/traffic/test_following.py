@@ -7,18 +7,16 @@ from deepaccident_devkit.synth.traffic.simulate import simulate
 
 ONE = np.ones(1)
 TEMPER = Temper(max_speed=10 * ONE, acceleration=2 * ONE, braking=2.5 * ONE, time_gap=ONE, min_gap=2 * ONE)
-FREE = np.array([np.inf])
 
 
-def test_a_free_driver_speeds_up_to_its_speed_and_keeps_it():
-    assert free_acceleration(TEMPER, 0 * ONE, FREE)[0] == pytest.approx(2.0)
-    assert free_acceleration(TEMPER, 10 * ONE, FREE)[0] == pytest.approx(0.0)
-    assert free_acceleration(TEMPER, 12 * ONE, FREE)[0] < 0
-
-
-def test_a_bend_ahead_slows_down_but_not_without_limit():
-    assert free_acceleration(TEMPER, 8 * ONE, 7.5 * ONE)[0] == pytest.approx(-1.25)
-    assert free_acceleration(TEMPER, 8 * ONE, 1 * ONE)[0] == pytest.approx(-4.0)
+@pytest.mark.parametrize(
+    ("speed", "bend", "expected"),
+    [(0, np.inf, 2.0), (10, np.inf, 0.0), (8, 7.5, -1.25), (8, 1, -4.0)],
+    ids=["it speeds up", "it keeps its speed", "it slows down for a bend", "but not without limit"],
+)
+def test_a_free_driver(speed, bend, expected):
+    assert free_acceleration(TEMPER, speed * ONE, bend * ONE)[0] == pytest.approx(expected)
+    assert free_acceleration(TEMPER, 12 * ONE, bend * ONE)[0] < 0
 
 
 def test_a_slower_leader_asks_for_more_braking_than_a_faster_one():
@@ -32,16 +30,14 @@ def test_nobody_brakes_hard_at_walking_pace():
     assert hardest[2] == 8.0
 
 
-def test_whether_one_can_stop():
-    assert can_stop(TEMPER, 10 * ONE, 20 * ONE)[0]
-    assert not can_stop(TEMPER, 10 * ONE, 10 * ONE)[0]
+@pytest.mark.parametrize(("metres", "possible"), [(20, True), (10, False)])
+def test_whether_one_can_stop(metres, possible):
+    assert can_stop(TEMPER, 10 * ONE, metres * ONE)[0] == possible
 
 
 def test_a_follower_stands_behind_a_standing_one(driver):
     users = [driver(before=5.0, speed=0.0, delay=100.0), driver(before=60.0)]
     run = simulate(users, begin=0.0, end=15.0, rights=find_rights(users))
-    assert run.states[-1, 1, 3] < 0.05
     gap = run.poses[-1, 0, 0] - run.poses[-1, 1, 0] - (users[0].body.size[0] + users[1].body.size[0]) / 2
-    assert 1.5 < gap < 3.0
-    acceleration = np.diff(run.states[:, 1, 3]) / 0.02
-    assert acceleration.min() > -4.0
+    assert (run.states[-1, 1, 3] < 0.05, 1.5 < gap < 3.0) == (True, True)
+    assert (np.diff(run.states[:, 1, 3]) / 0.02).min() > -4.0

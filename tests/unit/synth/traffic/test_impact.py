@@ -11,23 +11,17 @@ def paths(*columns):
     return np.stack([np.array(column, dtype=np.float64) for column in columns], axis=1)
 
 
-def test_those_who_meet_between_two_looks_are_found():
-    x = np.linspace(-8, 8, 81)
-    still, passing = np.zeros((81, 3)), np.stack([x, np.full(81, 1.9), np.zeros(81)], axis=1)
-    far = still + np.array([50.0, 0, 0])
-    assert touching_pairs(paths(still, passing, far), THREE_SIZES, 0.0) == [(0, 1)]
-    passing[:, 1] = 2.3
-    assert touching_pairs(paths(still, passing, far), THREE_SIZES, 0.0) == []
-    assert touching_pairs(paths(still, passing, far), THREE_SIZES, 0.4) == [(0, 1)]
+@pytest.mark.parametrize(("beside", "margin", "found"), [(1.9, 0.0, [(0, 1)]), (2.3, 0.0, []), (2.3, 0.4, [(0, 1)])])
+def test_those_who_meet_between_two_looks_are_found(beside, margin, found):
+    still, x = np.zeros((81, 3)), np.linspace(-8, 8, 81)
+    passing = np.stack([x, np.full(81, beside), np.zeros(81)], axis=1)
+    assert touching_pairs(paths(still, passing, np.add(still, [50.0, 0, 0])), THREE_SIZES, margin) == found
 
 
-def test_the_least_gap_is_that_of_the_rows_asked_for():
-    still = np.zeros((3, 3))
-    beside, farther = (still + np.array([0, y, 0]) for y in (3.0, 3.5))
-    poses = paths(still, beside, farther)
-    assert least_gap(poses, THREE_SIZES, [0, 1], 2.0) == pytest.approx(1.0)
-    assert least_gap(poses, THREE_SIZES, [0, 2], 2.0) == pytest.approx(1.5)
-    assert least_gap(poses, THREE_SIZES, [0], 2.0) == 2.0
+@pytest.mark.parametrize(("rows", "gap"), [([0, 1], 1.0), ([0, 2], 1.5), ([0], 2.0)])
+def test_the_least_gap_is_that_of_the_rows_asked_for(rows, gap):
+    poses = paths(*(np.tile([0, y, 0], (3, 1)) for y in (0.0, 3.0, 3.5)))
+    assert least_gap(poses, THREE_SIZES, rows, 2.0) == pytest.approx(gap)
 
 
 SIZE = np.array([[4.0, 2.0], [5.0, 2.0]])
@@ -35,12 +29,9 @@ SIZE = np.array([[4.0, 2.0], [5.0, 2.0]])
 
 def last_step(first, second, velocities):
     """A simulation of two steps that ends with poses, each reached at a velocity."""
-    last = np.array([first, second], dtype=np.float64)
-    velocity = np.array(velocities, dtype=np.float64)
-    before = last.copy()
-    before[:, :2] -= 0.02 * velocity
-    states = np.zeros((2, 2, 5))
-    states[0, :, :3], states[1, :, :3] = before, last
+    velocity, states = np.array(velocities, dtype=np.float64), np.zeros((2, 2, 5))
+    states[:, :, :3] = np.array([first, second])
+    states[0, :, :2] -= 0.02 * velocity
     return Simulation(time=np.array([1.0, 1.02]), states=states, velocities=np.stack([velocity, velocity]), contact=1)
 
 
@@ -61,8 +52,6 @@ def test_the_side_that_is_hit(second, velocities, side):
 def test_the_boxes_just_touch_at_its_time():
     run = last_step((0, 0, 0), (4.4, 0.0, np.pi), ((8, 0), (-8, 0)))
     impact = impact_of(run, (0, 1), SIZE)
-    share = (impact.time - 1.0) / 0.02
-    poses = run.poses[0] + share * (run.poses[1] - run.poses[0])
+    poses = run.poses[0] + (impact.time - 1.0) / 0.02 * (run.poses[1] - run.poses[0])
     assert separation(poses[0], SIZE[0], poses[1], SIZE[1]) == pytest.approx(0.0, abs=1e-6)
-    assert impact.time == pytest.approx(1.02 - 0.1 / 16)
-    assert impact.strength == pytest.approx(60 * 8 * 16)
+    assert (impact.time, impact.strength) == pytest.approx((1.02 - 0.1 / 16, 60 * 8 * 16))

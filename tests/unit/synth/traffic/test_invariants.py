@@ -124,8 +124,7 @@ def test_everyone_stays_where_it_belongs(design, kind):
         spec = run.stage.spec
         arms = tuple(spec.actor(role).from_arm or "west" for role in ("ego", "other"))
         world = random_world(np.random.default_rng(design), run.stage.junction, spec.view, between=arms)
-        corners = run.corners()
-        codes = world.top.at(corners.reshape(-1, 2)).reshape(corners.shape[:3])
+        codes = world.top.at(run.corners().reshape(-1, 2)).reshape(-1, len(run.users), 4)
         mapped = (np.abs(run.poses[::10, :, :2]).max(axis=-1) < MAPPED)[..., None]
         for row, user in enumerate(run.users):
             allowed = (*ROAD_CODES, SIDEWALK) if user.walks else ROAD_CODES
@@ -134,32 +133,24 @@ def test_everyone_stays_where_it_belongs(design, kind):
 
 @over_scenes
 def test_at_red_drives_only_who_breaks_that_rule_and_its_follower(design, kind):
-    for run in runs(design, kind):
-        if run.stage.signals is None:
-            continue
-        for row, user in enumerate(run.users):
-            if user.route is None:
-                continue
+    for run in (each for each in runs(design, kind) if each.stage.signals):
+        free = run.stage.cast.pair if run.accident else ()
+        for row, user in ((row, user) for row, user in enumerate(run.users) if user.route):
             front = user.path.project(run.poses[::5, row, :2])[0] + user.body.size[0] / 2
             passing = np.flatnonzero((front[:-1] < user.route.stop_s + 0.6) & (front[1:] >= user.route.stop_s + 0.6))
             red = [run.stage.signals.state(user.route.from_arm, run.time[::5][step]) == RED for step in passing]
-            pair = run.stage.cast.pair if run.accident else ()
-            assert not any(red) or row in pair or (run.accident and "signal" in user.ignores)
+            assert not any(red) or row in free or (run.accident and "signal" in user.ignores)
 
 
 @over_scenes
 def test_traffic_flows_on(design, kind):
     """Of those who have no red light, few stand during the last five seconds."""
     for run in runs(design, kind):
-        since = max(len(run.time) - round(5.0 / PERIOD), 0)
-        standing = free = 0
-        for row in run.driving:
-            arm = run.users[row].route.from_arm
-            times = run.time[since::25]
-            if run.stage.signals is None or (run.stage.signals.state(arm, times) == GREEN).all():
-                free += 1
-                standing += int((run.states[since:, row, 3] < 0.3).all())
-        assert standing <= 2 + free / 4
+        since, lights = max(len(run.time) - round(5.0 / PERIOD), 0), run.stage.signals
+        arms = {row: run.users[row].route.from_arm for row in run.driving}
+        free = [row for row in arms if not lights or (lights.state(arms[row], run.time[since::25]) == GREEN).all()]
+        standing = (run.states[since:, free, 3] < 0.3).all(axis=0).sum()
+        assert standing <= 2 + len(free) / 4
 
 
 @over_scenes

@@ -8,10 +8,8 @@ from deepaccident_devkit.synth.traffic.simulate import simulate
 @pytest.fixture(scope="module", params=["car", "truck", "motorcycle", "cyclist"])
 def turning(request, driver):
     """Left and right turns of a category."""
-    users = [
-        driver("west", "left", category=request.param, max_speed=6.0),
-        driver("east", "right", category=request.param, max_speed=6.0),
-    ]
+    ways = (("west", "left"), ("east", "right"))
+    users = [driver(*way, category=request.param, max_speed=6.0) for way in ways]
     return users, simulate(users, begin=0.0, end=12.0)
 
 

@@ -9,28 +9,26 @@ SEES = ~np.eye(2, dtype=bool)
 
 def look(users, sees=SEES):
     """Gaps and leaders' speeds of two users where they start."""
-    lateral, stops = np.full(2, 3.0), np.zeros(2, dtype=bool)
     starts = np.array([user.start for user in users])
-    tracks = Tracks([user.path for user in users], lateral, stops)
-    bodies = Bodies(
-        poses=tracks.at(starts)[:3].T,
-        speed=np.array([user.start_speed for user in users]),
-        length=np.array([user.body.size[0] for user in users]),
-        width=np.array([user.body.size[1] for user in users]),
-    )
-    return leaders(bodies, tracks, starts, sees)
+    tracks = Tracks([user.path for user in users], np.full(2, 3.0), np.zeros(2, dtype=bool))
+    length, width, _ = np.array([user.body.size for user in users]).T
+    speed = np.array([user.start_speed for user in users])
+    return leaders(Bodies(poses=tracks.at(starts)[:3].T, speed=speed, length=length, width=width), tracks, starts, sees)
 
 
 def test_the_gap_is_from_bumper_to_bumper(driver):
     users = [driver(before=30.0), driver(before=18.0, speed=5.0)]
     gap, speed = look(users)
-    assert gap[0] == pytest.approx(12.0 - users[1].body.size[0], abs=1e-6)
-    assert speed[0] == pytest.approx(5.0)
-    assert np.isinf(gap[1])
+    assert (*gap, speed[0]) == pytest.approx((12.0 - users[1].body.size[0], np.inf, 5.0), abs=1e-6)
 
 
-def test_who_comes_the_other_way_in_its_lane_is_not_ahead(driver):
-    gap, _ = look([driver("west", before=5.0), driver("east", before=5.0)])
+@pytest.mark.parametrize(
+    ("arms", "before", "sees"),
+    [(("west", "east"), (5.0, 5.0), SEES), (("west", "west"), (30.0, 18.0), np.zeros((2, 2), dtype=bool))],
+    ids=["who comes the other way in its lane", "who is not seen"],
+)
+def test_who_is_not_ahead(driver, arms, before, sees):
+    gap, _ = look([driver(arm, before=metres) for arm, metres in zip(arms, before, strict=True)], sees)
     assert np.isinf(gap).all()
 
 
@@ -38,11 +36,6 @@ def test_who_stands_across_the_lane_is_ahead_and_does_not_move_along_it(driver, 
     gap, speed = look([driver(before=20.0), walker(start=(-15.0, -1.75))])
     assert 10.0 < gap[0] < 25.0
     assert speed[0] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_who_is_not_seen_is_not_ahead(driver):
-    gap, _ = look([driver(before=30.0), driver(before=18.0)], np.zeros((2, 2), dtype=bool))
-    assert np.isinf(gap).all()
 
 
 def test_one_sees_round_its_own_bend(driver):
@@ -75,15 +68,10 @@ def test_each_notices_the_contact_so_long_before_it(seconds):
     assert found == [row for row, alert in ((1, 0.4), (2, 0.2)) if seconds < alert]
 
 
-def test_one_who_is_never_alert_notices_nothing():
-    assert alarm(0.0, 0.0).rows(*crossing_poses(0.0)).tolist() == []
-
-
-def test_who_has_noticed_brakes_until_the_end():
-    both = alarm(0.2, 0.6)
-    assert both.rows(*crossing_poses(0.13)).tolist() == [1, 2]
-    assert both.rows(*crossing_poses(0.44)).tolist() == [1, 2]
-    assert both.rows(*crossing_poses(5.0)).tolist() == [1, 2]
+def test_who_has_noticed_brakes_until_the_end_and_who_is_never_alert_not():
+    both, never = alarm(0.2, 0.6), alarm(0.0, 0.0)
+    assert [both.rows(*crossing_poses(seconds)).tolist() for seconds in (0.13, 0.44, 5.0)] == [[1, 2]] * 3
+    assert never.rows(*crossing_poses(0.0)).tolist() == []
 
 
 def test_nobody_notices_one_who_comes_from_behind():

@@ -12,22 +12,17 @@ from deepaccident_devkit.synth.traffic.simulate import simulate
 
 def test_one_set_on_its_way_comes_to_the_place_in_time(driver):
     user = driver(before=90.0, speed=0.0)
-    approach = drive_alone(user)
-    time = approach.time_to(user.route.enter_s)
-    started = approach.at(time - 4.0)
-    run = simulate([started], begin=0.0, end=4.0)
-    along, _ = user.path.project(run.poses[-1:, 0, :2])
-    assert along[0] == pytest.approx(user.route.enter_s, abs=0.3)
+    place, approach = user.route.enter_s, drive_alone(user)
+    run = simulate([approach.at(approach.time_to(place) - 4.0)], begin=0.0, end=4.0)
+    assert user.path.project(run.poses[-1:, 0, :2])[0][0] == pytest.approx(place, abs=0.3)
 
 
 def test_a_slow_one_is_driven_on_until_it_is_at_the_place(driver):
-    slow = driver(before=90.0, speed=0.0, max_speed=3.0)
+    slow, quick = driver(before=90.0, speed=0.0, max_speed=3.0), driver(before=20.0)
     place = slow.route.enter_s
-    assert drive_alone(slow).along[-1] < place
     approach = drive_alone(slow, to=place)
-    assert 30.0 < approach.time_to(place) < 40.0
+    assert (drive_alone(slow).along[-1] < place, 30.0 < approach.time_to(place) < 40.0) == (True, True)
     assert approach.along[-1] == pytest.approx(place, abs=0.5)
-    quick = driver(before=20.0)
     assert len(drive_alone(quick, to=quick.route.enter_s).along) == len(drive_alone(quick).along)
 
 
@@ -58,25 +53,26 @@ def cast(spec=SPEC, duration=6.0):
 @pytest.mark.parametrize("duration", [4.0, 8.0, 30.0])
 def test_the_pair_comes_to_the_crossing_when_it_should(offset, duration):
     found = cast(replace(SPEC, meet=MeetSpec(offset=offset)), duration)
-    assert found.begin == -(duration + WARM_UP)
     users = [found.users[row] for row in found.pair]
-    assert [user.role for user in users] == ["ego", "other"]
+    assert (found.begin, [user.role for user in users]) == (-(duration + WARM_UP), ["ego", "other"])
     run = simulate(users, begin=found.begin, end=2.0)
     for row, (user, place, late) in enumerate(zip(users, crossing(*(u.path for u in users)), (0, offset), strict=True)):
         along, _ = user.path.project(run.poses[:, row, :2])
-        assert run.time[np.searchsorted(along, place)] == pytest.approx(
-            late, abs=0.11
-        )  # who waits sets off at a decision
+        # who waits sets off at a decision
+        assert run.time[np.searchsorted(along, place)] == pytest.approx(late, abs=0.11)
 
 
 def test_those_behind_start_at_their_gap():
     found = cast()
-    ego, behind = (found.users[found.row_of(role)] for role in ("ego", "ego_behind"))
-    assert ego.start - behind.start - (ego.body.size[0] + behind.body.size[0]) / 2 == pytest.approx(8.0)
-    assert behind.start_speed == ego.start_speed
-    assert behind.max_speed > ego.max_speed
-    other, behind = (found.users[found.row_of(role)] for role in ("other", "other_behind"))
-    assert 8.0 <= other.start - behind.start - (other.body.size[0] + behind.body.size[0]) / 2 <= 16.0
+
+    def ahead_and_gap(role):
+        ahead, behind = (found.users[found.row_of(each)] for each in (role, f"{role}_behind"))
+        return ahead, behind, ahead.start - behind.start - (ahead.body.size[0] + behind.body.size[0]) / 2
+
+    ego, behind, gap = ahead_and_gap("ego")
+    assert gap == pytest.approx(8.0)
+    assert (behind.start_speed, behind.max_speed > ego.max_speed) == (ego.start_speed, True)
+    assert 8.0 <= ahead_and_gap("other")[2] <= 16.0
 
 
 def test_those_who_meet_may_notice_each_other_at_the_last_moment_and_nobody_else_does():
@@ -95,8 +91,7 @@ def test_those_who_meet_may_notice_each_other_at_the_last_moment_and_nobody_else
 def test_a_start_that_is_given_is_kept_where_nobody_is_to_meet():
     actors = (replace(SPEC.actors[0], start_distance=33.0), *SPEC.actors[1:])
     ego = cast(replace(SPEC, actors=actors, meet=None)).users[0]
-    assert middle_of(ego.route) - ego.start == 33.0
-    assert ego.start_speed == ego.max_speed
+    assert (middle_of(ego.route) - ego.start, ego.start_speed) == (33.0, ego.max_speed)
 
 
 def test_paths_that_never_cross_have_no_pair():
@@ -106,7 +101,6 @@ def test_paths_that_never_cross_have_no_pair():
 
 @pytest.mark.parametrize(("side", "sign"), [("right", -1), ("left", 1)])
 def test_a_pedestrian_walks_over_the_road_from_its_side(side, sign):
-    path = road_crossing(SPEC.road, "west", 30.0, side)
+    path, begin = road_crossing(SPEC.road, "west", 30.0, side), sign * (SPEC.road.road_edge + 0.7)
     np.testing.assert_allclose(path.xy[:, 0], -30.0)
-    assert path.xy[0, 1] == pytest.approx(sign * (SPEC.road.road_edge + 0.7))
-    assert path.xy[-1, 1] == pytest.approx(-path.xy[0, 1])
+    np.testing.assert_allclose(path.xy[[0, -1], 1], [begin, -begin])

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from deepaccident_devkit.synth.traffic.rights import AMBER, GREEN, RED, SignalPlan, find_rights, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import simulate
@@ -20,24 +21,16 @@ def test_never_have_both_roads_anything_but_red():
 
 def test_green_is_where_it_was_asked_for():
     plan = plan_with_green("south-north", 3.0, 12.0, 0.25)
-    assert plan.start == 0.0
-    assert plan.state("south", 3.0) == GREEN
-    assert plan.shifted(-3.0).state("south", 0.0) == plan.state("south", 3.0)
+    states = (plan.state("south", 3.0), plan.shifted(-3.0).state("south", 0.0))
+    assert (plan.start, *states) == (0.0, GREEN, GREEN)
 
 
-def test_one_stops_before_the_line_at_red_and_goes_at_green(driver, junction):
-    users = [driver("west", on=junction(signalized=True))]
+@pytest.mark.parametrize("ignores", [(), ("signal",)])
+def test_one_stops_before_the_line_at_red_and_goes_at_green_if_it_obeys(driver, junction, ignores):
+    users = [driver("west", on=junction(signalized=True), ignores=ignores)]
     plan = SignalPlan(first="south-north", start=0.0, green=8.0)  # green for west from 12.5 s on
     run = simulate(users, begin=0.0, end=20.0, rights=find_rights(users), signals=plan)
     front = users[0].path.project(run.poses[:, 0, :2])[0] + users[0].body.size[0] / 2
-    red = run.time < 12.5
-    assert front[red].max() < users[0].route.stop_s
-    assert front[red].max() > users[0].route.stop_s - 3.0
-    assert front[-1] > users[0].route.enter_s
-
-
-def test_one_who_ignores_it_runs_the_red_light(driver, junction):
-    users = [driver("west", on=junction(signalized=True), ignores=("signal",))]
-    plan = SignalPlan(first="south-north", start=0.0, green=8.0)
-    run = simulate(users, begin=0.0, end=8.0, rights=find_rights(users), signals=plan)
-    assert run.poses[-1, 0, 0] > 0
+    at_red, route = front[run.time < 12.5].max(), users[0].route
+    assert (route.stop_s - 3.0 < at_red < route.stop_s) == (not ignores)
+    assert front[-1] > route.enter_s

@@ -17,14 +17,11 @@ def middle(prop):
 def test_it_stands_on_the_sidewalk_at_the_right_of_the_line(make, spec):
     junction = Junction(spec)
     for arm in junction.arms:
-        place = middle(make(spec, arm))
-        assert junction.ground_map().at(place[None])[0] == SIDEWALK
-        left_end, right_end = junction.stop_line(arm)
-        inward = -junction.stop_line(arm)[0] / np.linalg.norm(junction.stop_line(arm)[0])
-        right = (right_end - left_end) / np.linalg.norm(right_end - left_end)
+        place, (left_end, right_end) = middle(make(spec, arm)), junction.stop_line(arm)
+        inward, right = (each / np.linalg.norm(each) for each in (-left_end, right_end - left_end))
         np.testing.assert_allclose([inward[1], -inward[0]], right, atol=1e-9)
-        along_right = (place - left_end) @ right
-        assert spec.road_edge < along_right < spec.road_edge + 0.6
+        assert junction.ground_map().at(place[None])[0] == SIDEWALK
+        assert spec.road_edge < (place - left_end) @ right < spec.road_edge + 0.6
         assert 0 < (place - left_end) @ inward < 1.5
 
 

@@ -28,7 +28,7 @@ def test_higher_things_cover_lower_ones_whatever_their_order():
 def test_a_thing_on_a_slope_goes_down_to_its_lowest_corner():
     terrain = Terrain(Hump(arm="east", distance=40.0, height=2.0, length=60.0))
     moved = Prop(20, (Block((20.0, 30.0), (0.0, 2.0), (-0.2, 3.0), (1, 2, 3)),))
-    lift = terrain.height([[20.0, 0.0]])[0]
-    assert 0 < lift < terrain.height([[30.0, 0.0]])[0]
+    lift, higher = terrain.height([[20.0, 0.0], [30.0, 0.0]])
+    assert 0 < lift < higher
     assert settled(moved, terrain).blocks[0].z == (-0.2 + lift, 3.0 + lift)
     assert settled(moved, Terrain()) is moved

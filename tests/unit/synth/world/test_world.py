@@ -41,44 +41,41 @@ def test_nothing_stands_on_the_road_and_no_house_on_the_sidewalk(named):
     _, world = named
     covered = world.top.codes != world.ground.codes
     assert not np.isin(world.ground.codes[covered], ROAD_CODES).any()
-    on_sidewalk = world.top.codes[covered & (world.ground.codes == SIDEWALK)]
-    assert set(np.unique(on_sidewalk)) == {POLE}
-    seen = set(np.unique(world.top.codes))
-    assert {TREE, POLE, FIRST_BUILDING} <= seen
+    assert set(world.top.codes[covered & (world.ground.codes == SIDEWALK)].tolist()) == {POLE}
+    assert {TREE, POLE, FIRST_BUILDING} <= set(np.unique(world.top.codes).tolist())
 
 
 def test_things_reach_into_the_ground_and_stand_above_it(named):
     _, world = named
-    corners = world.props.corners
-    height = world.terrain.height(corners[..., :2])
-    grounded = (corners[..., 2] < height).any(axis=1)
-    houses = world.props.facade
-    assert (corners[houses][..., 2].min(axis=1) <= height[houses].min(axis=1) - 0.19).all()
-    assert (corners[houses][..., 2].max(axis=1) > height[houses].max(axis=1) + 3).all()
-    assert grounded.mean() > 0.3
+    above = world.props.corners[..., 2]
+    ground, houses = world.terrain.height(world.props.corners[..., :2]), world.props.facade
+    assert (above[houses].min(axis=1) <= ground[houses].min(axis=1) - 0.19).all()
+    assert (above[houses].max(axis=1) > ground[houses].max(axis=1) + 3).all()
+    assert (above < ground).any(axis=1).mean() > 0.3
 
 
 def test_the_pole_sees_the_middle(named):
     _, world = named
-    place = world.lidar_pole.translation
-    assert 3 <= place[2] <= 5
-    ahead = world.lidar_pole.rotation[:, 0]
+    place, ahead = world.lidar_pole.translation, world.lidar_pole.rotation[:, 0]
+    assert (3 <= place[2] <= 5, world.ground.at(place[None, :2])[0]) == (True, SIDEWALK)
     np.testing.assert_allclose(ahead[:2], -place[:2] / np.hypot(*place[:2]), atol=1e-9)
-    for target in ([0.0, 0.0, 0.5], [3.0, -3.0, 0.5], [-3.0, -3.0, 0.5], [2.0, 3.0, 0.5]):
-        assert clear_of_props(world, place, target)
-    assert world.ground.at(place[None, :2])[0] == SIDEWALK
+    targets = ([0.0, 0.0, 0.5], [3.0, -3.0, 0.5], [-3.0, -3.0, 0.5], [2.0, 3.0, 0.5])
+    assert [target for target in targets if not clear_of_props(world, place, target)] == []
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_pole_stands_where_the_two_come_from(seed):
-    for between, corners in {
-        ("west", "north"): {(-1, 1)},
-        ("south", "east"): {(1, -1)},
-        ("south", "south"): {(1, -1), (-1, -1)},
-        ("east", "west"): {(1, 1), (1, -1), (-1, 1), (-1, -1)},
-    }.items():
-        place = world_of("wide", seed, between=between).lidar_pole.translation
-        assert tuple(np.sign(place[:2]).astype(int).tolist()) in corners
+@pytest.mark.parametrize(
+    ("between", "corners"),
+    [
+        (("west", "north"), {(-1, 1)}),
+        (("south", "east"), {(1, -1)}),
+        (("south", "south"), {(1, -1), (-1, -1)}),
+        (("east", "west"), {(1, 1), (1, -1), (-1, 1), (-1, -1)}),
+    ],
+)
+def test_the_pole_stands_where_the_two_come_from(seed, between, corners):
+    place = world_of("wide", seed, between=between).lidar_pole.translation
+    assert tuple(np.sign(place[:2]).astype(int).tolist()) in corners
 
 
 def test_each_arm_sees_its_lamps(named):
@@ -87,10 +84,8 @@ def test_each_arm_sees_its_lamps(named):
     for head in world.signals:
         lamps = world.props.corners[list(head.rows)].mean(axis=1)
         assert (np.diff(lamps[:, 2]) < 0).all()
-        line = junction.stop_line(head.arm)
-        out = line.mean(axis=0) - np.array([0.0, 0.0])
-        waiting = np.append(line.mean(axis=0) * (1 + 8 / np.hypot(*out)), 1.5)
-        shining = np.array(OUTWARD[head.arm], dtype=np.float64)
+        line, shining = junction.stop_line(head.arm).mean(axis=0), np.array(OUTWARD[head.arm], dtype=np.float64)
+        waiting = np.append(line * (1 + 8 / np.hypot(*line)), 1.5)
         assert shining @ (waiting - lamps[1])[:2] > 5
         assert clear_of_props(world, lamps[1] + 0.2 * np.append(shining, 0), waiting)
         red, _, green = world.props.colors[list(head.rows), 0].astype(int)
@@ -101,24 +96,18 @@ def test_each_arm_sees_its_lamps(named):
 @pytest.mark.parametrize("between", CORNERS)
 @pytest.mark.parametrize("name", ["four-way", "hilly"])
 def test_a_house_on_the_kerb_hides_who_comes_until_late(name, between):
-    hidden = world_of(name, view="hidden", between=between)
-    junction = Junction(SPECS[name])
+    hidden, junction = world_of(name, view="hidden", between=between), Junction(SPECS[name])
     first, second = (junction.route(arm, "straight") for arm in between)
     meeting = junction.conflicts(first, second)
 
-    def eyes(route, s):
-        x, y, _, _ = route.path.at(s)
-        return np.array([x, y, 1.5])
+    def eyes(metres):
+        """Those of the two, so far before they meet."""
+        places = ((first, meeting.s_a), (second, meeting.s_b))
+        return [np.array([*route.path.at(s - metres)[:2], 1.5]) for route, s in places]
 
-    def sees(world, metres):
-        return clear_of_props(world, eyes(first, meeting.s_a - metres), eyes(second, meeting.s_b - metres))
-
-    assert not sees(hidden, 20.0)
-    assert not sees(hidden, 30.0)
-    assert sees(hidden, 6.0)
-    for route, s in ((first, meeting.s_a), (second, meeting.s_b)):
-        for metres in (0.0, 10.0, 20.0, 30.0):
-            assert clear_of_props(hidden, hidden.lidar_pole.translation, eyes(route, s - metres))
+    assert [clear_of_props(hidden, *eyes(metres)) for metres in (20.0, 30.0, 6.0)] == [False, False, True]
+    seen = [eye for metres in (0.0, 10.0, 20.0, 30.0) for eye in eyes(metres)]
+    assert all(clear_of_props(hidden, hidden.lidar_pole.translation, eye) for eye in seen)
     covered = hidden.top.codes != hidden.ground.codes
     assert not np.isin(hidden.ground.codes[covered], ROAD_CODES).any()
 

@@ -7,6 +7,7 @@ from typing import Any
 import click
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
@@ -82,27 +83,19 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
 ]
 
 
-@pytest.mark.parametrize(("given", "known", "wrong", "error", "call"), CALLS)
-def test_a_call_takes_a_word_in_any_case(
+@pytest.mark.parametrize(
+    ("given", "known", "wrong", "error", "call"),
+    [*CALLS, *((*words, error, lambda _, word, make=make: make(word)) for *words, error, make in MAKERS)],
+)
+def test_a_word_is_taken_in_any_case(
     da: DeepAccident, given: str, known: str, wrong: str, error: type[DeepAccidentError], call: Callable[..., Any]
 ) -> None:
     assert call(da, given) == call(da, known)
-    with pytest.raises(error, match=r"; did you mean '[\w+-]+'\?$"):
-        call(da, wrong)
-
-
-@pytest.mark.parametrize(("given", "known", "wrong", "error", "make"), MAKERS)
-def test_a_configuration_takes_a_word_in_any_case(
-    given: str, known: str, wrong: str, error: type[DeepAccidentError], make: Callable[[str], Any]
-) -> None:
-    assert make(given) == make(known)
-    with pytest.raises(error, match=r"; did you mean '[\w+-]+'\?$"):
-        make(wrong)
+    assert_refused((lambda: call(da, wrong), error, r"; did you mean '[\w+-]+'\?$"))
 
 
 def test_what_is_told_of_a_split_is_its_name() -> None:
-    assert SampleSelection(split="VAL_mini") == SampleSelection(split="val_mini")
-    assert SampleSelection(split="Mine.txt").split == "Mine.txt"
+    assert [SampleSelection(split=each).split for each in ("VAL_mini", "Mine.txt")] == ["val_mini", "Mine.txt"]
 
 
 def verbs(group: click.Group, context: click.Context) -> Iterator[click.Command]:
@@ -115,28 +108,27 @@ def verbs(group: click.Group, context: click.Context) -> Iterator[click.Command]
 
 
 def test_every_option_with_words_takes_them_in_any_case() -> None:
-    context, found = click.Context(deepaccident), 0
-    for verb in verbs(deepaccident, context):
-        for option in verb.params:
-            if not isinstance(option.type, click.Choice):
-                continue
-            assert isinstance(option.type, WordChoice), f"{verb.name} {option.opts[0]}"
-            for word in option.type.choices:
-                assert option.type.convert(word.upper(), option, context) == word
-            long = max(option.type.choices, key=len)
-            with pytest.raises(click.BadParameter, match=rf" is not one of .*; did you mean '{re.escape(long)}'\?$"):
-                option.type.convert(f"{long}s", option, context)
-            found += 1
-    assert found > 40
+    context = click.Context(deepaccident)
+    options = [(verb, option) for verb in verbs(deepaccident, context) for option in verb.params]
+    of_words = [(verb, option) for verb, option in options if isinstance(option.type, click.Choice)]
+    assert len(of_words) > 40
+    for verb, option in of_words:
+        assert isinstance(option.type, WordChoice), f"{verb.name} {option.opts[0]}"
+        words = list(option.type.choices)
+        assert [option.type.convert(word.upper(), option, context) for word in words] == words
+        long = max(words, key=len)
+        with pytest.raises(click.BadParameter, match=rf" is not one of .*; did you mean '{re.escape(long)}'\?$"):
+            option.type.convert(f"{long}s", option, context)
 
 
-def test_a_word_that_is_like_none_has_no_suggestion() -> None:
+@pytest.mark.parametrize("wrong", ["qqq", None, 3, ["left"]])
+def test_a_word_that_is_like_none_has_no_suggestion(wrong: Any) -> None:
     assert meant_text("qqq", ["left", "right"]) == meant_text("", ["left"]) == meant_text(None, ["left"]) == ""
-    for wrong in ("qqq", None, 3, ["left"]):
-        with pytest.raises(ChoiceError, match=r"^turn: expected one of left, right, found .*[^?]$"):
-            choice("turn", wrong, ("left", "right"))
-    with pytest.raises(ChoiceError, match=r"expected one of left, or None, found 3$"):
-        choice("turn", 3, (None, "left"))
+    told = r"^turn: expected one of left, right, found .*[^?]$"
+    assert_refused(
+        (lambda: choice("turn", wrong, ("left", "right")), ChoiceError, told),
+        (lambda: choice("turn", 3, (None, "left")), ChoiceError, r"expected one of left, or None, found 3$"),
+    )
     assert choice("turn", None, (None, "left")) is None
 
 

@@ -2,12 +2,11 @@
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -38,16 +37,6 @@ with replacing(folder / "table.json") as path, replacing_folder(folder / "run") 
     time.sleep(60)
 """
 DAY = 24 * 3600
-
-
-@pytest.fixture
-def writer(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that is writing a file and a folder."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen([sys.executable, "-c", WRITER, tmp_path], env=environment) as process:
-        wait_for(lambda: list(tmp_path.glob(".table.json.*")))
-        yield process
-        process.kill()
 
 
 def names(folder: Path) -> list[str]:
@@ -84,10 +73,11 @@ def test_a_name_says_of_what_and_by_whom() -> None:
     assert temporary_of(".table.json.tmp") is temporary_of(path.name[1:]) is None
 
 
-def test_the_longest_name_can_be_written(tmp_path: Path) -> None:
-    name = "ö" * 127
-    write_bytes(tmp_path / name, b"whole")
-    assert names(tmp_path) == [name]
+def test_the_longest_name_can_be_written_and_into_a_folder_that_is_gone(tmp_path: Path) -> None:
+    tmp_path.rmdir()
+    remove_leftovers(tmp_path)
+    write_bytes(tmp_path / ("ö" * 127), b"whole")
+    assert names(tmp_path) == ["ö" * 127]
 
 
 def test_a_block_that_fails_leaves_nothing(tmp_path: Path) -> None:
@@ -109,14 +99,16 @@ def test_a_folder_has_the_permissions_of_others(tmp_path: Path) -> None:
     assert (tmp_path / "made").stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
-def test_the_next_run_removes_what_a_killed_one_left(writer: subprocess.Popen[bytes], tmp_path: Path) -> None:
-    process = writer.pid
-    remove_leftovers(tmp_path)
-    assert [temporary_of(name) for name in names(tmp_path)] == ["run", "table.json"]  # it lives
-    os.kill(process, signal.SIGKILL)
-    wait_for(lambda: Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z")
-    write_bytes(tmp_path / "other.json", b"")  # nobody has asked for its status yet
-    assert names(tmp_path) == ["other.json"]
+def test_the_next_run_removes_what_a_killed_one_left(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([sys.executable, "-c", WRITER, tmp_path], env=environment) as writer:
+        wait_for(lambda: list(tmp_path.glob(".table.json.*")))
+        remove_leftovers(tmp_path)
+        assert [temporary_of(name) for name in names(tmp_path)] == ["run", "table.json"]  # it lives
+        os.kill(writer.pid, signal.SIGKILL)
+        wait_for(lambda: Path(f"/proc/{writer.pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z")
+        write_bytes(tmp_path / "other.json", b"")  # nobody has asked for its status yet
+        assert names(tmp_path) == ["other.json"]
 
 
 def test_a_folder_is_looked_through_once_a_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,19 +117,22 @@ def test_a_folder_is_looked_through_once_a_process(tmp_path: Path, monkeypatch: 
     write_bytes(tmp_path / "second", b"")
 
 
-def test_the_number_of_a_dead_writer_given_to_another_process(tmp_path: Path) -> None:
-    own = left_by(tmp_path)
-    left_by(tmp_path, lambda name: re.sub(r"-\d+-(\d+)\.tmp", r"-1-\1.tmp", name))
-    remove_leftovers(tmp_path)
-    assert names(tmp_path) == [own.name]
+def other_process(name: str) -> str:
+    return re.sub(r"-\d+-(\d+)\.tmp", r"-1-\1.tmp", name)
 
 
-def test_writers_on_other_hosts_are_given_a_day(tmp_path: Path) -> None:
-    def elsewhere(name: str) -> str:
-        return re.sub(r"[0-9a-f]{8}-\d+", "0123abcd-999999999", name)
+def elsewhere(name: str) -> str:
+    return re.sub(r"[0-9a-f]{8}-\d+", "0123abcd-999999999", name)
 
-    fresh = left_by(tmp_path, elsewhere, age=0.9 * DAY)
-    left_by(tmp_path, elsewhere, age=1.1 * DAY)
+
+@pytest.mark.parametrize(
+    ("kept", "gone", "days"),
+    [(str, other_process, (0, 0)), (elsewhere, elsewhere, (0.9, 1.1))],
+    ids=["the number of a dead writer is another process's", "writers on other hosts are given a day"],
+)
+def test_whose_leftovers_are_removed(tmp_path: Path, kept, gone, days: tuple[float, float]) -> None:
+    fresh = left_by(tmp_path, kept, age=days[0] * DAY)
+    left_by(tmp_path, gone, age=days[1] * DAY)
     remove_leftovers(tmp_path)
     assert names(tmp_path) == [fresh.name]
 
@@ -157,15 +152,7 @@ def test_a_link_is_removed_and_not_what_it_leads_to(tmp_path: Path) -> None:
     dead.unlink()
     dead.symlink_to(tmp_path / "data")
     remove_leftovers(tmp_path)
-    assert names(tmp_path) == ["data"]
-    assert names(tmp_path / "data") == ["file"]
-
-
-def test_a_folder_that_is_gone(tmp_path: Path) -> None:
-    shutil.rmtree(tmp_path)
-    remove_leftovers(tmp_path)
-    write_bytes(tmp_path / "file", b"whole")
-    assert names(tmp_path) == ["file"]
+    assert (names(tmp_path), names(tmp_path / "data")) == (["data"], ["file"])
 
 
 def test_plain_names_are_names_on_any_file_system() -> None:
