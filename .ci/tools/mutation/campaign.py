@@ -36,7 +36,7 @@ TESTS = {
     "evaluation": "unit/evaluation property/test_accident property/test_detection property/test_motion_metrics "
     "parity/test_accident parity/test_anticipation parity/test_attributes parity/test_detection parity/test_motion "
     "parity/test_trajectories",
-    "v2x": "unit/v2x unit/baselines/test_oracle property/test_v2x parity/test_poses parity/test_visibility",
+    "v2x": "unit/v2x unit/baselines/test_outlook property/test_v2x parity/test_poses parity/test_visibility",
     "splits": "unit/test_splits",
 }
 """The tests of each room, by how their paths begin; besides them its examples in docstrings."""

@@ -1,3 +1,8 @@
+"""The baselines: motion that is drawn, detections, and accidents that lie ahead."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from refusals import assert_refused
@@ -5,19 +10,24 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import (
     Baseline,
+    Outlook,
+    SeenActors,
     predict_accidents,
     predict_detections,
     predict_motion,
     predict_results,
     seen_actors,
 )
+from deepaccident_devkit.baselines.predict import accidents_ahead, label_times, motion_of
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError
 from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, detection_truth
 from deepaccident_devkit.evaluation.accident import accident_context
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.results import read_results
-from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.geometry import BevGrid, Boxes
+from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.taxonomy import CATEGORIES, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import Link
 
 
@@ -67,8 +77,7 @@ def test_the_hidden_accident_is_foreseen_by_the_pole_and_named(da_hidden: DeepAc
     token = tokens[1]
     assert predict_accidents(da_hidden, token) == []
     (alarm,) = predict_accidents(da_hidden, token, agents="+infrastructure")
-    assert set(alarm.ids or ()) == set(collision["ids"])
-    assert alarm.time == pytest.approx(1.5, abs=0.11)
+    assert (set(alarm.ids or ()), alarm.time) == (set(collision["ids"]), pytest.approx(1.5, abs=0.11))
     evaluator = AccidentEvaluator("boxes")
     evaluator.update(token, [alarm], None, accident_context(da_hidden, token, 2.0))
     assert evaluator.compute().position_error == pytest.approx(0, abs=1.5)
@@ -128,8 +137,7 @@ def test_what_cannot_be_is_refused(
     error: type[DeepAccidentError],
     sentence: str,
 ) -> None:
-    with pytest.raises(error, match=sentence):
-        predict_accidents(da_hidden, tokens[0], **options)  # type: ignore[arg-type]
+    assert_refused((lambda: predict_accidents(da_hidden, tokens[0], **options), error, sentence))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -148,8 +156,7 @@ def test_results_are_the_predictions_and_the_same_bytes_with_two_workers(
     assert results.tokens == tuple(every)
     assert results.form is not None
     assert (results.form.frames, results.form.labels) == (7, "released")
-    assert results.meta["agents"] == "+infrastructure"
-    assert results.meta["link"]["latency"] == 0.1
+    assert (results.meta["agents"], results.meta["link"]["latency"]) == ("+infrastructure", 0.1)
     stored = results.prediction(tokens[0])
     expected = chosen.predict(da_hidden, "motion", tokens[0])
     np.testing.assert_array_equal(stored.instances, expected.instances)  # type: ignore[union-attr]
@@ -187,3 +194,178 @@ def test_a_task_or_horizon_that_is_none_is_refused(
         ),
     )
     assert not out.exists()
+
+
+CAR = (4.0, 2.0, 1.5)
+
+
+def ahead(
+    *actors: tuple[int, float, float, float, float, float], own: int | None = 50, on_foot: Sequence[int] = ()
+) -> Outlook:
+    """Cars, or whom ids say to be on foot, by actor id, x, y, yaw, speed along x, speed along y."""
+    rows: Sequence[tuple[float, ...]] = actors
+    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    boxes = Boxes.from_arrays(
+        np.column_stack([table[:, 1:3], np.zeros(len(table))]),
+        np.tile(CAR, (len(table), 1)),
+        table[:, 3],
+        frame="ego",
+        actor_id=table[:, 0].astype(np.int64),
+        velocity=np.column_stack([table[:, 4:6], np.zeros(len(table))]),
+        category=np.where(np.isin(table[:, 0], on_foot), CATEGORIES.index("pedestrian"), 0),
+    )
+    seen = SeenActors(boxes=boxes, seen_by=np.zeros(len(table), np.uint8), own_actor_id=own)
+    return Outlook(seen=seen, turn_rate=np.zeros(len(table)))
+
+
+EGO = (OWN_ACTOR_ID, 0, 0, 0, 10, 0)
+CROSSING = (7, 15, -15, np.pi / 2, 0, 10)
+
+
+def test_crossing_paths_collide_where_the_boxes_first_come_near() -> None:
+    (alarm,) = accidents_ahead(ahead(EGO, CROSSING), 2.0)
+    # at t the centres are (10 t, 0) and (15, −15 + 10 t): the boxes touch once 15 − 10 t ≤ 3
+    np.testing.assert_allclose(alarm.positions, [[12, 0], [15, -3]], atol=1e-9)
+    assert (alarm.time, alarm.ids, alarm.score) == (pytest.approx(1.2), (50, 7), pytest.approx(1 / 2.2))
+    (unknown,) = accidents_ahead(ahead(EGO, CROSSING, own=None), 2.0)  # meta does not say who the ego is
+    assert unknown.ids is None
+
+
+PARKED = [(1, 0, 20, 0, 0, 0), (2, 4.1, 20, 0, 0, 0)]
+SIDE_BY_SIDE = [(3, 0, 40, 0, 5, 0), (4, 0, 42.1, 0, 5, 0)]
+
+
+@pytest.mark.parametrize(
+    ("actors", "horizon"), [((EGO, CROSSING), 1.1), ((*PARKED, *SIDE_BY_SIDE), 2.0), ((), 2.0), ((EGO,), 2.0)]
+)
+def test_no_alarm_beyond_the_horizon_of_those_who_come_no_nearer_and_of_nobody(
+    actors: tuple[tuple[int, float, float, float, float, float], ...], horizon: float
+) -> None:
+    assert accidents_ahead(ahead(*actors), horizon) == []
+
+
+def test_a_pass_within_the_danger_distance_is_an_alarm_of_less_weight() -> None:
+    passing = (7, 20, 2.2, np.pi, -10, 0)  # on the next lane: 0.2 m between the sides
+    (alarm,) = accidents_ahead(ahead(EGO, passing), 2.0)
+    assert alarm.score == pytest.approx((1 - 0.2 / 0.25) / (1 + alarm.time))
+    assert accidents_ahead(ahead(EGO, passing), 2.0, danger_distance=0.1) == []
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_who_drives_up_to_a_queue_brakes(yaw: float) -> None:
+    """At constant velocity the follower is through the one that stands within 2 s."""
+    along = np.array([np.cos(yaw), np.sin(yaw)])
+
+    def follower(aside: float, turned: float) -> tuple[int, float, float, float, float, float]:
+        place = -12 * along + aside * np.array([-along[1], along[0]])
+        return 2, *place, yaw + turned, *(8 * along)
+
+    stands = (1, 0, 0, yaw, 0, 0)
+    assert accidents_ahead(ahead(stands, follower(0.5, 0.0)), 2.0) == []
+    assert accidents_ahead(ahead(follower(0.5, 0.0), stands), 2.0) == []
+    assert len(accidents_ahead(ahead(stands, follower(1.5, 0.0)), 2.0)) == 1  # it comes from the next lane
+    assert len(accidents_ahead(ahead(stands, follower(0.5, 0.6)), 2.0)) == 1  # it slides
+
+
+@pytest.mark.parametrize(("on_foot", "alarms"), [([], 1), ([2], 1), ([1, 2], 0)])
+def test_two_pedestrians_are_in_no_danger_of_each_other(on_foot: list[int], alarms: int) -> None:
+    met = [(1, 0, 0, 0, 1.5, 0), (2, 6, 0.5, np.pi, -1.5, 0)]
+    assert len(accidents_ahead(ahead(*met, on_foot=on_foot), 3.0)) == alarms
+
+
+def test_two_that_overlap_now_are_the_surest_alarm() -> None:
+    (alarm,) = accidents_ahead(ahead((1, 0, 0, 0, 5, 0), (2, 1, 0, 0, 5, 0)), 2.0)
+    assert (alarm.time, alarm.score) == (0, 1)
+
+
+def test_of_alarms_at_one_place_the_surest_is_kept() -> None:
+    followers = [(8, -8, 0, 0, 10, 0), (9, 15, -23, np.pi / 2, 0, 10)]
+    far_away = [(10, 0, 100, 0, 10, 0), (11, 17, 85, np.pi / 2, 0, 10)]
+    alarms = accidents_ahead(ahead(EGO, CROSSING, *followers, *far_away), 3.0)
+    assert [alarm.ids for alarm in alarms] == [(50, 7), (10, 11)]
+    assert alarms[0].score > alarms[1].score
+
+
+CLEAN = MOTION_PROTOCOLS["released"].__class__(labels="clean")
+
+
+def what_comes(da: DeepAccident, token: str, config: MotionLabelConfig) -> tuple[SeenActors, FloatArray]:
+    """Whom the labels show at the present and all the time, and where they will be: (T, N, 3) in its ego frame."""
+    seen = seen_actors(da, token, agents="all")
+    scenario, agent, number = token.rsplit("/", 2)
+    annotated = set(da.boxes(token, "ego").actor_id.tolist())
+    poses = []
+    for frame in range(config.label_frames):
+        boxes = da.boxes(f"{scenario}/{agent}/{int(number) + frame * config.step:03d}", "world")
+        boxes = boxes.transform(da.world_from(token, "ego").inverse(), "ego")
+        annotated &= set(boxes.actor_id.tolist())
+        poses.append(boxes)
+    rows = np.flatnonzero(np.isin(seen.boxes.actor_id, list(annotated)))
+    seen = SeenActors(boxes=seen.boxes.select(rows), seen_by=seen.seen_by[rows], own_actor_id=seen.own_actor_id)
+    result = []
+    for boxes in poses:
+        place = [int(np.flatnonzero(boxes.actor_id == actor)[0]) for actor in seen.boxes.actor_id]
+        result.append(np.column_stack([boxes.center[place, :2], boxes.yaw[place]]))
+    return seen, np.stack(result)
+
+
+def without_others(label: MotionLabels, known: set[int]) -> MotionLabels:
+    """The label without those whose whole future the labels do not tell: they leave the range, or come into sight."""
+    others = [number for actor, number in label.id_map.items() if actor not in {*known, OWN_BOX_ID}]
+    gone = np.isin(label.instance, others)
+    instance, segmentation = (np.where(gone, 0, each) for each in (label.instance, label.segmentation))
+    return replace(label, instance=instance, segmentation=segmentation)
+
+
+@pytest.mark.parametrize("agent", ["ego_vehicle", "other_vehicle_behind", "infrastructure"])
+@pytest.mark.parametrize("protocol", ["released", "clean"])
+def test_who_foresees_everything_scores_a_hundred(da_motion: DeepAccident, agent: str, protocol: str) -> None:
+    """Cell by cell."""
+    config = MotionLabelConfig(protocol=protocol)
+    token = f"{da_motion.scenario[0]['token']}/{agent}/012"
+    seen, poses = what_comes(da_motion, token, config)
+    output = motion_of(seen, poses, da_motion.ego_from(token, LIDAR), config)
+    evaluator = MotionEvaluator("released" if protocol == "released" else CLEAN)
+    label = da_motion.motion_labels(token, config)
+    evaluator.update(token, output, without_others(label, set(seen.boxes.actor_id.tolist())))
+    result = evaluator.compute()
+    assert len(seen.boxes) > 5
+    for each in result.ranges.values():
+        assert each.sq > 99.9
+        assert (each.false_positive, each.false_negative) == (0, 0)
+    assert result.ranges["100x100"].true_positive > 40
+
+
+def test_the_present_is_drawn_exactly_as_labels_are(da_motion: DeepAccident) -> None:
+    config = MotionLabelConfig()
+    token = f"{da_motion.scenario[0]['token']}/ego_vehicle/012"
+    label = da_motion.motion_labels(token)
+    seen = seen_actors(da_motion, token, agents="all")
+    rows = np.flatnonzero(np.isin(seen.boxes.actor_id, da_motion.boxes(token, "ego").actor_id))
+    boxes = seen.boxes.select(rows)
+    seen = SeenActors(boxes=boxes, seen_by=seen.seen_by[rows], own_actor_id=seen.own_actor_id)
+    standing = np.repeat(np.column_stack([boxes.center[:, :2], boxes.yaw])[None], config.label_frames, axis=0)
+    output = motion_of(seen, standing, da_motion.ego_from(token, LIDAR), config)
+    assert output.instances is not None
+    assert output.instances.shape == (1, 5, 200, 200)
+    np.testing.assert_array_equal(output.instances[0, 0] > 0, label.instance[0] > 0)
+    assert (output.instances[0] > 0).any(axis=(1, 2)).all()
+
+
+def test_ids_stay_the_same_over_the_frames(da_motion: DeepAccident) -> None:
+    config = MotionLabelConfig()
+    token = f"{da_motion.scenario[0]['token']}/ego_vehicle/012"
+    seen, poses = what_comes(da_motion, token, config)
+    only = np.flatnonzero(seen.boxes.actor_id == OWN_ACTOR_ID)
+    alone = SeenActors(boxes=seen.boxes.select(only), seen_by=seen.seen_by[only], own_actor_id=seen.own_actor_id)
+    output = motion_of(alone, poses[:, only], da_motion.ego_from(token, LIDAR), config)
+    assert output.instances is not None
+    assert [np.unique(frame).tolist() for frame in output.instances[0]] == [[0, 1]] * 5
+
+
+@pytest.mark.parametrize(
+    ("config", "times"),
+    [(MotionLabelConfig(), [0, 0.5, 1, 1.5, 2]), (MotionLabelConfig(step=1, future_frames=3), [0, 0.1, 0.2, 0.3])],
+)
+def test_label_times_are_the_label_frames(config: MotionLabelConfig, times: list[float]) -> None:
+    np.testing.assert_allclose(label_times(config), times)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident, __version__
 from deepaccident_devkit.baselines import Baseline, predict_results
@@ -89,8 +90,7 @@ def test_several_calls_share_the_scenarios(
     with ThreadPoolExecutor(3) as threads:
         made = threads.map(lambda _: predict_results(da_b, task, tokens, out, NOISY, workers=1), range(3))
         assert list(made) == [out] * 3
-    assert sorted(predicted) == sorted(tokens)
-    assert contents(out) == contents(wholes / NAMES[task])
+    assert (sorted(predicted), contents(out)) == (sorted(tokens), contents(wholes / NAMES[task]))
     assert [path.name for path in tmp_path.iterdir()] == [NAMES[task]]
 
 
@@ -111,8 +111,7 @@ def test_an_interrupted_call_loses_the_scenario_at_hand(
     assert not (tmp_path / "motion").exists()
     del predicted[:]
     call()
-    assert predicted == tokens[4:]
-    assert contents(tmp_path / "motion") == contents(wholes / "motion")
+    assert (predicted, contents(tmp_path / "motion")) == (tokens[4:], contents(wholes / "motion"))
 
 
 def test_what_was_predicted_with_other_settings_or_samples_is_not_taken(
@@ -138,8 +137,7 @@ def test_scenarios_that_fail_are_listed_and_the_others_done(
     with monkeypatch.context() as patch:
         patch.setattr(Baseline, "predict", stopped_at(tokens[6], ConfigError("no such day")))
         scenario = tokens[6].rsplit("/", 2)[0]
-        with pytest.raises(SomeFailedError, match=rf"1 of 4 failed:\n  {scenario}: no such day\n"):
-            call()
+        assert_refused((call, SomeFailedError, rf"1 of 4 failed:\n  {scenario}: no such day\n"))
     call()
     assert contents(out) == contents(wholes / "detection.json")
 
@@ -170,8 +168,7 @@ def test_complete_results_stay_and_others_are_refused(
     broken = tmp_path / NAMES[task]
     broken.mkdir()
     (broken / "results.json").write_bytes(b"{}")
-    with pytest.raises(ResultsError, match="is there already"):
-        predict_results(da_b, task, tokens, broken, NOISY)
+    assert_refused((lambda: predict_results(da_b, task, tokens, broken, NOISY), ResultsError, "is there already"))
     assert not predicted
     assert contents(out) == before
 

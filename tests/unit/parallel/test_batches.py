@@ -1,21 +1,29 @@
-"""Bulk work on executors: order, how much is under way, what workers must see."""
+"""Bulk work on executors: order, how much is under way, what workers must see, and work that ends early."""
 
+import os
 import pickle
 import pickletools
+import signal
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import workers
+from processes import is_running, wait_for
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ReleaseError, SomeFailedError, WorkerError
 from deepaccident_devkit.parallel import Failure, Places, Tried, check_failures, in_order, run_batch, run_unordered
 from deepaccident_devkit.parallel.batches import Call, marked
+from deepaccident_devkit.parallel.executors import signals_put_off
 
 
 class Delayed(Executor):
@@ -76,8 +84,7 @@ def test_cancelled_when_the_generator_is_closed() -> None:
 
 
 def test_a_wrong_number_of_workers() -> None:
-    with pytest.raises(ChoiceError, match=r"^workers: expected a number of at least 1, or None, found 0$"):
-        run_batch(workers.following, [1], workers=0)
+    assert_refused((lambda: run_batch(workers.following, [1], workers=0), ChoiceError, ("workers", "at least 1", "0")))
 
 
 def test_the_folders_are_marked_meanwhile(tmp_path: Path) -> None:
@@ -85,8 +92,7 @@ def test_the_folders_are_marked_meanwhile(tmp_path: Path) -> None:
     inside.mkdir()
     with marked(Places(reads=(inside,), writes=(out,))) as seen:
         assert all(Path(each).exists() for each in seen)
-        assert Call(workers.following, 1, seen)() == 2
-        assert len(list(out.iterdir())) == 1
+        assert (Call(workers.following, 1, seen)(), len(list(out.iterdir()))) == (2, 1)
     assert not list(out.iterdir())
 
 
@@ -100,15 +106,13 @@ def test_a_worker_with_another_folder_of_the_same_name(tmp_path: Path) -> None:
     with marked(Places(writes=(tmp_path,))) as seen:
         for mark in tmp_path.iterdir():
             mark.unlink()  # as on a host where the folder is another one
-        with pytest.raises(WorkerError, match=rf"does not see {tmp_path}; give"):
-            Call(workers.following, 1, seen)()
+        assert_refused((Call(workers.following, 1, seen), WorkerError, rf"does not see {tmp_path}; give"))
 
 
 def test_a_worker_with_another_version(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     sent = pickle.dumps(Call(workers.following, 1, (str(tmp_path),)))  # not checked yet in this process
     monkeypatch.setattr("deepaccident_devkit.parallel.batches.__version__", "9.9")
-    with pytest.raises(WorkerError, match=r"^a worker on \S+ has deepaccident_devkit 9\.9, and this is .*; install"):
-        pickle.loads(sent)()
+    assert_refused((pickle.loads(sent), WorkerError, ("a worker on ", "deepaccident_devkit 9.9", "install")))
 
 
 def test_what_is_sent_needs_no_devkit_before_it_is_called() -> None:
@@ -121,21 +125,19 @@ def test_what_is_sent_needs_no_devkit_before_it_is_called() -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    "error",
     [
-        (ModuleNotFoundError("No module named 'deepaccident_devkit'"), "a worker cannot do the work"),
-        (AttributeError("Can't get attribute 'x' on <module 'deepaccident_devkit.v2x'>"), "a worker cannot do"),
+        ModuleNotFoundError("No module named 'deepaccident_devkit'"),
+        AttributeError("Can't get attribute 'x' on <module 'deepaccident_devkit.v2x'>"),
     ],
 )
-def test_a_worker_without_the_package(error: Exception, told: str) -> None:
-    class Failing(Executor):
-        def submit(self, _function: Any, /, *_: Any, **__: Any) -> Future[Any]:
-            future: Future[Any] = Future()
-            future.set_exception(error)
-            return future
-
-    with pytest.raises(WorkerError, match=f"^{told}"):
-        run_batch(workers.following, [1], executor=Failing())
+def test_a_worker_without_the_package(error: Exception) -> None:
+    failed: Future[Any] = Future()
+    failed.set_exception(error)
+    executor = Mock(spec=Executor, submit=lambda *_, **__: failed)
+    assert_refused(
+        (lambda: run_batch(workers.following, [1], executor=executor), WorkerError, "^a worker cannot do the work")
+    )
 
 
 def broken_if_odd(item: int) -> int:
@@ -163,5 +165,95 @@ def test_what_failed_is_listed_and_the_rest_done() -> None:
 
 
 def test_a_full_disk_ends_it_all() -> None:
-    with pytest.raises(OSError, match="No space left"):
-        run_batch(Tried(full_disk), range(5), workers=1)
+    assert_refused((lambda: run_batch(Tried(full_disk), range(5), workers=1), OSError, "No space left"))
+
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c_counts() -> Iterator[None]:
+    """As in a terminal: a runner in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_killed_worker_is_our_error() -> None:
+    with pytest.raises(WorkerError, match=r"^a worker process was killed \(.*memory ran out; .* with fewer workers$"):
+        run_batch(workers.killed, range(6), workers=2)
+
+
+def test_workers_leave_ctrl_c_to_the_parent() -> None:
+    assert run_batch(workers.interrupted, range(4), workers=2) == [0, 1, 2, 3]
+
+
+def wait_and_raise_ctrl_c(folder: Path) -> None:
+    wait_for(lambda: len(list(folder.iterdir())) == 2)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def assert_workers_end(folder: Path) -> None:
+    """Those that wrote their numbers into files of a folder."""
+    numbers = [int(path.read_text()) for path in folder.iterdir() if path.read_text()]
+    wait_for(lambda: not any(map(is_running, numbers)))
+
+
+def test_ctrl_c_ends_the_workers_at_once(tmp_path: Path) -> None:
+    """In a notebook: nobody but the caller of the library handles signals."""
+    before = [signal.getsignal(number) for number in SIGNALS]
+    waiting = threading.Thread(target=wait_and_raise_ctrl_c, args=(tmp_path,))
+    waiting.start()
+    with pytest.raises(KeyboardInterrupt):
+        run_batch(workers.told_and_asleep, [str(tmp_path / str(item)) for item in range(6)], workers=2)
+    waiting.join()
+    assert_workers_end(tmp_path)
+    assert [signal.getsignal(number) for number in SIGNALS] == before
+
+
+def test_closing_the_generator_ends_the_workers(tmp_path: Path) -> None:
+    results = run_unordered(workers.told_and_asleep, ["", str(tmp_path / "1"), str(tmp_path / "2")], workers=2)
+    next(results)
+    wait_for(lambda: any(path.read_text() for path in tmp_path.iterdir()))
+    results.close()
+    assert_workers_end(tmp_path)
+
+
+def test_an_error_lets_others_end_what_they_do(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"^broken$"):
+        run_batch(workers.told_or_broken, [str(tmp_path / str(item)) for item in range(20)], workers=2)
+    assert 0 < len(list(tmp_path.iterdir())) < 10
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_signals_wait_for_the_start_of_processes(number: signal.Signals) -> None:
+    came: list[int] = []
+    before = signal.signal(number, lambda each, _: came.append(each))
+    try:
+        with signals_put_off():
+            os.kill(os.getpid(), number)
+            assert not came
+        assert came == [number]
+    finally:
+        signal.signal(number, before)
+
+
+def test_other_threads_get_no_signals_to_put_off() -> None:
+    with ThreadPoolExecutor(1) as threads:
+        threads.submit(lambda: signals_put_off().__enter__()).result(60)
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    paths = [str(tmp_path / "a"), str(tmp_path / "b")]
+    script = (
+        "import workers\nfrom deepaccident_devkit.parallel import run_batch\n"
+        f"run_batch(workers.told_and_asleep, {paths!r}, workers=2)"
+    )
+    path = os.pathsep.join([str(Path(workers.__file__).parent), *sys.path])
+    parent = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": path})
+    wait_for(lambda: len([file for file in tmp_path.iterdir() if file.read_text()]) == 2)
+    numbers = [int(file.read_text()) for file in tmp_path.iterdir()]
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not any(map(is_running, numbers)))

@@ -42,8 +42,7 @@ def test_the_serial_share_is_of_one_core_and_bounds_all_cores(benchmark: ModuleT
     here = benchmark.Seen(**seen, export_s=10.0, outside_s=0.9, batch_busy_s=0.0)
     engine = benchmark.Seen(**seen, export_s=6.0, outside_s=0.3, batch_busy_s=0.01)
     assert benchmark.serial_share(here, engine) == pytest.approx((0.3 + 20 * 0.01) / 10)
-    assert benchmark.amdahl(0.0, 64) == 64
-    assert benchmark.amdahl(1.0, 64) == 1
+    assert (benchmark.amdahl(0.0, 64), benchmark.amdahl(1.0, 64)) == (64, 1)
     assert benchmark.amdahl(0.05, 512) == pytest.approx(512 / (1 + 511 * 0.05))
     found = {figure.name: figure for figure in benchmark.of_engine("engine_dask", here, here, engine)}
     assert found["engine_dask_efficiency_2_workers"].value == pytest.approx(10 / 6 / 2)

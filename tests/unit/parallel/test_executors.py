@@ -85,10 +85,16 @@ def test_the_width_of_executors() -> None:
         assert width_of(threads) == 5
 
 
-def test_errors_of_the_work_are_not_those_of_workers() -> None:
-    assert fault_of_workers(MissingExtraError("install deepaccident_devkit[synth]")) is None
-    assert fault_of_workers(AttributeError("'Box' of deepaccident_devkit has no attribute 'x'")) is None
-    assert fault_of_workers(ValueError("deepaccident_devkit")) is None
+@pytest.mark.parametrize(
+    "error",
+    [
+        MissingExtraError("install deepaccident_devkit[synth]"),
+        AttributeError("'Box' of deepaccident_devkit has no attribute 'x'"),
+        ValueError("deepaccident_devkit"),
+    ],
+)
+def test_errors_of_the_work_are_not_those_of_workers(error: Exception) -> None:
+    assert fault_of_workers(error) is None
 
 
 def test_the_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

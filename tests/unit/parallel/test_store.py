@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from refusals import assert_refused
 from stored import ITEMS, Work, made, process, store_in
 
 from deepaccident_devkit.errors import ConfigError, OutputFolderError, SomeFailedError
@@ -99,8 +100,7 @@ def test_no_link_is_followed(tmp_path: Path, place: str) -> None:
     link.parent.mkdir(parents=True, exist_ok=True)
     link.symlink_to(outside / "precious" if place.endswith(("lock", "making", ITEMS[1])) else outside)
     before = (outside / "precious").stat()
-    with pytest.raises(OutputFolderError, match="a symbolic link, which no devkit makes; remove it"):
-        made(tmp_path)
+    assert_refused((lambda: made(tmp_path), OutputFolderError, "a symbolic link, which no devkit makes; remove it"))
     assert [each.name for each in outside.iterdir()] == ["precious"]
     assert (outside / "precious").stat() == before
 
@@ -172,16 +172,22 @@ def test_another_command_waits_for_its_turn(tmp_path: Path) -> None:
             assert not waiting.done()
             with one.shared(lambda: begun.append("one again")):
                 pass
-        waiting.result(20).end()
+        waiting.result(60).end()
     assert begun == ["one", "other"]
 
 
 def test_what_cannot_be_written_is_an_error_of_the_caller(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"out: cannot be written \(no room\); make room there, or choose another"):  # noqa: SIM117
+    def fill() -> None:
         with store_in(tmp_path).shared():
             raise OSError("no room")
+
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match=r"file/out: cannot be written .*; make room there"):  # noqa: SIM117
-        with store_in(tmp_path / "file").shared():
-            pytest.fail("entered")
+    assert_refused(
+        (fill, ConfigError, ("out: cannot be written (no room)", "make room there, or choose another")),
+        (
+            lambda: store_in(tmp_path / "file").shared().__enter__(),
+            ConfigError,
+            ("file/out: cannot be written", "room"),
+        ),
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

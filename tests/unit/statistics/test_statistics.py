@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from refusals import assert_refused
 from tiny import META, TYPE, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.statistics import ENDS, GROUPS, DatasetStatistics, dataset_statistics
@@ -107,14 +109,12 @@ def test_lengths_have_the_references_seven_bins(of_tiny: DatasetStatistics) -> N
     assert lengths.counts["total"] == (2, 0, 0, 0, 0, 0, 0)
     assert lengths.counts["val"] == (1, 0, 0, 0, 0, 0, 0)
     assert lengths.outside == {"total": 4, "train": 3, "val": 0, "test": 0, "unknown": 1}
-    assert lengths.bin_labels()[0] == "30–39"
-    assert lengths.bin_labels()[-1] == "90–100"
+    assert (lengths.bin_labels()[0], lengths.bin_labels()[-1]) == ("30–39", "90–100")
 
 
 def test_ego_drives_at_ten_metres_a_second_and_has_the_size_of_its_row(of_tiny: DatasetStatistics) -> None:
     speeds = of_tiny.histograms["ego_speeds"]
-    assert speeds.counts["total"][10] == 4 + 35 + 2 + 2 + 1
-    assert speeds.total() == 44
+    assert (speeds.counts["total"][10], speeds.total()) == (4 + 35 + 2 + 2 + 1, 44)
     assert speeds.left_out is not None
     assert speeds.left_out.counts["test"] == 30
     sizes = of_tiny.quantiles["ego_sizes"]
@@ -123,8 +123,7 @@ def test_ego_drives_at_ten_metres_a_second_and_has_the_size_of_its_row(of_tiny: 
     assert sizes.median("length", "ego_vehicle", "test") is None
     assert sizes.left_out is not None
     assert sizes.left_out.counts["total"] == 1
-    with pytest.raises(KeyError, match="depth"):
-        sizes.row("depth", "ego_vehicle")
+    assert_refused((lambda: sizes.row("depth", "ego_vehicle"), KeyError, "depth"))
 
 
 def test_actors_and_boxes(of_tiny: DatasetStatistics) -> None:
@@ -146,8 +145,7 @@ def test_distances_leave_out_the_agents_own_row(of_tiny: DatasetStatistics) -> N
     quantiles, histogram = of_tiny.quantiles["distance_quantiles"], of_tiny.histograms["distances"]
     assert quantiles.row("distance", "car").number == 0
     assert quantiles.median("distance", "pedestrian") == pytest.approx(math.hypot(30.0, 1.5))
-    assert histogram.counts["val"][6] >= 35  # 30 to 35 m: every pedestrian
-    assert histogram.total("val") == 2 * 35
+    assert (histogram.counts["val"][6] >= 35, histogram.total("val")) == (True, 2 * 35)  # 30 to 35 m: every pedestrian
 
 
 def test_speeds_are_the_tracks(of_tiny: DatasetStatistics) -> None:
@@ -248,22 +246,18 @@ def test_a_selection_counts_alone(tiny: DeepAccident, of_tiny: DatasetStatistics
     assert nothing.counts["annotations"].total() == 0
     assert "selected: 0 of 6 scenarios" in nothing.to_text()
     assert nothing.to_text().endswith("no scenario meets the filters, so there is nothing to count")
-    with pytest.raises(TokenError, match="nowhere"):
-        dataset_statistics(tiny, ["nowhere/at all"])
+    assert_refused((lambda: dataset_statistics(tiny, ["nowhere/at all"]), TokenError, "nowhere"))
 
 
 def test_a_single_scenario_by_token_or_record(tiny: DeepAccident) -> None:
     record = tiny.scenario[2]
-    want = dataset_statistics(tiny, [record["token"]]).to_json()
-    assert dataset_statistics(tiny, record["token"]).to_json() == want
-    assert dataset_statistics(tiny, record).to_json() == want
+    want, *same = (
+        dataset_statistics(tiny, chosen).to_json() for chosen in ([record["token"]], record["token"], record)
+    )
+    assert same == [want, want]
     assert_refused(
         (lambda: dataset_statistics(tiny, "nowhere"), TokenError, "nowhere"),
-        (
-            lambda: dataset_statistics(tiny, 3),
-            ChoiceError,
-            "scenarios: expected tokens or records of scenarios, found 3",
-        ),
+        (lambda: dataset_statistics(tiny, 3), ChoiceError, ("scenarios", "tokens or records", "found 3")),
     )
 
 
@@ -294,5 +288,33 @@ def test_json_and_csv_say_the_same(of_tiny: DatasetStatistics, tmp_path: Path) -
     assert ["length", "van", "total"] in [row[:3] for row in tables["box_sizes"]]
     assert len(tables["collision_pairs"]) == 1 + len(of_tiny.collisions)
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="file is a file; give a folder"):
-        of_tiny.to_csv(tmp_path / "file")
+    assert_refused((lambda: of_tiny.to_csv(tmp_path / "file"), ConfigError, "file is a file; give a folder"))
+
+
+EDGES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0)
+
+
+def test_pairs_and_scenarios_are_in_their_bins(da_b: DeepAccident) -> None:
+    plain = dataset_statistics(da_b)
+    assert not {"pair_min_ttcs", "scenario_min_ttcs"} & plain.histograms.keys()
+    made = dataset_statistics(da_b, interactions=True)
+    assert {name: each for name, each in made.histograms.items() if name in plain.histograms} == plain.histograms
+    times = [found.pairs.min_ttc[found.pairs.moving] for found in map(da_b.interactions, da_b.scenario)]
+    pairs, scenarios = made.histograms["pair_min_ttcs"], made.histograms["scenario_min_ttcs"]
+    together = np.concatenate(times)
+    assert pairs.counts["total"] == tuple(np.histogram(together[together <= 10], EDGES)[0])
+    assert pairs.outside["total"] == ((together > 10) & np.isfinite(together)).sum()
+    assert pairs.left_out.counts["total"] == np.isinf(together).sum()
+    least = np.array([each.min() for each in times])
+    assert scenarios.counts["total"] == tuple(np.histogram(least[least <= 10], EDGES)[0])
+    assert scenarios.total() + scenarios.left_out.counts["total"] == len(da_b.scenario)
+    below = int((least < 1.5).sum())
+    line = next(line for line in made.to_text().splitlines() if line.startswith("below 1.5 s"))
+    assert f" {below} ({round(100 * below / len(least)):>3} %)" in line
+    assert "below 1.5 s" not in plain.to_text()
+
+
+def test_the_verb_counts_interactions(da_b: DeepAccident) -> None:
+    words = ["info", str(da_b.dataroot), "--statistics", "--interactions"]
+    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert result.output.rstrip("\n") == dataset_statistics(da_b, interactions=True).to_text()

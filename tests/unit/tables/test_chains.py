@@ -35,27 +35,22 @@ def test_tokens_are_unique_and_lead_back_to_their_rows(both_layouts: DeepAcciden
 def test_chains_reach_every_row_once_and_run_both_ways(both_layouts: DeepAccident, table: str) -> None:
     records = {record["token"]: record for record in getattr(both_layouts, table)}
     walked = []
-    for start in [record for record in records.values() if record["prev"] is None]:
-        record = start
-        walked.append(record["token"])
-        while record["next"] is not None:
-            following = records[record["next"]]
-            assert following["prev"] == record["token"]
-            record = following
-            walked.append(record["token"])
+    for record in [record for record in records.values() if record["prev"] is None]:
+        before, token = None, record["token"]
+        while token is not None:
+            assert records[token]["prev"] == before
+            walked.append(token)
+            before, token = token, records[token]["next"]
     assert sorted(walked) == sorted(records)
 
 
 def test_annotation_chains_stay_with_one_agent_and_actor(both_layouts: DeepAccident) -> None:
+    def who(token: str) -> tuple[object, ...]:
+        record = both_layouts.get("annotation", token)
+        return record["actor_id"], both_layouts.get("sample", record["sample_token"])["agent_token"]
+
     for record in both_layouts.annotation:
-        if record["next"] is None:
-            continue
-        following = both_layouts.get("annotation", record["next"])
-        assert following["actor_id"] == record["actor_id"]
-        agent, later_agent = (
-            both_layouts.get("sample", token["sample_token"])["agent_token"] for token in (record, following)
-        )
-        assert agent == later_agent
+        assert record["next"] is None or who(record["next"]) == who(record["token"])
 
 
 def test_an_instances_first_and_last_annotation_are_by_frame_then_agent(both_layouts: DeepAccident) -> None:
@@ -66,11 +61,8 @@ def test_an_instances_first_and_last_annotation_are_by_frame_then_agent(both_lay
             agent = both_layouts.getind("agent", sample["agent_token"])
             entry = (sample["timestamp"], agent, row, record["token"])
             order.setdefault(record["instance_token"], []).append(entry)
-    assert len(order) == len(both_layouts.instance)
-    for instance in both_layouts.instance:
-        entries = sorted(order[instance["token"]])
-        assert instance["num_annotations"] == len(entries)
-        assert (instance["first_annotation_token"], instance["last_annotation_token"]) == (
-            entries[0][-1],
-            entries[-1][-1],
-        )
+    found = {
+        each["token"]: (each["num_annotations"], each["first_annotation_token"], each["last_annotation_token"])
+        for each in both_layouts.instance
+    }
+    assert found == {token: (len(rows), min(rows)[-1], max(rows)[-1]) for token, rows in order.items()}

@@ -3,9 +3,11 @@
 import json
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
+from refusals import assert_refused
 from tiny_index import INDEX, contents, opened
 
 from deepaccident_devkit.cli import deepaccident
@@ -68,36 +70,29 @@ def test_clear_removes_every_index_and_says_what(root: Path, cache: Path, monkey
 def test_clear_of_a_given_folder_leaves_the_others(root: Path, tmp_path: Path) -> None:
     run(root)
     run(root, "--index-dir", tmp_path / "given")
-    run(root, "--index-dir", tmp_path / "given", "--clear")
+    for place in (("--index-dir", tmp_path / "given"), ("--version", "v1-mini")):
+        run(root, *place, "--clear")
+        assert (root / INDEX / MANIFEST_FILE).exists()
     assert list((tmp_path / "given").iterdir()) == []
-    assert (root / INDEX / MANIFEST_FILE).exists()
-    run(root, "--version", "v1-mini", "--clear")
-    assert (root / INDEX / MANIFEST_FILE).exists()
     (root / INDEX / MANIFEST_FILE).unlink()
     assert len(clear_index(root)) == 1  # what a stopped process left is an index too
-    with pytest.raises(VersionError, match="version: expected one of v1, v1-mini, found 'v2'"):
-        clear_index(root, version="v2")
+    assert_refused((lambda: clear_index(root, version="v2"), VersionError, ("version", "v1, v1-mini", "'v2'")))
 
 
 @pytest.mark.parametrize(
     "name", ["notes.txt", "images/1.png", "shards/train/000.tar", "tables-01/notes.txt", "tables-01/linked"]
 )
 def test_clear_refuses_what_is_no_index(root: Path, tmp_path: Path, name: str) -> None:
-    folder = tmp_path / "given"
-    path = folder / "v1" / name
+    folder, path = tmp_path / "given", tmp_path / "given" / "v1" / name
     path.parent.mkdir(parents=True)
-    if name.endswith("linked"):
-        path.symlink_to(root)
-    else:
-        path.write_text("{}")
+    path.symlink_to(root) if name.endswith("linked") else path.write_text("{}")
     before = contents(folder)
     if "tables" not in name:
         assert clear_index(root, index_dir=folder) == []
     run(root, "--index-dir", folder)
     path.parent.mkdir(parents=True, exist_ok=True)  # what looks like tables was removed
     path.write_text("{}")
-    with pytest.raises(IndexStoreError, match=rf"v1: not removed: it holds what is no part of an index: {name};"):
-        clear_index(root, index_dir=folder)
+    assert_refused((lambda: clear_index(root, index_dir=folder), IndexStoreError, ("v1: not removed", f"{name};")))
     assert contents(folder).items() > before.items()
 
 
@@ -114,8 +109,7 @@ def test_clear_follows_no_symbolic_link(root: Path, tmp_path: Path) -> None:
     precious.mkdir()
     (precious / "one.arrow").touch()
     (root / INDEX / "tables-linked").symlink_to(precious)
-    with pytest.raises(IndexStoreError, match="no part of an index: tables-linked"):
-        clear_index(root)
+    assert_refused((lambda: clear_index(root), IndexStoreError, "no part of an index: tables-linked"))
     assert (precious / "one.arrow").exists()
     assert (root / INDEX / MANIFEST_FILE).exists()
 
@@ -137,20 +131,13 @@ def test_a_newer_devkits_index_is_refused_and_kept_until_it_is_cleared(root: Pat
         rf"{path}: a newer devkit's index \(schema version {SCHEMA_VERSION + 1}, this devkit's is {SCHEMA_VERSION}\); "
         r"update the devkit, give another index_dir=, or remove the index with: deepaccident index DATAROOT --clear"
     )
-    with pytest.raises(IndexStoreError, match=sentence):
-        opened(root)
-    assert contents(root) == before
-    assert len(opened(root, tmp_path / "own").scenario) == 2
+    assert_refused((lambda: opened(root), IndexStoreError, sentence))
+    assert (contents(root), len(opened(root, tmp_path / "own").scenario)) == (before, 2)
     run(root, "--clear")
     assert len(opened(root).scenario) == 2
 
 
 def test_clear_of_a_folder_that_cannot_be_emptied(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(root)
-
-    def closed(*_arguments: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(files.shutil, "rmtree", closed)
-    with pytest.raises(IndexStoreError, match=r"v1: cannot be removed \(.*Permission denied"):
-        clear_index(root)
+    monkeypatch.setattr(files.shutil, "rmtree", Mock(side_effect=PermissionError(13, "Permission denied")))
+    assert_refused((lambda: clear_index(root), IndexStoreError, r"v1: cannot be removed \(.*Permission denied"))

@@ -30,18 +30,19 @@ def test_the_rows_of_scenarios_and_agents(both_layouts: DeepAccident) -> None:
         assert maker.tokens(table, rows).to_pylist() == wanted
 
 
-def test_no_rows(da: DeepAccident) -> None:
-    for table in table_names():
-        assert len(RecordTables(da).table(table, np.arange(0))) == 0
+@pytest.mark.parametrize("table", table_names())
+def test_no_rows(da: DeepAccident, table: str) -> None:
+    assert len(RecordTables(da).table(table, np.arange(0))) == 0
 
 
-def test_a_row_that_only_a_damaged_index_holds(da: DeepAccident) -> None:
-    with pytest.raises(IndexStoreError, match="table 'annotation' holds a value out of its range"):
-        RecordTables(da).table("annotation", np.array([len(da.annotation)]))
-
-
-def test_unknown_names(da: DeepAccident) -> None:
+def test_unknown_names_and_a_row_that_only_a_damaged_index_holds(da: DeepAccident) -> None:
+    made, beyond = RecordTables(da), np.array([len(da.annotation)])
     assert_refused(
-        (lambda: RecordTables(da).table("box", np.arange(1)), TableError, "no table 'box'"),
-        (lambda: RecordTables(da).rows(["nowhere"]), TokenError, "has no token 'nowhere'"),
+        (lambda: made.table("box", np.arange(1)), TableError, "no table 'box'"),
+        (lambda: made.rows(["nowhere"]), TokenError, "has no token 'nowhere'"),
+        (
+            lambda: made.table("annotation", beyond),
+            IndexStoreError,
+            "table 'annotation' holds a value out of its range",
+        ),
     )

@@ -49,8 +49,7 @@ def test_left_handed_values_are_turned_once(hand_made: DeepAccident) -> None:
     np.testing.assert_allclose(pose["rotation"], [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)], atol=1e-12)
     assert hand_made.get("sample", FRAME_2)["velocity"] == [0.0, -10.0]
     own = hand_made.get("annotation", f"{FRAME_2}/0")
-    assert own["velocity_label"] == [0.0, -10.0]
-    assert own["actor_id"] == -100
+    assert (own["velocity_label"], own["actor_id"]) == ([0.0, -10.0], -100)
     pedestrian = hand_made.get("annotation", f"{FRAME_2}/2")
     assert (pedestrian["translation"], pedestrian["yaw"]) == ([30.0, 1.5, -0.9], -2.19)
 
@@ -65,19 +64,13 @@ def test_world_boxes_are_where_the_car_is_for_every_agent(hand_made: DeepAcciden
 
 
 @pytest.mark.parametrize("frame", [1, 2, 4])
-def test_velocity_is_the_labels_decoded(hand_made: DeepAccident, frame: int) -> None:
-    """In the LiDAR frame's axes, yawed by −90° in world."""
-    van = hand_made.get("annotation", f"{tiny.TOKEN}/ego_vehicle/{frame:03d}/1")
-    np.testing.assert_allclose(van["velocity"], [0.0, 2.0, 0.0], atol=1e-9)
-    own = hand_made.boxes(f"{tiny.TOKEN}/ego_vehicle/{frame:03d}").velocity[0]
-    np.testing.assert_allclose(own, [0.0, -10.0, 0.0], atol=1e-9)
-
-
-@pytest.mark.parametrize("frame", [1, 2, 4])
-def test_velocity_can_come_from_world_positions(hand_made: DeepAccident, frame: int) -> None:
-    """Central in the middle, one-sided at the ends; untracked boxes have none."""
-    boxes = hand_made.boxes(f"{tiny.TOKEN}/ego_vehicle/{frame:03d}", velocity="derived")
-    np.testing.assert_allclose(boxes.velocity, [[0, -10, 0], [2, 0, 0], [np.nan] * 3], atol=1e-9)
+def test_velocity_is_the_labels_decoded_or_comes_from_world_positions(hand_made: DeepAccident, frame: int) -> None:
+    """In the LiDAR frame's axes, yawed by −90° in world. Central in the middle, one-sided at the ends."""
+    token = f"{tiny.TOKEN}/ego_vehicle/{frame:03d}"
+    derived = hand_made.boxes(token, velocity="derived").velocity
+    np.testing.assert_allclose(derived, [[0, -10, 0], [2, 0, 0], [np.nan] * 3], atol=1e-9)  # one is untracked
+    np.testing.assert_allclose(hand_made.get("annotation", f"{token}/1")["velocity"], [0.0, 2.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(hand_made.boxes(token).velocity[0], [0.0, -10.0, 0.0], atol=1e-9)
 
 
 def test_velocity_is_exact_where_positions_tell_less(tmp_path: Path) -> None:
@@ -102,8 +95,8 @@ def test_velocity_is_exact_where_positions_tell_less(tmp_path: Path) -> None:
 
 def test_untracked_boxes_have_no_instance_and_no_chain(hand_made: DeepAccident) -> None:
     untracked = hand_made.get("annotation", f"{FRAME_2}/2")
-    assert untracked["velocity"] == [0.0, 0.0, 0.0]
-    assert (untracked["instance_token"], untracked["prev"], untracked["next"]) == (None, None, None)
+    found = [untracked[name] for name in ("velocity", "instance_token", "prev", "next")]
+    assert found == [[0.0, 0.0, 0.0], None, None, None]
 
 
 def test_the_labels_own_velocity_can_be_asked_for(hand_made: DeepAccident) -> None:
@@ -169,8 +162,7 @@ def test_a_sensor_has_one_row_where_rounding_alone_differs(tmp_path: Path, shift
     assert [token for token in tokens if token.startswith(lidar)] == [lidar, f"{lidar}/2"][:rows]
     exact = [da.ego_from(f"{tiny.TOKEN}/ego_vehicle/{frame:03d}", "lidar01").translation[0] for frame in (1, 3)]
     assert exact == [0.0, shift]
-    named = {finding.code for finding in da.findings(tiny.TOKEN)}
-    assert ("calib-changes" in named) == (rows == 2)
+    assert ("calib-changes" in {finding.code for finding in da.findings(tiny.TOKEN)}) == (rows == 2)
 
 
 def test_sensor_data_comes_with_boxes_in_the_sensors_frame(hand_made: DeepAccident, tmp_path: Path) -> None:
