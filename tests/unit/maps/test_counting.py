@@ -5,10 +5,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import SE3
-from deepaccident_devkit.maps.counting import GROUND_CLASSES, cells_around, codes_in_world
+from deepaccident_devkit.maps import TownMapConfig
+from deepaccident_devkit.maps.counting import (
+    GROUND_CLASSES,
+    cells_around,
+    chosen_frames,
+    codes_in_world,
+    hidden_ground,
+    looks_of,
+)
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.support.arrays import ByteArray
+from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA
 
 
 def checkered(side: int) -> ByteArray:
@@ -70,3 +81,102 @@ def test_the_cells_around_hold_every_picture(resolution: float) -> None:
     reached = (poses @ corners.T)[:, :2] / resolution
     np.testing.assert_array_equal(low[::-1], np.floor(reached.min(axis=(0, 2)) + 1e-9))
     np.testing.assert_array_equal(high[::-1], np.ceil(reached.max(axis=(0, 2)) - 1e-9))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("resolution", 0.05, "resolution: expected a number of at least 0.1, found 0.05"),
+        ("resolution", float("nan"), "resolution: expected a number of at least 0.1, found nan"),
+        ("travel", 0.0, "travel: expected a number above 0, found 0"),
+        ("period", -1.0, "period: expected a number above 0, found -1"),
+        ("period", float("inf"), "period: expected a number above 0, found inf"),
+        ("travel", "far", "travel: expected a number, found 'far'"),
+    ],
+)
+def test_what_is_no_setting(name: str, value: object, words: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{words}$"):
+        TownMapConfig(**{name: value})  # type: ignore[arg-type]
+
+
+def test_whole_numbers_are_taken_for_the_same_setting() -> None:
+    assert repr(TownMapConfig(travel=20)) == repr(TownMapConfig(travel=20.0))
+
+
+@pytest.fixture
+def street() -> np.ndarray:
+    """A street of 20 × 40 cells with a sidewalk of 8 more rows; cells of 1 m."""
+    classes = np.full((28, 40), 1, np.uint8)
+    classes[20:] = 3
+    return classes
+
+
+def test_a_hole_is_what_lies_around_it(street: np.ndarray) -> None:
+    street[4:6, 10:15] = 0
+    street[22:24, 10:15] = 0
+    filled = hidden_ground(street, 1.0)
+    assert (filled[4:6, 10:15] == 1).all()
+    assert (filled[22:24, 10:15] == 3).all()
+    assert filled.sum() == 10 + 30
+
+
+def test_road_lines_are_taken_for_road(street: np.ndarray) -> None:
+    street[3:7, 9:16] = 2
+    street[4:6, 10:15] = 0
+    assert (hidden_ground(street, 1.0)[4:6, 10:15] == 1).all()
+
+
+def test_a_hole_between_two_kinds_is_what_has_more_of_its_edge(street: np.ndarray) -> None:
+    street[18:21, 5:9] = 0  # of its 14 neighbours 4 + 2 · 2 are road
+    street[19:23, 20:24] = 0
+    filled = hidden_ground(street, 1.0)
+    assert set(filled[18:21, 5:9].ravel()) == {1}
+    assert set(filled[19:23, 20:24].ravel()) == {3}
+
+
+def test_large_holes_and_those_at_the_edge_stay(street: np.ndarray) -> None:
+    street[2:10, 2:10] = 0  # 64 m²
+    street[0:2, 20:22] = 0
+    street[12:14, 0] = street[12:14, -1] = street[-1, 7] = 0
+    assert not hidden_ground(street, 1.0).any()
+    assert (hidden_ground(street, 0.9) > 0).sum() == 64
+
+
+def test_nothing_seen_and_all_seen() -> None:
+    assert not hidden_ground(np.zeros((5, 5), np.uint8), 1.0).any()
+    assert not hidden_ground(np.full((5, 5), 2, np.uint8), 1.0).any()
+
+
+def test_who_stands_is_read_every_two_seconds_and_at_the_end() -> None:
+    assert chosen_frames(np.zeros((45, 2)), TownMapConfig()).tolist() == [0, 20, 40, 44]
+    assert chosen_frames(np.zeros((1, 2)), TownMapConfig()).tolist() == [0]
+
+
+def test_who_drives_is_read_every_ten_metres() -> None:
+    xy = np.column_stack([np.arange(14) * 3.0, np.arange(14) * 4.0])  # 5 m a frame
+    assert chosen_frames(xy, TownMapConfig()).tolist() == [0, 2, 4, 6, 8, 10, 12, 13]
+
+
+@given(st.lists(st.floats(0, 3), min_size=1, max_size=90), st.floats(1, 30), st.floats(0.3, 4))
+def test_between_two_pictures_nothing_is_far(speeds: list[float], travel: float, period: float) -> None:
+    """A picture is due in each stretch of the way and of time, so that two of them are at most two stretches apart."""
+    travelled = np.concatenate([[0.0], np.cumsum(speeds)])
+    config = TownMapConfig(travel=travel, period=period)
+    frames = chosen_frames(np.column_stack([travelled, 0 * travelled]), config)
+    assert (frames[0], frames[-1]) == (0, len(travelled) - 1)
+    gaps = np.diff(frames)
+    assert (gaps > 0).all()
+    assert (gaps * 0.1 <= period + 0.1 + 1e-6).all()
+    assert (np.diff(travelled[frames]) <= travel + 3 + 1e-6).all()
+
+
+def test_the_looks_are_the_agents_own_samples_with_their_poses(da: DeepAccident) -> None:
+    token = da.scenario[1]["token"]
+    recordings = looks_of(da, 1, TownMapConfig())
+    assert len(recordings) == len(AGENTS)
+    for agent, looks in zip(AGENTS, recordings, strict=True):
+        samples = [f"{token}/{agent}/{frame:03d}" for frame in (1, 6)]
+        assert [da.sample[row]["token"] for row in looks.sample_rows.tolist()] == samples
+        assert [*looks.files(da)] == [da.sensor_path(sample, BEV_CAMERA) for sample in samples]
+        for sample, pose in zip(samples, looks.poses, strict=True):
+            np.testing.assert_array_equal(pose, da.world_from(sample, "ego").matrix)

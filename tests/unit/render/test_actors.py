@@ -1,8 +1,9 @@
-"""An actor over time: its path, its views and who sees it."""
+"""One box: large from above, in a camera and in words."""
 
 from typing import Any
 
 import numpy as np
+import pytest
 from drawing import tokens_of
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
@@ -10,10 +11,45 @@ from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render import detached_figure, render_instance
+from deepaccident_devkit.render import detached_figure, render_annotation, render_instance
 from deepaccident_devkit.render.actors import sightings
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
+from deepaccident_devkit.v2x import visible_instances
+
+
+def test_an_annotation_is_shown_large_from_above_and_in_words(da: DeepAccident, frame: str) -> None:
+    sample = f"{frame.rsplit('/', 1)[0]}/ego_vehicle_behind/004"
+    ego = da.get("agent", f"{frame.rsplit('/', 1)[0]}/ego_vehicle")["actor_id"]
+    boxes = da.boxes(sample, "ego")
+    row = int(np.flatnonzero(boxes.actor_id == ego)[0])
+    fig = render_annotation(da, f"{sample}/{row}", margin=8, fig=detached_figure((10, 5)))
+    camera, above, words = fig.axes
+    assert camera.get_title() == "Camera_Front"
+    assert np.ptp(camera.get_xlim()) <= 64
+    center = np.mean([above.get_xlim(), above.get_ylim()], axis=1)
+    np.testing.assert_allclose(center, boxes.center[row, :2], atol=1e-9)
+    assert np.ptp(above.get_xlim()) == pytest.approx(16)
+    text = "\n".join(one.get_text() for one in words.texts)
+    length, width, height = boxes.size[row]
+    for fact in (
+        f"category: {boxes.category_names[row]}",
+        f"label id: {ego}",
+        f"size: {length:.2f} × {width:.2f} × {height:.2f} m",
+        f"speed: {np.linalg.norm(boxes.velocity[row]):.1f} m/s",
+        f"distance: {np.linalg.norm(boxes.center[row, :2]):.1f} m from the agent",
+        f"LiDAR points: {boxes.num_lidar_pts[row]}",
+        "impact: in 0.2 s, with this actor",
+        "annotated by: ego, ego behind",
+    ):
+        assert fact in text
+
+
+def test_an_agent_s_own_box_is_in_none_of_its_cameras(da: DeepAccident, frame: str) -> None:
+    sample = f"{frame.rsplit('/', 1)[0]}/ego_vehicle/004"
+    own = da.boxes(sample, "lidar").actor_id.tolist().index(OWN_ACTOR_ID)
+    fig = render_annotation(da, f"{sample}/{own}", fig=detached_figure((10, 5)))
+    assert [one.get_text() for one in fig.axes[0].texts] == ["in no image of its agent's cameras"]
 
 
 def drawn(da: DeepAccident, instance: str, **how: Any) -> tuple[Any, dict[str, Any]]:
@@ -106,3 +142,21 @@ def test_a_release_without_images_shows_what_the_labels_tell(da_b: DeepAccident)
     _, panels = drawn(da_b, instance["token"])
     assert not any(panels[name].images for name in panels)
     assert len(panels["speed"].lines[0].get_xdata()) == len(da_b.trajectory(instance))
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_sightings_are_the_agent_s_annotations_and_the_released_rule(da: DeepAccident, other: str, agent: str) -> None:
+    scenario, actor = other.split("/actor/")
+    known = sightings(da, scenario, agent, int(actor))
+    points, camera, seen = {}, {}, []
+    for index in range(1, 7):
+        sample = f"{scenario}/{agent}/{index:03d}"
+        for annotation in da.annotation:
+            if annotation["sample_token"] == sample and annotation["actor_id"] == int(actor):
+                points[index], camera[index] = annotation["num_lidar_pts"], annotation["camera_visible"]
+                seen.append(other in visible_instances(da, sample, agents=[agent]))
+    assert known.index.tolist() == list(points)
+    assert known.points.tolist() == list(points.values())
+    assert known.camera.tolist() == list(camera.values())
+    assert known.seen.tolist() == seen
+    assert (agent == "other_vehicle") == (len(points) == 0)

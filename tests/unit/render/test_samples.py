@@ -5,17 +5,16 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib import pyplot as plt
-from matplotlib.collections import PathCollection
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_hex
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render import detached_figure, render_frame, render_sample
+from deepaccident_devkit.render import detached_figure, render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.samples import draw_shared_moment
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
-
-pytestmark = pytest.mark.slow
+from deepaccident_devkit.v2x import map_pointcloud_to_image
 
 
 def images(axes: Any) -> list[Any]:
@@ -35,6 +34,7 @@ def clouds(fig: Any) -> dict[str, int]:
     return {ax.get_title(): sum(type(one) is PathCollection for one in ax.collections) for ax in fig.axes}
 
 
+@pytest.mark.slow
 def test_a_frame_shows_its_agents_in_their_order(da: DeepAccident, frame: str) -> None:
     fig = render_frame(da, frame, fig=detached_figure((16, 9)))
     cameras, above = fig.axes[:5], fig.axes[5:]
@@ -51,6 +51,7 @@ def test_a_frame_shows_its_agents_in_their_order(da: DeepAccident, frame: str) -
     assert plt.get_fignums() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "least"), [((12.8, 7.2), 290), ((12.8, 4.48), 235)])
 def test_a_shared_moment_has_large_cameras_and_one_view_from_above_of_all_agents(
     da: DeepAccident, frame: str, size: tuple[float, float], least: float
@@ -70,12 +71,14 @@ def test_a_shared_moment_has_large_cameras_and_one_view_from_above_of_all_agents
     assert {COLLIDER_COLOR, AGENT_COLORS["ego_vehicle_behind"]} <= colors_from_above_shared(above)
 
 
+@pytest.mark.slow
 def test_the_order_of_agents_is_fixed_and_who_is_left_out_leaves_no_hole(da: DeepAccident, frame: str) -> None:
     fig = render_frame(da, frame, agents=("infrastructure", "ego_vehicle_behind"), fig=detached_figure((8, 6)))
     assert [ax.get_title() for ax in fig.axes] == ["ego_vehicle_behind", "infrastructure", "", ""]
     assert all(ax.has_data() for ax in fig.axes)
 
 
+@pytest.mark.slow
 def test_the_columns_stand_side_by_side_with_camera_above_view_from_above(da: DeepAccident, frame: str) -> None:
     fig = render_frame(da, frame, fig=detached_figure((16, 9)))
     fig.draw_without_rendering()
@@ -88,6 +91,7 @@ def test_the_columns_stand_side_by_side_with_camera_above_view_from_above(da: De
     assert (np.diff([box.x0 for box in boxes[:5]]) > boxes[0].width).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(18, 6.9), (16, 9), (12.8, 7.2)])
 def test_panels_from_above_fill_a_tall_figure(da: DeepAccident, frame: str, size: tuple[float, float]) -> None:
     fig = render_frame(da, frame, fig=detached_figure(size))
@@ -100,6 +104,7 @@ def test_panels_from_above_fill_a_tall_figure(da: DeepAccident, frame: str, size
     assert half == pytest.approx(50, abs=1e-9) if wide else 50.1 < half <= 100
 
 
+@pytest.mark.slow
 def test_a_part_of_a_figure_is_drawn_on(da: DeepAccident, frame: str) -> None:
     left, right = detached_figure((24, 7)).subfigures(1, 2)
     assert render_frame(da, frame, fig=left) is left
@@ -108,6 +113,7 @@ def test_a_part_of_a_figure_is_drawn_on(da: DeepAccident, frame: str) -> None:
     assert [len(part.axes) for part in (left, right)] == [10, 7]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(16.0, 5.6), (12.8, 7.2)])
 def test_the_cameras_of_a_sample_fill_the_figure(da: DeepAccident, frame: str, size: tuple[float, float]) -> None:
     """Three a row in a wide figure, two in one of 16 to 9: front and back on top."""
@@ -119,6 +125,7 @@ def test_the_cameras_of_a_sample_fill_the_figure(da: DeepAccident, frame: str, s
     assert min(panel.y0 for panel in panels.values()) < 0.2 * fig.bbox.height
 
 
+@pytest.mark.slow
 def test_a_sample_shows_six_cameras_as_they_look_and_the_view_from_above(da: DeepAccident, frame: str) -> None:
     sample = da.samples_of(frame)[0]
     fig = render_sample(da, sample, fig=detached_figure((16, 6)))
@@ -135,6 +142,7 @@ def test_a_sample_shows_six_cameras_as_they_look_and_the_view_from_above(da: Dee
             assert_array_equal(images([ax])[0], da.load_image(f"{sample['token']}/{ax.get_title()}"))
 
 
+@pytest.mark.slow
 def test_each_panel_draws_the_layers_that_it_has(da: DeepAccident, frame: str) -> None:
     sample = da.samples_of(frame)[0]
     fig = render_sample(da, sample, agents=None, layers=["points"], fig=detached_figure((16, 6)))
@@ -142,3 +150,52 @@ def test_each_panel_draws_the_layers_that_it_has(da: DeepAccident, frame: str) -
     assert not any(ax.images for ax in fig.axes)
     plain = render_sample(da, sample, fig=detached_figure((16, 6)))
     assert clouds(plain) == {**dict.fromkeys(CAMERAS, 0), "": 1}
+
+
+def clouds_of(ax: Any) -> list[Any]:
+    return [one for one in ax.collections if type(one) is PathCollection]
+
+
+def test_of_a_sample_all_agents_points_are_in_its_six_cameras(da: DeepAccident) -> None:
+    sample = da.sample[3]["token"]
+    scenario, _, number = sample.rsplit("/", 2)
+    fig = render_calibration(da, sample, fig=detached_figure((15, 7)))
+    assert sorted(ax.get_title() for ax in fig.axes) == sorted(CAMERAS)
+    for ax in fig.axes:
+        for agent, drawn in zip(AGENTS, clouds_of(ax), strict=True):
+            points = map_pointcloud_to_image(
+                da, f"{sample}/{ax.get_title()}", f"{scenario}/{agent}/{number}", colors=False
+            )
+            offsets = np.asarray(drawn.get_offsets()).reshape(-1, 2)
+            assert_allclose(offsets, points.pixels[points.mask], atol=1e-6)
+            if len(offsets):
+                assert to_hex(drawn.get_facecolor()[0]) == AGENT_COLORS[agent]
+        assert len(ax.images) == 1
+    assert [one.get_text() for one in fig.legends[0].get_texts()][::4] == ["ego", "infrastructure"]
+    assert plt.get_fignums() == []
+
+
+def test_of_a_frame_the_front_cameras_of_its_agents_are_shown(da: DeepAccident) -> None:
+    frame = da.get("frame", da.sample[3]["frame_token"])
+    fig = render_calibration(da, frame, agents=("infrastructure", "ego_vehicle"), fig=detached_figure((10, 4)))
+    assert [ax.get_title() for ax in fig.axes] == ["ego_vehicle, Camera_Front", "infrastructure, Camera_Front"]
+    assert [len(clouds_of(ax)) for ax in fig.axes] == [2, 2]
+    everyone = render_calibration(da, frame["token"], layers=["image"], fig=detached_figure((15, 7)))
+    shown = [ax for ax in everyone.axes if ax.images]
+    assert [ax.get_title().split(",")[0] for ax in shown] == list(AGENTS)
+
+
+def test_boxes_are_those_of_all_agents_but_the_camera_s_own_vehicle(da: DeepAccident) -> None:
+    sample = da.sample[3]["token"]
+    fig = render_calibration(da, sample, layers=["boxes"], fig=detached_figure((15, 7)))
+    front = next(ax for ax in fig.axes if ax.get_title() == "Camera_Front")
+    boxes = da.cooperative_boxes(sample, frame="Camera_Front")
+    own = da.get("agent", sample.rsplit("/", 1)[0])["actor_id"]
+    near = (np.linalg.norm(boxes.center, axis=1) < 60) & (boxes.actor_id != own)
+    depth = boxes.corners()[near][..., 2]
+    whole, partly = (depth >= 0.1).all(axis=1).sum(), (depth >= 0.1).any(axis=1).sum()
+    edges = next(one for one in front.collections if type(one) is LineCollection)
+    assert 0 < 12 * whole <= len(edges.get_segments()) <= 12 * partly
+    assert clouds_of(front) == []
+    assert not front.images
+    assert not fig.legends

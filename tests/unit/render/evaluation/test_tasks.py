@@ -5,10 +5,21 @@ from typing import Any
 import numpy as np
 from drawing import new_axes, words
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
-from deepaccident_devkit.evaluation import AccidentEvaluator
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation import AccidentEvaluator, MotionEvaluator
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
-from deepaccident_devkit.render.evaluation import render_accuracy, render_alarms, render_errors
+from deepaccident_devkit.evaluation.detection.result import DetectionResult
+from deepaccident_devkit.evaluation.warning import WarningEvaluator
+from deepaccident_devkit.render.evaluation import (
+    render_accuracy,
+    render_alarms,
+    render_errors,
+    render_precision_recall,
+    render_predictors,
+    render_quality_by_time,
+)
 from deepaccident_devkit.render.evaluation.tasks import accuracy_by_distance, alarm_precision_recall
 
 LEFT_OUT = {"unjudged": 0, "beyond": 0, "at_impact": False, "unplaced": False}
@@ -102,3 +113,49 @@ def test_errors_are_counted() -> None:
     ax = render_errors(boxes(), "time", ax=new_axes())
     assert {bar.get_x() + 0.25: bar.get_height() for bar in ax.patches if bar.get_height()} == {0.5: 1, -0.5: 1}
     assert "no accident has a prediction" in words(render_errors(AccidentEvaluator("boxes"), "time", ax=new_axes()))
+
+
+def test_precision_is_drawn_up_to_the_recall_that_is_reached(detected: DetectionResult) -> None:
+    ax = render_precision_recall(detected, "car", ax=new_axes())
+    assert_array_equal(ax.lines[0].get_xydata(), [(0.25, 1), (0.5, 0.5), (0.75, 0.5)])
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["0.5: AP 50.0 %", "2: AP 75.0 %"]
+    assert words(ax) == "car: 8 true, 9 detected"
+    ax = render_precision_recall(detected, "truck", ax=new_axes())
+    assert not ax.lines
+    assert "none in the truth" in words(ax)
+    assert_refused(
+        (
+            lambda: render_precision_recall(detected, "bus"),
+            ChoiceError,
+            "name: expected one of car, van, truck, found 'bus'",
+        ),
+        (lambda: render_precision_recall(detected, "car", ring=1), ChoiceError, "ring: expected 0 to 0, found 1"),
+    )
+
+
+def moving() -> MotionEvaluator:
+    """Two samples, of two frames and of one."""
+    evaluator = MotionEvaluator("paper")
+    for token, frames in {"a": 2, "b": 1}.items():
+        vpq = [[[0.8] * frames, [1] * frames, [0, 2][:frames], [0] * frames], [[0.0] * frames] * 4]
+        counts = {
+            "samples": 1,
+            "frames": frames,
+            "instance_maps": 0,
+            "cells": [[3, 1, 0], [0, 0, 0]],
+            "vpq": vpq,
+            "paths": None,
+        }
+        evaluator.add(token, counts)
+    return evaluator
+
+
+def test_motion_is_drawn_by_frame() -> None:
+    ax = render_quality_by_time(moving(), ax=new_axes())
+    assert_allclose(ax.lines[0].get_xydata(), [(0, 80), (0.5, 40)])
+    assert np.isnan(ax.lines[1].get_ydata()).all()
+    assert "nothing to count" in words(render_quality_by_time(MotionEvaluator(), ax=new_axes()))
+
+
+def test_nothing_to_warn_of_is_said() -> None:
+    assert "no recording" in words(render_predictors(WarningEvaluator().compute(), ax=new_axes()))

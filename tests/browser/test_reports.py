@@ -1,0 +1,119 @@
+"""The page of `deepaccident demo`, opened as its reader opens it."""
+
+from pathlib import Path
+
+import pytest
+from chromium import Browser
+from evaluation_runs import PARTIAL, evaluation_run
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.motion import samples
+from deepaccident_devkit.render.evaluation import save_report
+from deepaccident_devkit.safety import safety_report
+from deepaccident_devkit.safety.page import save_safety_report
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("width", [1280, 700])
+def test_the_page_shows_pictures_replay_and_report(width: int, made_demo: tuple[Path, str], browser: Browser) -> None:
+    out, _ = made_demo
+    browser.open(out / "index.html", width)
+    assert browser.script("return document.compatMode") == "CSS1Compat"
+    assert browser.script("return document.images.length") == 4
+    assert browser.script("return [...document.images].filter((each) => !each.naturalWidth).length") == 0
+    assert browser.overflowing() == []
+    assert browser.script("return document.documentElement.scrollWidth") <= width
+    frames = browser.driver.find_elements("tag name", "iframe")
+    titles = []
+    for frame in frames:
+        browser.driver.execute_script("arguments[0].scrollIntoView()", frame)  # the browser loads it when it is near
+        browser.driver.switch_to.frame(frame)
+        titles.append(browser.script("return document.title"))
+        assert browser.script("return document.documentElement.scrollWidth <= innerWidth")
+        browser.driver.switch_to.default_content()
+    assert [title.split(":")[0] for title in titles] == ["Accident replay", "DeepAccident evaluation"]
+    assert browser.complaints() == []
+    assert [each for each in browser.requests() if not each.startswith(out.as_uri())] == []
+
+
+LONG = "a_name_without_any_blank_that_is_much_longer_than_a_telephone_is_wide_" * 3
+SETUPS = (
+    EvaluationSetup(task="motion"),
+    EvaluationSetup(task="accident", protocol="paper"),
+    EvaluationSetup(task="detection", protocol="released_iou"),
+    EvaluationSetup(task="warning", protocol="clean"),
+)
+
+
+@pytest.fixture(scope="module")
+def tokens(da_motion: DeepAccident) -> list[str]:
+    listed = samples(da_motion, "train", "evaluate", "paper", scope="all")
+    return [token for token in listed if token.split("/")[-2] in ("ego_vehicle", "infrastructure")][::2]
+
+
+@pytest.mark.parametrize("setup", SETUPS, ids=lambda setup: setup.task)
+def test_a_report_opens_without_a_complaint(
+    setup: EvaluationSetup, da_motion: DeepAccident, tokens: list[str], browser: Browser, tmp_path: Path
+) -> None:
+    run = evaluation_run(da_motion, setup, tokens, partial=PARTIAL, meta={"method": LONG, "paper": {LONG: [LONG, 1.5]}})
+    page = save_report(run, tmp_path)
+    for width in (1200, 400):
+        browser.open(page, width)
+        browser.script("document.querySelectorAll('details').forEach((each) => { each.open = true; });")
+        assert browser.script("return document.compatMode") == "CSS1Compat"
+        assert browser.script("return [...document.images].filter((each) => !each.naturalWidth).length") == 0
+        assert browser.script("return document.images.length") >= 2
+        assert browser.overflowing() == []
+        assert browser.script("return document.documentElement.scrollWidth") <= width
+        assert browser.complaints() == []
+        assert browser.requests() == [page.as_uri()]
+
+
+COLUMN = """
+const headings = [...document.querySelector('.sortable').tHead.rows[1].cells];
+const column = headings.findIndex((each) => each.textContent === '%s');
+return [...document.querySelector('.sortable').tBodies[0].rows].map((row) => row.cells[column].textContent);
+"""
+CLICK = """
+[...document.querySelectorAll('.sortable button')].find((each) => each.textContent === '%s').click();
+"""
+
+
+@pytest.fixture(scope="module")
+def page(da_b: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    report = safety_report(da_b, workers=1)
+    return save_safety_report(report, tmp_path_factory.mktemp("safety"), dataset=da_b, replays=1, workers=1)[-1]
+
+
+def test_it_opens_without_a_complaint(page: Path, browser: Browser, scheme: str) -> None:
+    for width in (1280, 400):
+        browser.open(page, width)
+        browser.script("document.querySelectorAll('details').forEach((each) => { each.open = true; });")
+        assert browser.overflowing() == []
+        assert browser.complaints() == []
+        assert browser.requests() == [page.as_uri()]
+        assert browser.script("return [...document.images].filter((each) => !each.naturalWidth).length") == 0
+    assert browser.scheme() == scheme
+
+
+def test_a_click_sorts(page: Path, browser: Browser) -> None:
+    browser.open(page, 1280)
+    browser.script(CLICK % "closing")
+    values = [*map(float, browser.script(COLUMN % "closing"))]
+    assert len(values) >= 3
+    assert len(set(values)) > 1
+    assert values == sorted(values)
+    browser.script(CLICK % "closing")
+    assert [*map(float, browser.script(COLUMN % "closing"))] == values[::-1]
+    browser.script(CLICK % "scenario")
+    names = browser.script(COLUMN % "scenario")
+    assert names == sorted(names)
+    assert browser.complaints() == []
+
+
+def test_a_link_leads_to_a_replay(page: Path, browser: Browser) -> None:
+    browser.open(page, 1280)
+    browser.script("document.querySelector('.sortable a').click()")
+    assert "Accident replay" in browser.driver.title

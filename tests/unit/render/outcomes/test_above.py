@@ -1,0 +1,136 @@
+"""Accidents foreseen: places, metres and words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drawing import new_axes, picture, rendered, title_of
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex, to_rgb
+from numpy.testing import assert_allclose
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation import (
+    Accident,
+    AccidentContext,
+    AccidentEvaluator,
+    DetectedBoxes,
+    MotionEvaluator,
+    MotionOutput,
+    box_truth,
+    detection_truth,
+    instances_of,
+)
+from deepaccident_devkit.evaluation.accident.scoring import ComparedAccidents
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome, motion_outcome
+from deepaccident_devkit.render.outcomes.above import difference_words, verdict_words
+from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
+from deepaccident_devkit.render.styles import OUTCOME_COLORS
+
+
+def test_accidents_without_truth(da_motion: DeepAccident) -> None:
+    normal = next(scenario for scenario in da_motion.scenario if not scenario["collision"])
+    token = da_motion.get_sample(normal, "ego_vehicle", 5)["token"]
+    alarm = Accident(positions=np.array([[5.0, 0.0], [7.0, 0.0]]), time=1.0)
+    figure = render_evaluation(da_motion, token, [alarm], fig=detached_figure((9, 5)))
+    assert title_of(figure).endswith("5 m: FP, 10 m: FP, 15 m: FP")
+    assert figure.axes[0].get_title() == "truth: no accident comes"
+    nothing = ComparedAccidents(true=None, predicted=())
+    assert difference_words(nothing) == "no accident comes, none is foreseen"
+    assert not draw_accident_outcome(nothing, ax=new_axes()).lines
+
+
+def test_the_verdict_names_several_of_a_kind(da_motion: DeepAccident, sample: str) -> None:
+    evaluator = AccidentEvaluator("boxes")
+    far = Accident(positions=np.array([[40.0, 40.0], [42.0, 40.0]]), time=1.0)
+    evaluator.update(sample, [far, replace(far, score=0.5)], None, AccidentContext(truth=box_truth(da_motion, sample)))
+    assert verdict_words(evaluator.compute()) == "5 m: 2 FP + FN, 10 m: 2 FP + FN, 15 m: 2 FP + FN"
+
+
+@pytest.mark.parametrize("off", [0.0, 0.5, 1.0, 2.0, 4.0])
+def test_words_cover_neither_circles_nor_crosses(da_motion: DeepAccident, sample: str, off: float) -> None:
+    truth = box_truth(da_motion, sample)
+    assert truth.accident is not None
+    alarm = replace(truth.accident, positions=truth.accident.positions + np.array([off, -off]))
+    ax = draw_accident_outcome(ComparedAccidents(true=truth.accident, predicted=(alarm,)), truth, ax=new_axes())
+    rendered(ax)
+    chips = [text.get_window_extent() for text in ax.texts if text.get_visible()]
+    assert len(chips) == 3
+    for place in ax.transData.transform(np.concatenate([truth.accident.positions, alarm.positions])):
+        assert not any(chip.padded(3).contains(*place) for chip in chips)
+
+
+def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sample: str) -> None:
+    truth = detection_truth(da_motion, sample, "paper")
+    truth = truth.select((np.abs(truth.center[:, :2]) < 50).all(axis=1))  # well within the protocol's area
+    some = np.arange(2, len(truth))
+    center = np.vstack([truth.center[some] + (0.3, 0.0, 0.0), [[20.0, -45.0, 0.0]]])
+    detected = DetectedBoxes.from_arrays(
+        center,
+        np.vstack([truth.size[some], [[4.0, 2.0, 1.5]]]),
+        np.append(truth.yaw[some], 0.0),
+        np.linspace(1, 0.5, len(center)),
+        category=np.append(truth.category[some], 0),
+        frame="lidar",
+    )
+    ax = draw_detection_outcome(detected, truth, "paper", ax=new_axes())
+    shapes = {
+        to_hex(each.get_edgecolor()[0]): each.get_paths()
+        for each in ax.collections
+        if isinstance(each, PolyCollection) and len(each.get_paths())
+    }
+    (false,) = shapes[OUTCOME_COLORS["false"]]
+    assert_allclose(false.vertices[:4].mean(axis=0), (20, -45))
+    missed = [path.vertices[:4].mean(axis=0) for path in shapes[OUTCOME_COLORS["missed"]]]
+    assert_allclose(missed, truth.center[:2, :2], atol=1e-6)
+    assert len(shapes[OUTCOME_COLORS["right"]]) == len(some)
+    assert ax.get_title() == f"at 2 m: {len(some)} TP, 1 FP, 2 FN;\ncentres off by 0.30 m on average"
+    ego_from_lidar = da_motion.ego_from(sample, "lidar01")
+    moved = DetectedBoxes(boxes=detected.boxes.transform(ego_from_lidar, "ego"), scores=detected.scores)
+    figure = render_evaluation(da_motion, sample, moved, protocol="paper", fig=detached_figure((10, 6)))
+    assert figure.axes[1].get_title().startswith(f"at 2 m: {len(some)} TP, 1 FP, ")
+    assert figure.axes[0].get_title().startswith(f"true boxes: {len(some)} found, ")
+
+
+def damaged(labels: MotionLabels) -> MotionOutput:
+    """The labels without one instance, with one too many, and with one that is four cells off in later frames."""
+    instance = labels.instance.copy()
+    instance[instance == 3] = 0
+    instance[:, 2:8, 2:12] = 90
+    moved = instance[1:] == 4
+    instance[1:][moved] = 0
+    instance[1:][np.roll(moved, 4, axis=-2)] = 4
+    return instances_of(instance, labels.config.grid)
+
+
+def test_motion_outcomes_are_those_that_are_counted(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+    output = damaged(labels)
+    outcome = motion_outcome(output, labels)
+    evaluator = MotionEvaluator("released")
+    evaluator.update(sample, output, labels)
+    counted = evaluator.compute().ranges["100x100"]
+    assert len(outcome.matches) == counted.true_positive
+    sides = {"true": (labels.instance, counted.false_negative), "predicted": (outcome.predicted.instance, None)}
+    for side, (instance, missed) in sides.items():
+        cells = outcome.outcomes(side)  # type: ignore[arg-type]
+        frames = [np.unique(here[kind == 2]) for here, kind in zip(instance, cells, strict=False)]
+        total = counted.false_positive if missed is None else missed
+        assert sum(map(len, frames)) == total > 0
+    figure = render_evaluation(da_motion, sample, output, fig=detached_figure((10, 6)))
+    left, right = figure.axes
+    assert left.get_title() == f"true instances: {counted.true_positive} found, {counted.false_negative} missed"
+    assert right.get_title().endswith(f"{counted.true_positive} right, {counted.false_positive} false")
+    assert f"PQ {counted.pq:.1f} %" in title_of(figure)
+    present = np.isin(labels.instance[0], 3)
+    assert_allclose(picture(left)[present], np.broadcast_to(to_rgb(OUTCOME_COLORS["missed"]), (present.sum(), 3)))
+    assert_allclose(picture(right)[4, 4], to_rgb(OUTCOME_COLORS["false"]))
+
+
+def test_what_lies_beyond_the_range_is_not_judged(labels: MotionLabels, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deepaccident_devkit.render.outcomes.above.RANGES", {"30x30": 30.0})
+    output = instances_of(labels.instance, labels.config.grid)
+    cells = motion_outcome(output, labels).outcomes("true")
+    here = labels.instance[0] > 0
+    assert set(np.unique(cells[0][here]).tolist()) == {1, 3}
