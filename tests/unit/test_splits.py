@@ -67,8 +67,7 @@ def test_shares_of_designed_twins_and_of_the_others() -> None:
     made = split_records(scenarios)
     assert len(scenarios) == 200  # so 30 is the cap: 8 designed, 6 others, and what is left of 21 single ones
     for split in (made.val, made.test):
-        assert [len(names(split, prefix)) for prefix in "abc"] == [4, 3, 16]
-        assert len(split) == 30
+        assert ([len(names(split, prefix)) for prefix in "abc"], len(split)) == ([4, 3, 16], 30)
     assert [len(names(made.train, prefix)) for prefix in "abc"] == [2, 14, 108]
 
 
@@ -235,8 +234,7 @@ def test_only_scenarios_with_more_than_five_labels_of_ego_count(tmp_path: Path) 
     da = DeepAccident(dataroot=tmp_path, verbose=False)
     made = official_split(da)
     tokens = [scenario["token"] for scenario in da.scenario]
-    assert made.train == (tokens[1],)
-    assert made.left_out == (tokens[0], tokens[2], tokens[3])
+    assert (made.train, made.left_out) == ((tokens[1],), (tokens[0], tokens[2], tokens[3]))
     report = split_report(da, made)
     assert "five labels or fewer: 3 scenarios" in report.to_text()
     assert (report.scenarios["train"], report.frames["train"]) == (1, 6)
@@ -253,8 +251,7 @@ def test_the_report_counts_every_attribute_of_every_split(da_b: DeepAccident) ->
     tokens = [scenario["token"] for scenario in da_b.scenario]
     assert "2 ( 67 %)" in split_report(da_b, {"three": tokens[:3]}).to_text()  # two of three collide
     report = split_report(da_b, {"one": tokens[:1], "rest": tokens[1:], "none": []})
-    assert report.scenarios == {"one": 1, "rest": 5, "none": 0}
-    assert report.frames == {"one": 4, "rest": 20, "none": 0}
+    assert (report.scenarios, report.frames) == ({"one": 1, "rest": 5, "none": 0}, {"one": 4, "rest": 20, "none": 0})
     for counts in report.attributes.values():
         for name, total in report.scenarios.items():
             assert sum(row[name] for row in counts.values()) == total
@@ -263,8 +260,9 @@ def test_the_report_counts_every_attribute_of_every_split(da_b: DeepAccident) ->
     squeezed = " ".join(report.to_text().split())
     assert "split one rest none scenarios 1 5 0 frames 4 20 0" in squeezed
     assert f"yes 1 (100 %) {collided['yes'] - 1} ( 40 %) 0 ( 0 %)" in squeezed
-    with pytest.raises(TokenError, match="nowhere"):
-        split_report(da_b, {"one": ["type1_subtype1_normal/nowhere"]})
+    assert_refused(
+        (lambda: split_report(da_b, {"one": ["type1_subtype1_normal/nowhere"]}), TokenError, "nowhere"),
+    )
 
 
 def test_saved_splits_are_read_back_and_never_overwritten_unasked(da_b: DeepAccident, tmp_path: Path) -> None:
@@ -276,15 +274,17 @@ def test_saved_splits_are_read_back_and_never_overwritten_unasked(da_b: DeepAcci
     assert {path.stem: tuple(read_split_file(path)) for path in paths} == made.by_name()
     before = (folder / "train.txt").read_bytes()
     (folder / "test.txt").unlink()
-    with pytest.raises(ConfigError, match=r"train\.txt: is there already"):
-        split_records(long_ones, 3).save(folder)
+    assert_refused(
+        (lambda: split_records(long_ones, 3).save(folder), ConfigError, r"train\.txt: is there already"),
+    )
     assert (folder / "train.txt").read_bytes() == before
     assert not (folder / "test.txt").exists()
     split_records(long_ones, 3).save(str(folder), overwrite=True)
     assert (folder / "train.txt").read_bytes() != before
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="file: is a file; give a folder"):
-        made.save(tmp_path / "file")
+    assert_refused(
+        (lambda: made.save(tmp_path / "file"), ConfigError, "file: is a file; give a folder"),
+    )
 
 
 def test_splits_that_cannot_be_written_leave_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,8 +294,9 @@ def test_splits_that_cannot_be_written_leave_nothing(tmp_path: Path, monkeypatch
         path.write_text("half")
 
     monkeypatch.setattr("deepaccident_devkit.splits.write_split_file", failing)
-    with pytest.raises(OSError, match="disk full"):
-        split_records(many_twins(3)).save(tmp_path)
+    assert_refused(
+        (lambda: split_records(many_twins(3)).save(tmp_path), OSError, "disk full"),
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -304,8 +305,9 @@ def test_a_selection_saved_is_a_split(da_b: DeepAccident, tmp_path: Path) -> Non
     path = save_selection([*chosen[::-1], chosen[0]["token"]], tmp_path / "mine.txt")
     assert read_split_file(path) == [scenario["token"] for scenario in chosen[::-1]]
     assert da_b.split_scenarios(path) == da_b.split_scenarios(str(path)) == {one["token"] for one in chosen}
-    with pytest.raises(ConfigError, match="is there already"):
-        save_selection(chosen, path)
+    assert_refused(
+        (lambda: save_selection(chosen, path), ConfigError, "is there already"),
+    )
     save_selection([], path, overwrite=True)
     assert da_b.split_scenarios(path) == set()
     assert_refused(
@@ -318,11 +320,21 @@ def test_a_selection_saved_is_a_split(da_b: DeepAccident, tmp_path: Path) -> Non
     "token", ["a b/c", "a/b c", "a/b\n", "a/b\u2028c", "a/\xa0b", "a/", "/b", " a/b", "\ufeffa/b", "a/\udcff", "a/b\0"]
 )
 def test_a_name_that_would_not_be_read_back_is_refused(tmp_path: Path, token: str) -> None:
-    with pytest.raises(TokenError, match=r"mine\.txt: scenario .* cannot stand in a split file.*; leave it out"):
-        save_selection(["type1_subtype1_normal/Town03", token], tmp_path / "mine.txt")
+    assert_refused(
+        (
+            lambda: save_selection(["type1_subtype1_normal/Town03", token], tmp_path / "mine.txt"),
+            TokenError,
+            r"mine\.txt: scenario .* cannot stand in a split file.*; leave it out",
+        ),
+    )
     made = split_records(many_twins(3))
-    with pytest.raises(TokenError, match=r"val\.txt: scenario .* cannot stand in a split file"):
-        replace(made, val=(token,)).save(tmp_path / "splits")
+    assert_refused(
+        (
+            lambda: replace(made, val=(token,)).save(tmp_path / "splits"),
+            TokenError,
+            r"val\.txt: scenario .* cannot stand in a split file",
+        ),
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -344,13 +356,15 @@ def test_split_files_of_ones_own(da_b: DeepAccident, tmp_path: Path) -> None:
     path.write_bytes(f"\ufeff{lines[0]}  \r\n\r\n \t{lines[1]}\r\n".encode())
     assert da_b.split_scenarios(path) == set(tokens[:2])
     path.write_text(f"{lines[0]}\n\n{lines[1]}\n{lines[0]}\n")
-    with pytest.raises(SplitFileError, match=rf"mine\.txt:4: '{lines[0]}' stands in line 1 already"):
-        da_b.split_scenarios(path)
+    assert_refused(
+        (lambda: da_b.split_scenarios(path), SplitFileError, rf"mine\.txt:4: '{lines[0]}' stands in line 1 already"),
+    )
     absent = [f"type1_subtype1_normal TownX{number}" for number in range(4)]
     path.write_text("\n".join([lines[2], *absent]))
     message = r"mine\.txt: 4 of its 5 scenarios are not in .*: type1_subtype1_normal/TownX0, .*TownX2, …; pass missing"
-    with pytest.raises(NotAvailableError, match=message):
-        da_b.split_scenarios(path)
+    assert_refused(
+        (lambda: da_b.split_scenarios(path), NotAvailableError, message),
+    )
     assert da_b.split_scenarios(path, missing="skip") == {tokens[2]}
     assert_refused(
         (lambda: da_b.split_scenarios(tmp_path / "absent.txt"), MissingFileError, "no such file"),

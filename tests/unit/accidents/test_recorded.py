@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.accidents.recorded import CLASS_MASSES, accident_of, accidents_of, masses_of
@@ -15,8 +16,7 @@ def test_the_pair_of_an_accident(da_motion: DeepAccident) -> None:
     accident = accident_of(da_motion, scenario)
     assert accident is not None
     contact = da_motion.collision(scenario)
-    assert accident.actor_ids == contact.actor_ids
-    assert accident.agents == tuple(scenario["collision"]["agents"])
+    assert (accident.actor_ids, accident.agents) == (contact.actor_ids, tuple(scenario["collision"]["agents"]))
     assert accident.categories == tuple(scenario["collision"]["classes"])
     assert accident.last_frame == accident.num_frames == scenario["num_frames"]
     assert accident.paths.shape == (2, accident.num_frames, 3)
@@ -82,12 +82,18 @@ def test_a_scenario_without_labels_is_named(tmp_path: Path) -> None:
         for folder in (*label.iterdir(), label):
             folder.rmdir()
     da = DeepAccident("v1", root, verbose=False)
-    with pytest.raises(NotAvailableError, match="has no labels"):
-        accident_of(da, da.find(collision=True, signalized=True)[0])
+    assert_refused(
+        (lambda: accident_of(da, da.find(collision=True, signalized=True)[0]), NotAvailableError, "has no labels"),
+    )
 
 
 def test_masses_follow_class_and_size() -> None:
     sizes = np.array([[4.6, 1.93, 1.52], [9.2, 3.86, 3.04], [0.1, 0.1, 0.1]])
     np.testing.assert_allclose(masses_of([0, 0, 5], sizes), [1500, 3000, 37.5])
-    with pytest.raises(ConfigError, match="car, truck has none"):
-        masses_of([0], sizes[:1], {**CLASS_MASSES, "car": 0, "truck": -1})
+    assert_refused(
+        (
+            lambda: masses_of([0], sizes[:1], {**CLASS_MASSES, "car": 0, "truck": -1}),
+            ConfigError,
+            "car, truck has none",
+        ),
+    )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import assert_refused
 from replayed_accidents import straight, wild_paths
 
 from deepaccident_devkit.accidents.replay import HORIZON, Motion, ReplayStates, braking_plans, motion_of, replay
@@ -82,8 +83,9 @@ def test_when_braking_has_no_effect_or_begins_at_once() -> None:
 
 @pytest.mark.parametrize("path", [[[0, 0, 0]], [[0, 0], [1, 1]], [[0, 0, 0], [np.nan, 0, 0]]])
 def test_paths_that_are_none(path: list[list[float]]) -> None:
-    with pytest.raises(GeometryError, match="path: expected"):
-        motion_of(path)
+    assert_refused(
+        (lambda: motion_of(path), GeometryError, "path: expected"),
+    )
 
 
 @given(wild_paths(), st.floats(0, 2), st.floats(1, 10))

@@ -71,8 +71,7 @@ def test_the_first_of_ties_is_kept_whatever_the_machine() -> None:
 
 def test_no_outlines_are_simplified() -> None:
     nothing = np.zeros((0, 2))
-    assert simplified([]) == []
-    assert [len(each) for each in simplified([nothing, np.eye(2), nothing])] == [0, 2, 0]
+    assert (simplified([]), [len(each) for each in simplified([nothing, np.eye(2), nothing])]) == ([], [0, 2, 0])
 
 
 def test_an_outline_is_found_wherever_it_is() -> None:
@@ -113,9 +112,7 @@ def boxes() -> np.ndarray:
 def test_instances_are_nearer_than_they_are_drawn(boxes) -> None:
     """By 0.9 and 0.95 cells: each outline runs where the interpolated id is 0.1."""
     gaps = gaps_of(boxes, 1, 2, 3)
-    assert list(gaps) == [(1, 2), (1, 3), (2, 3)]
-    assert gaps[1, 2] == pytest.approx(8 - 0.9 - 0.95)
-    assert gaps[2, 3] == 0
+    assert (list(gaps), gaps[1, 2], gaps[2, 3]) == ([(1, 2), (1, 3), (2, 3)], pytest.approx(8 - 0.9 - 0.95), 0)
     outline = first_outline(boxes, 2, find_objects(boxes)[1])
     assert outline[:, 1].min() == 20 - 0.95
 
@@ -137,9 +134,7 @@ def test_who_is_not_there_or_too_small_is_far_away(boxes) -> None:
 
 
 def test_nobody_has_no_distances(boxes) -> None:
-    assert gaps_of(boxes) == {}
-    assert gaps_of(boxes, 2) == {}
-    assert gaps_of(np.zeros_like(boxes), 1, 2) == {(1, 2): NO_OUTLINE}
+    assert (gaps_of(boxes), gaps_of(boxes, 2), gaps_of(np.zeros_like(boxes), 1, 2)) == ({}, {}, {(1, 2): NO_OUTLINE})
 
 
 def test_ids_keep_their_order(boxes) -> None:

@@ -36,8 +36,7 @@ def test_against_pyquaternion() -> None:
 def test_leading_axes_are_kept(shape: tuple[int, ...]) -> None:
     yaw = np.full(shape, 0.7)
     quaternion = quaternions.from_yaw(yaw)
-    assert quaternion.shape == (*shape, 4)
-    assert quaternions.to_matrix(quaternion).shape == (*shape, 3, 3)
+    assert (quaternion.shape, quaternions.to_matrix(quaternion).shape) == ((*shape, 4), (*shape, 3, 3))
     assert quaternions.left_multiplier(quaternion).shape == (*shape, 4, 4)
     assert_allclose(quaternions.from_matrix(quaternions.to_matrix(quaternion)), quaternion, atol=1e-12)
     assert_allclose(quaternions.yaw_of(quaternion), yaw)

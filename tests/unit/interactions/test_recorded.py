@@ -22,10 +22,8 @@ def pet(first, second) -> float:
 
 def test_one_crosses_after_the_other() -> None:
     east, north = straight(60, -20, 0, 10), straight(60, 0, -40, 10, 90)
-    assert pet(east, north) == pytest.approx(1.4)
-    assert pet(north, east) == pytest.approx(-1.4)
-    assert pet(east[:30], north[:35]) == math.inf
-    assert pet(east, straight(60, 0, -20, 10, 90)) == 0
+    assert (pet(east, north), pet(north, east)) == (pytest.approx(1.4), pytest.approx(-1.4))
+    assert (pet(east[:30], north[:35]), pet(east, straight(60, 0, -20, 10, 90))) == (math.inf, 0)
 
 
 def test_who_waits_is_there_until_it_goes() -> None:
@@ -51,8 +49,7 @@ def test_gaps_are_bridged_and_one_frame_is_enough() -> None:
     holes = [place if frame % 5 == 0 else None for frame, place in enumerate(east)]
     assert pet(holes, north) == pytest.approx(1.4)
     once = [None] * 20 + [(0.0, 0.0, 0.0)] + [None] * 39
-    assert pet(once, north) == pytest.approx(3.7 - 2.0)
-    assert pet(once, once) == 0
+    assert (pet(once, north), pet(once, once)) == (pytest.approx(3.7 - 2.0), 0)
     assert pet(once, straight(60, 0, 9, 10)) == math.inf
 
 

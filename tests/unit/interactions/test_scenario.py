@@ -25,8 +25,7 @@ def own(own_release: Path) -> DeepAccident:
 
 
 def assert_same(one: Interactions, other: Interactions) -> None:
-    assert repr(one) == repr(other)
-    assert one.config == other.config
+    assert (repr(one), one.config) == (repr(other), other.config)
     for found, expected in ((one, other), (one.pairs, other.pairs)):
         for name in type(found).__slots__:
             value = getattr(expected, name)
@@ -168,8 +167,7 @@ def test_the_colliding_pair_is_the_most_critical(da_motion: DeepAccident) -> Non
     first, second = accident["collision"]["ids"]
     row = found.pairs.position(second, first)
     assert row is not None
-    assert found.pairs.position(first, first) is None
-    assert row == found.pairs.min_ttc.argmin()
+    assert (found.pairs.position(first, first), row) == (None, found.pairs.min_ttc.argmin())
     assert found.pairs.min_ttc_frame[row] == accident["num_frames"]
     rows = found.of_pair(first, second)
     assert found.ttc[rows].min() == found.pairs.min_ttc[row]

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -89,8 +90,9 @@ def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
 
 
 def test_unknown_classes_are_refused() -> None:
-    with pytest.raises(ChoiceError, match="expected one of"):
-        segmentation_of(_image(), BevGrid()).mask("tram")
+    assert_refused(
+        (lambda: segmentation_of(_image(), BevGrid()).mask("tram"), ChoiceError, "expected one of"),
+    )
 
 
 def test_results_are_read_only() -> None:

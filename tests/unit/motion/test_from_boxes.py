@@ -1,9 +1,11 @@
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid
@@ -164,8 +166,7 @@ def test_half_a_cell_more_or_less() -> None:
     released = labels(frames, draw_ego=False).instance[0]
     for made, rows, columns in ((clean, (100, 104), (100, 108)), (released, (100, 104), (101, 109))):
         found = np.argwhere(made)
-        assert (found[:, 1].min(), found[:, 1].max()) == columns
-        assert (found[:, 0].min(), found[:, 0].max()) == rows
+        assert ((found[:, 1].min(), found[:, 1].max()), (found[:, 0].min(), found[:, 0].max())) == (columns, rows)
 
 
 def test_beverse_rounds_in_its_own_right_handed_frame() -> None:
@@ -199,24 +200,33 @@ def test_ids_go_on_where_another_sample_left_off() -> None:
     continued = motion_labels_from_boxes(
         [frame((0, 10, 9, 0, 1), (0, 20, 3, 0, 1))] * 5, STILL, MotionLabelConfig(draw_ego=False), id_map=given
     )
-    assert continued.id_map == {5: 1, 9: 2, 3: 3}
-    assert given == {5: 1, 9: 2}
+    assert (continued.id_map, given) == ({5: 1, 9: 2, 3: 3}, {5: 1, 9: 2})
     assert set(np.unique(continued.instance)) == {0, 2, 3}
 
 
 def test_ids_go_on_only_where_the_protocol_keeps_them() -> None:
     frames = [frame((0, 10, 9, 0, 1))] * 5
-    for protocol in ("clean", "beverse"):
-        with pytest.raises(ConfigError, match="count from 1 in every sample; leave it out, or choose a protocol with"):
-            motion_labels_from_boxes(frames, STILL, MotionLabelConfig(protocol=protocol), id_map={9: 4})
+    assert_refused(
+        *[
+            (
+                partial(motion_labels_from_boxes, frames, STILL, MotionLabelConfig(protocol=protocol), id_map={9: 4}),
+                ConfigError,
+                "count from 1 in every sample; leave it out, or choose a protocol with",
+            )
+            for protocol in ("clean", "beverse")
+        ],
+    )
     kept = replace(CLEAN, ids_kept_between_samples=True)
     made = motion_labels_from_boxes(frames, STILL, MotionLabelConfig(protocol=kept), id_map={np.int64(9): np.int32(4)})
     assert made.id_map == {9: 4}
     nobody = MotionLabelConfig(draw_ego=False)
     assert motion_labels_from_boxes([frame()] * 5, STILL, nobody, id_map={3: 2**24}).id_map == {3: 2**24}
-    for wrong in ({"a": 2}, {3: -4}, {7: 0}, {3: 1.5}, {3: 2**24 + 1}, [3]):
-        with pytest.raises(ConfigError, match="id_map: expected"):
-            motion_labels_from_boxes(frames, STILL, id_map=wrong)
+    assert_refused(
+        *[
+            (partial(motion_labels_from_boxes, frames, STILL, id_map=wrong), ConfigError, "id_map: expected")
+            for wrong in ({"a": 2}, {3: -4}, {7: 0}, {3: 1.5}, {3: 2**24 + 1}, [3])
+        ],
+    )
 
 
 @pytest.mark.parametrize("protocol", sorted(LABEL_PROTOCOLS))
@@ -335,14 +345,22 @@ def test_arrays_are_read_only_and_whole() -> None:
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_remedy(make: Callable[[], object], sentence: str) -> None:
-    with pytest.raises(GeometryError, match=sentence):
-        make()
+    assert_refused(
+        (make, GeometryError, sentence),
+    )
 
 
 def test_vectors_have_two_channels_of_cells() -> None:
-    for wrong in (np.zeros((2, 5)), np.zeros((3, 4, 5))):
-        with pytest.raises(GeometryError, match=r"vectors: expected shape \(…, 2, H, W\), found"):
-            to_orientation(wrong, vectors=True, source="devkit", target="fiery")
+    assert_refused(
+        *[
+            (
+                partial(to_orientation, wrong, vectors=True, source="devkit", target="fiery"),
+                GeometryError,
+                r"vectors: expected shape \(…, 2, H, W\), found",
+            )
+            for wrong in (np.zeros((2, 5)), np.zeros((3, 4, 5)))
+        ],
+    )
 
 
 def test_axes_as_rows_and_columns_count_them() -> None:

@@ -294,8 +294,7 @@ class TestBatches:
         file = out / f"{some[0]}.npz"
         file.write_bytes(file.read_bytes()[:-40])
         temporary_path(file).touch()  # of a killed process
-        assert write_label_files(small, out, more, names="beverse", workers=1).written == 1
-        assert contents(out) == before
+        assert (write_label_files(small, out, more, names="beverse", workers=1).written, contents(out)) == (1, before)
 
     def test_what_the_release_changed_is_made_again(self, root: Path, out: Path) -> None:
         tokens = tokens_of(opened(root), 1, 7, agents=("ego_vehicle",))
@@ -311,10 +310,13 @@ class TestBatches:
             folder = tmp_path / str(own)
             write_label_files(small, folder, tokens, names=own, workers=1)
             before = contents(folder)
-            with pytest.raises(
-                ConfigError, match=f"configuration .names: {own!r}, asked for {other!r}.; choose another"
-            ):
-                write_label_files(small, folder, tokens, names=other, workers=1)
+            assert_refused(
+                (
+                    partial(write_label_files, small, folder, tokens, names=other, workers=1),
+                    ConfigError,
+                    f"configuration .names: {own!r}, asked for {other!r}.; choose another",
+                ),
+            )
             assert contents(folder) == before
         assert_refused(
             (
@@ -344,8 +346,7 @@ class TestAdding:
         assert write(small, out, others) == LabelsWritten(samples=2, written=1, kept=0)
         before = contents(out)
         assert write(small, out, some[:1]) == LabelsWritten(samples=1, written=0, kept=1)
-        assert write(small, out, some) == LabelsWritten(samples=10, written=0, kept=5)
-        assert contents(out) == before
+        assert (write(small, out, some), contents(out)) == (LabelsWritten(samples=10, written=0, kept=5), before)
         files = LabelFiles(out)
         assert set(files) == {*some, *others}
         for token in files:
@@ -374,8 +375,13 @@ class TestAdding:
         write(opened(root), tmp_path / "labels", tokens_of(opened(root), 1, 12))
         shorter = opened(tiny.write_tiny_release(tmp_path / "shorter", frames=6))
         before = contents(tmp_path / "labels")
-        with pytest.raises(LabelFilesError, match=r"ego_vehicle has frames that are not in .*shorter any more"):
-            write(shorter, tmp_path / "labels", tokens_of(shorter, 1))
+        assert_refused(
+            (
+                lambda: write(shorter, tmp_path / "labels", tokens_of(shorter, 1)),
+                LabelFilesError,
+                r"ego_vehicle has frames that are not in .*shorter any more",
+            ),
+        )
         assert contents(tmp_path / "labels") == before
 
 
@@ -392,11 +398,17 @@ class TestRefusing:
             "agents: None, asked for 'single'": MotionLabelConfig(agents="single"),
             "orientation: 'devkit', asked for 'released'": MotionLabelConfig(orientation="released"),
         }
-        for told, config in others.items():
-            with pytest.raises(ConfigError, match=f"another configuration .*{told}.*choose another folder"):
-                write(small, out, tokens, config)
-            with pytest.raises(ConfigError, match=told):
-                LabelFiles(out, config)
+        assert_refused(
+            *[
+                (
+                    partial(write, small, out, tokens, config),
+                    ConfigError,
+                    f"another configuration .*{told}.*choose another folder",
+                )
+                for told, config in others.items()
+            ],
+            *[(partial(LabelFiles, out, config), ConfigError, told) for told, config in others.items()],
+        )
         assert contents(out) == before
 
     def test_numbers_of_another_type_are_the_same_configuration(self, small: DeepAccident, out: Path) -> None:
@@ -411,26 +423,44 @@ class TestRefusing:
         (tmp_path / "photos" / "cat.jpg").write_text("mine")
         (tmp_path / "odd" / MANIFEST).mkdir(parents=True)
         (tmp_path / "empty").mkdir()
-        for folder, told in {
-            "": "found an empty path; give '.' for the current one",
-            tmp_path / "file": "file: is a file; give a folder",
-            tmp_path / "photos": "photos: is not empty and holds no motion labels; choose a new folder",
-            tmp_path / "odd": r"manifest.json: not a regular file \(a folder\)",
-            tmp_path / "file" / "below": "below: cannot be written .*; make room there, or choose another folder",
-            "/proc/nowhere": "nowhere: cannot be written .*; make room there, or choose another folder",
-        }.items():
-            with pytest.raises(LabelFilesError, match=told):
-                write_label_files(small, folder, tokens_of(small, 3))
+        assert_refused(
+            *[
+                (partial(write_label_files, small, folder, tokens_of(small, 3)), LabelFilesError, told)
+                for folder, told in {
+                    "": "found an empty path; give '.' for the current one",
+                    tmp_path / "file": "file: is a file; give a folder",
+                    tmp_path / "photos": "photos: is not empty and holds no motion labels; choose a new folder",
+                    tmp_path / "odd": r"manifest.json: not a regular file \(a folder\)",
+                    tmp_path
+                    / "file"
+                    / "below": "below: cannot be written .*; make room there, or choose another folder",
+                    "/proc/nowhere": "nowhere: cannot be written .*; make room there, or choose another folder",
+                }.items()
+            ],
+        )
         assert contents(tmp_path / "photos") == {"cat.jpg": b"mine"}
-        for folder in ("nowhere", "empty", "photos", "file"):
-            with pytest.raises(LabelFilesError, match=r"holds no motion labels .*make them with `deepaccident labels`"):
-                LabelFiles(tmp_path / folder)
+        assert_refused(
+            *[
+                (
+                    partial(LabelFiles, tmp_path / folder),
+                    LabelFilesError,
+                    r"holds no motion labels .*make them with `deepaccident labels`",
+                )
+                for folder in ("nowhere", "empty", "photos", "file")
+            ],
+        )
         assert write(small, tmp_path / "empty", tokens_of(small, 3)).written == 5
 
     def test_what_cannot_be_drawn_is_said_before_anything_is_written(self, root: Path, tmp_path: Path) -> None:
         small, out = opened(root), tmp_path / "labels"
         unlabelled = opened(tiny.write_tiny_release(tmp_path / "test", labelled=False))
+        two = opened(tiny.write_tiny_release(tmp_path / "two", agents=("ego_vehicle", "infrastructure")))
         assert_refused(
+            (
+                lambda: write(two, out, tokens_of(two, 3), MotionLabelConfig(agents="+other")),
+                NotAvailableError,
+                "other_vehicle is not in this release",
+            ),
             (
                 lambda: write(unlabelled, out, tokens_of(unlabelled, 3)),
                 NotAvailableError,
@@ -438,13 +468,11 @@ class TestRefusing:
             ),
             (lambda: write(small, out, [*tokens_of(small, 3), "nothing"]), TokenError, "no token 'nothing'"),
             (lambda: write(small, out, []), ChoiceError, "expected at least one sample, found none"),
+            *[
+                (partial(write_label_files, small, out, one), ChoiceError, "put it into a list")
+                for one in (tokens_of(small, 3)[0], small.sample[3])
+            ],
         )
-        for one in (tokens_of(small, 3)[0], small.sample[3]):
-            with pytest.raises(ChoiceError, match="put it into a list"):
-                write_label_files(small, out, one)
-        partial = opened(tiny.write_tiny_release(tmp_path / "partial", agents=("ego_vehicle", "infrastructure")))
-        with pytest.raises(NotAvailableError, match="other_vehicle is not in this release"):
-            write(partial, out, tokens_of(partial, 3), MotionLabelConfig(agents="+other"))
         assert not out.exists()
 
 
@@ -530,8 +558,7 @@ print([os.waitpid(child, 0)[1] for child in children])
     def test_numpy_alone_opens_a_file(self, files: LabelFiles) -> None:
         token = next(iter(files))
         with np.load(files.folder / f"{token.removesuffix('/004')}.npz", allow_pickle=False) as archive:
-            assert archive["004/instance"].dtype == np.uint8
-            assert archive["config"].item() == files.config.digest
+            assert (archive["004/instance"].dtype, archive["config"].item()) == (np.uint8, files.config.digest)
 
 
 class TestDamage:
@@ -584,8 +611,9 @@ class TestDamage:
         token = tokens_of(small, 3)[0]
         write(small, tmp_path / "clean", [token], MotionLabelConfig(protocol="clean"))
         shutil.copy(tmp_path / "clean" / path.relative_to(folder), path)
-        with pytest.raises(LabelFilesError, match="holds labels of another configuration; remove it"):
-            LabelFiles(folder)[token]
+        assert_refused(
+            (lambda: LabelFiles(folder)[token], LabelFilesError, "holds labels of another configuration; remove it"),
+        )
         assert write(small, folder, [token]).written == 1
         assert_same(LabelFiles(folder)[token], motion_labels(small, token))
 
@@ -603,8 +631,13 @@ class TestDamage:
                 archive.writestr(name, content)
             with archive.open(f"003/{member}.npy", "w") as file:
                 np.lib.format.write_array(file, array[:-1])
-        with pytest.raises(LabelFilesError, match=r"ego_vehicle\.npz: .*expected .*found"):
-            LabelFiles(folder)[tokens_of(small, 3)[0]]
+        assert_refused(
+            (
+                lambda: LabelFiles(folder)[tokens_of(small, 3)[0]],
+                LabelFilesError,
+                r"ego_vehicle\.npz: .*expected .*found",
+            ),
+        )
 
     @pytest.mark.slow
     @pytest.mark.parametrize(
@@ -614,11 +647,12 @@ class TestDamage:
     def test_a_manifest_that_is_none(self, small: DeepAccident, folder: Path, text: str) -> None:
         (folder / MANIFEST).write_text(text, encoding="latin-1")
         before = contents(folder)
-        for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3))):
-            with pytest.raises(
-                LabelFilesError, match=r"manifest\.json: cannot be read .*; make the labels again in an"
-            ):
-                use()
+        assert_refused(
+            *[
+                (use, LabelFilesError, r"manifest\.json: cannot be read .*; make the labels again in an")
+                for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3)))
+            ],
+        )
         assert contents(folder) == before
 
     @pytest.mark.slow
@@ -646,34 +680,39 @@ class TestDamage:
     def test_a_manifest_with_a_wrong_value(self, folder: Path, change: dict[str, object]) -> None:
         path = folder / MANIFEST
         path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-        with pytest.raises(LabelFilesError, match=r"manifest\.json: cannot be read"):
-            LabelFiles(folder)
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, r"manifest\.json: cannot be read"),
+        )
 
     def test_a_manifest_that_is_a_pipe_or_a_giant(self, folder: Path) -> None:
         path = folder / MANIFEST
         content = path.read_bytes()
         path.unlink()
         os.mkfifo(path)
-        with pytest.raises(LabelFilesError, match=r"not a regular file \(a named pipe\)"):
-            LabelFiles(folder)
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, r"not a regular file \(a named pipe\)"),
+        )
         path.unlink()
         with path.open("wb") as file:
             file.truncate(3 << 30)
-        with pytest.raises(LabelFilesError, match="has 3,221,225,472 bytes"):
-            LabelFiles(folder)
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, "has 3,221,225,472 bytes"),
+        )
         told = json.loads(content)
         config = MotionLabelConfig(grid=BevGrid((-1000.0, 1000.0, 0.1), (-1000.0, 1000.0, 0.1)))
         path.write_text(json.dumps({**told, "config": config.as_dict(), "config_digest": config.digest}))
-        with pytest.raises(LabelFilesError, match="a sample takes 32,000,000,000 bytes"):
-            LabelFiles(folder)
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, "a sample takes 32,000,000,000 bytes"),
+        )
 
     def test_a_configuration_changed_by_hand(self, folder: Path) -> None:
         path = folder / MANIFEST
         told = json.loads(path.read_text())
         told["config"]["draw_ego"] = False
         path.write_text(json.dumps(told))
-        with pytest.raises(LabelFilesError, match="its digest is not that of its configuration"):
-            LabelFiles(folder)
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, "its digest is not that of its configuration"),
+        )
 
     @pytest.mark.parametrize(("version", "kind"), [(FORMAT_VERSION + 1, "newer"), (0, "older")])
     def test_another_devkits_labels_are_refused_and_kept(
@@ -685,9 +724,12 @@ class TestDamage:
         sentence = (
             rf"{kind} devkit's labels \(format version {version}, this devkit's is {FORMAT_VERSION}\); .* or make"
         )
-        for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3))):
-            with pytest.raises(LabelFilesError, match=sentence):
-                use()
+        assert_refused(
+            *[
+                (use, LabelFilesError, sentence)
+                for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3)))
+            ],
+        )
         assert contents(folder) == before
 
 
@@ -756,8 +798,9 @@ class TestStops:
             for after in (False, True):
                 folder = tmp_path / "killed" / f"{step} {after}"
                 if (step, after) != (3, True):
-                    with pytest.raises(LabelFilesError, match=r"not complete; run|holds no motion labels"):
-                        LabelFiles(folder)
+                    assert_refused(
+                        (partial(LabelFiles, folder), LabelFilesError, r"not complete; run|holds no motion labels"),
+                    )
                 done = write(small, folder, tokens)
                 assert done.kept == max(0, min(2, step - (not after))), folder
                 kept += done.kept
@@ -801,8 +844,13 @@ class TestStops:
 
     def test_a_folder_that_cannot_be_locked(self, small: DeepAccident, tmp_path: Path) -> None:
         (tmp_path / "labels" / ".unfinished" / ".lock").mkdir(parents=True)
-        with pytest.raises(LabelFilesError, match=r"cannot be written .*; make room there, or choose another folder"):
-            write(small, tmp_path / "labels", tokens_of(small, 3))
+        assert_refused(
+            (
+                lambda: write(small, tmp_path / "labels", tokens_of(small, 3)),
+                LabelFilesError,
+                r"cannot be written .*; make room there, or choose another folder",
+            ),
+        )
 
     def test_only_its_own_leftovers_are_removed(self, small: DeepAccident, out: Path) -> None:
         write(small, out, tokens_of(small, 3))

@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import LabelFilesError, NotAvailableError, SomeFailedError
@@ -49,23 +50,20 @@ def write(release: DeepAccident, folder: Path, *frames: int) -> LabelsWritten:
 def test_an_executor_writes_the_same_bytes(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
     with ThreadPoolExecutor(3) as executor:
         done = write_label_files(da_b, out, tokens_of(da_b, 2, 4), executor=executor)
-    assert done == LabelsWritten(samples=24, written=12, kept=0)
-    assert contents(out) == whole
+    assert (done, contents(out)) == (LabelsWritten(samples=24, written=12, kept=0), whole)
 
 
 def test_several_calls_share_the_scenarios(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
     with ThreadPoolExecutor(3) as threads:
         done = list(threads.map(lambda _: write(da_b, out), range(3)))
     assert sum(each.written for each in done) == 12
-    assert {(each.samples, each.written + each.kept) for each in done} == {(24, 12)}
-    assert contents(out) == whole
+    assert ({(each.samples, each.written + each.kept) for each in done}, contents(out)) == ({(24, 12)}, whole)
 
 
 def test_calls_for_other_samples_take_turns(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
     with ThreadPoolExecutor(2) as threads:
         list(threads.map(lambda frame: write(da_b, out, frame), (4, 2)))
-    assert len(LabelFiles(out)) == 24
-    assert contents(out) == whole
+    assert (len(LabelFiles(out)), contents(out)) == (24, whole)
 
 
 def test_nothing_is_listed_before_all_is_there(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
@@ -73,8 +71,9 @@ def test_nothing_is_listed_before_all_is_there(da_b: DeepAccident, out: Path, wh
     store = label_store(out, "")
     with store.shared():
         Manifest(MotionLabelConfig(), {}).write(out)
-        with pytest.raises(LabelFilesError, match="its labels are not complete"):
-            LabelFiles(out)
+        assert_refused(
+            (lambda: LabelFiles(out), LabelFilesError, "its labels are not complete"),
+        )
     begun = temporary_path(out / "manifest.json")
     begun.touch()
     assert write(da_b, out).written == 12
@@ -86,8 +85,7 @@ def test_files_that_were_cut_off_are_written_again(da_b: DeepAccident, out: Path
     write(da_b, out)
     path = next(out.rglob("*.npz"))
     path.write_bytes(path.read_bytes()[:-1])
-    assert write(da_b, out) == LabelsWritten(samples=24, written=1, kept=11)
-    assert contents(out) == whole
+    assert (write(da_b, out), contents(out)) == (LabelsWritten(samples=24, written=1, kept=11), whole)
 
 
 def test_what_fails_is_listed_and_the_rest_is_done(
@@ -102,8 +100,8 @@ def test_what_fails_is_listed_and_the_rest_is_done(
 
     with monkeypatch.context() as patch:
         patch.setattr(label_files, "motion_labels", fail_once)
-        with pytest.raises(SomeFailedError, match=rf"1 of 12 failed:\n  {broken[:-4]}: nothing to see\n"):
-            write(da_b, out)
-    assert len(list(out.rglob("*.npz"))) == 11
-    assert write(da_b, out) == LabelsWritten(samples=24, written=1, kept=11)
+        assert_refused(
+            (lambda: write(da_b, out), SomeFailedError, rf"1 of 12 failed:\n  {broken[:-4]}: nothing to see\n"),
+        )
+    assert (len(list(out.rglob("*.npz"))), write(da_b, out)) == (11, LabelsWritten(samples=24, written=1, kept=11))
     assert contents(out) == whole

@@ -50,8 +50,7 @@ def test_a_square_that_moves_keeps_its_id_and_has_a_path() -> None:
     assert ids_at(linked.instance[1], (5, 9), (20, 31), (0, 0)) == [1, 2, 0]
     assert_array_equal(linked.centers[1], [[5, 5], [5, 9]])
     assert_array_equal(linked.paths[2].cell_counts, [25, 25])
-    assert linked.instance.dtype == np.int32
-    assert linked.redrawn is None
+    assert (linked.instance.dtype, linked.redrawn) == (np.int32, None)
 
 
 def test_a_pair_must_be_nearer_than_the_link_distance() -> None:
@@ -82,8 +81,7 @@ def test_without_any_background_the_lowest_instance_becomes_it() -> None:
     heads = drawn({(5, 5): (0, 0), (20, 30): (0, 0)})
     full = replace(heads, segmentation=np.broadcast_to(np.float32([[[-1]], [[1]]]), heads.segmentation.shape))
     linked = predict_instances(full)
-    assert ids_at(linked.instance[0], (5, 5), (20, 30)) == [0, 1]
-    assert list(linked.paths) == [1]
+    assert (ids_at(linked.instance[0], (5, 5), (20, 30)), list(linked.paths)) == ([0, 1], [1])
     accident = predict_instances(full, "accident")
     assert accident.redrawn is not None
     assert set(np.unique(accident.redrawn)) == {0, 1}
@@ -146,8 +144,7 @@ def test_redrawn_boxes_are_cut_to_a_cars_size_and_later_ids_lie_on_top() -> None
     linked = predict_instances(replace(heads, segmentation=long, centerness=centerness), "accident")
     assert linked.redrawn is not None
     rows, columns = np.nonzero(linked.redrawn[0] == 3)
-    assert (np.ptp(rows), np.ptp(columns)) == (2, 10)
-    assert ids_at(linked.redrawn[0], (4, 12), (4, 9)) == [2, 1]
+    assert (np.ptp(rows), np.ptp(columns), ids_at(linked.redrawn[0], (4, 12), (4, 9))) == (2, 10, [2, 1])
 
 
 def test_trajectories_undo_the_half_cell() -> None:
@@ -168,8 +165,13 @@ def test_trajectories_undo_the_half_cell() -> None:
         for linked in (turned, native):
             assert_allclose(trajectories(linked, grid, protocol)[1], [place])
             assert_allclose(trajectories(linked, grid, protocol, half_cell_shift=False)[1], [[-5.75, 7.25]])
-    with pytest.raises(GeometryError, match=r"grid: has \(30, 20\) cells, but the instances have \(30, 40\)"):
-        trajectories(turned, BevGrid(x=(0, 10, 0.5), y=(-5, 10, 0.5)))
+    assert_refused(
+        (
+            lambda: trajectories(turned, BevGrid(x=(0, 10, 0.5), y=(-5, 10, 0.5))),
+            GeometryError,
+            r"grid: has \(30, 20\) cells, but the instances have \(30, 40\)",
+        ),
+    )
 
 
 def test_results_cannot_be_changed_and_own_nobodys_arrays() -> None:

@@ -1,12 +1,14 @@
 """`da.motion_labels`: what the tables of a release give, from its first frame to its last, whole or in part."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
@@ -129,8 +131,7 @@ class TestTime:
         after = [number + 5 * step <= 31 for step in range(-1, 6)]
         for protocol, mark in (("released", 0), ("clean", 255)):
             labels = small.motion_labels(f"{EGO}/{number:03d}", MotionLabelConfig(protocol=protocol))
-            assert labels.valid.tolist() == there
-            assert labels.future_egomotion.any(axis=1).tolist() == after
+            assert (labels.valid.tolist(), labels.future_egomotion.any(axis=1).tolist()) == (there, after)
             missing = ~labels.label_valid
             for name in ("segmentation", "instance", "centerness"):
                 assert (getattr(labels, name)[missing] == mark).all()
@@ -269,30 +270,46 @@ def spread(labels: MotionLabels, t: int, actor: int) -> float:
 class TestErrors:
     def test_a_sample_without_a_label(self, tmp_path: Path) -> None:
         release = opened(tiny.write_tiny_release(tmp_path, labelled=False))
-        with pytest.raises(NotAvailableError, match=r"ego_vehicle/002 has no label \(the test split has"):
-            release.motion_labels(f"{EGO}/002")
+        assert_refused(
+            (
+                lambda: release.motion_labels(f"{EGO}/002"),
+                NotAvailableError,
+                r"ego_vehicle/002 has no label \(the test split has",
+            ),
+        )
 
     @pytest.mark.parametrize("sample", ["", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3}])
     def test_what_is_no_sample(self, small: DeepAccident, sample: object) -> None:
-        with pytest.raises(TokenError, match=r"no token|expected a token or a record"):
-            small.motion_labels(sample)
+        assert_refused(
+            (lambda: small.motion_labels(sample), TokenError, r"no token|expected a token or a record"),
+        )
 
     def test_agents_of_a_partial_release(self, tmp_path: Path) -> None:
-        partial = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines))
-        assert VAN in partial.motion_labels(f"{EGO}/002").id_map
-        assert VAN in partial.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
-        for agents in ("+other", "all", ("ego_vehicle", "other_vehicle")):
-            with pytest.raises(
-                NotAvailableError, match=r"agents: other_vehicle\w* is not in this release|behind is not"
-            ):
-                partial.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents))
+        two = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines))
+        assert VAN in two.motion_labels(f"{EGO}/002").id_map
+        assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
+        assert_refused(
+            *[
+                (
+                    partial(two.motion_labels, f"{EGO}/002", MotionLabelConfig(agents=agents)),
+                    NotAvailableError,
+                    r"agents: other_vehicle\w* is not in this release|behind is not",
+                )
+                for agents in ("+other", "all", ("ego_vehicle", "other_vehicle"))
+            ],
+        )
         unfiltered = MotionLabelConfig(agents="+other", filter_invisible=False)
-        assert VAN in partial.motion_labels(f"{EGO}/002", unfiltered).id_map
+        assert VAN in two.motion_labels(f"{EGO}/002", unfiltered).id_map
 
     @pytest.mark.parametrize("agents", ["everybody", "ego_vehicle", ("pole",), ()])
     def test_agents_that_do_not_exist(self, small: DeepAccident, agents: object) -> None:
-        with pytest.raises(ChoiceError, match=r"agents?: expected"):
-            small.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents))
+        assert_refused(
+            (
+                lambda: small.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)),
+                ChoiceError,
+                r"agents?: expected",
+            ),
+        )
 
     def test_an_agent_without_labels_sees_nothing(self, tmp_path: Path) -> None:
         tiny.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)

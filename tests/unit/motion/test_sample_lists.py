@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import tiny
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
@@ -64,8 +65,9 @@ def test_evaluation_samples_are_those_of_the_purpose_to_evaluate(da_motion: Deep
     assert da_motion.evaluation_samples(every_scenario, "released") == tokens
     far = samples(da_motion, every_scenario, "evaluate", "paper", horizon=3.0, scope="all")
     assert da_motion.evaluation_samples(every_scenario, "paper", horizon=3.0, scope="all") == far
-    with pytest.raises(ConfigError, match="protocol='paper'"):
-        evaluation_samples(da_motion, every_scenario, horizon=3.0)
+    assert_refused(
+        (lambda: evaluation_samples(da_motion, every_scenario, horizon=3.0), ConfigError, "protocol='paper'"),
+    )
 
 
 def test_training_samples_are_those_of_the_purpose_to_train(da_motion: DeepAccident, every_scenario: Path) -> None:
@@ -105,13 +107,19 @@ def test_unknown_choices_name_those_there_are(da_motion: DeepAccident, arguments
 
 @pytest.mark.parametrize("horizon", [0.0, 0.4999, 0.7, -1.0, float("nan"), float("inf")])
 def test_a_horizon_is_a_number_of_half_seconds(da_motion: DeepAccident, horizon: float) -> None:
-    with pytest.raises(ConfigError, match=r"choose 0\.5, 1, 1\.5"):
-        samples(da_motion, "train", "evaluate", "paper", horizon=horizon)
+    assert_refused(
+        (
+            lambda: samples(da_motion, "train", "evaluate", "paper", horizon=horizon),
+            ConfigError,
+            r"choose 0\.5, 1, 1\.5",
+        ),
+    )
 
 
 def test_the_released_protocol_has_one_horizon(da_motion: DeepAccident) -> None:
-    with pytest.raises(ConfigError, match="protocol='paper'"):
-        samples(da_motion, "train", "evaluate", horizon=3.0)
+    assert_refused(
+        (lambda: samples(da_motion, "train", "evaluate", horizon=3.0), ConfigError, "protocol='paper'"),
+    )
 
 
 def test_a_split_without_labels_says_so(own_release: Path) -> None:
@@ -121,8 +129,9 @@ def test_a_split_without_labels_says_so(own_release: Path) -> None:
     unlabelled = DeepAccident("v1", own_release, verbose=False)
     split = own_release / "mine.txt"
     split.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
-    with pytest.raises(NotAvailableError, match="none of its samples here has labels"):
-        samples(unlabelled, split, "train")
+    assert_refused(
+        (lambda: samples(unlabelled, split, "train"), NotAvailableError, "none of its samples here has labels"),
+    )
 
 
 def test_a_list_without_samples_says_what_to_do(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tiny
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import GeometryError
@@ -19,8 +20,7 @@ SEEN = [False, True, False, True, False, True, True, True]
 def test_unseen_is_not_in_view_now_and_at_one_moment_before() -> None:
     assert_array_equal(accident_visible_mask(VIEWS), SEEN)
     assert_array_equal(accident_visible_mask(VIEWS.reshape(2, 4, 3)), np.reshape(SEEN, (2, 4)))
-    assert accident_visible_mask([1, 0, 0]) == np.array(False)
-    assert accident_visible_mask(np.zeros((0, 3))).shape == (0,)
+    assert (accident_visible_mask([1, 0, 0]), accident_visible_mask(np.zeros((0, 3))).shape) == (np.array(False), (0,))
 
 
 def test_without_a_collision_and_behind_sheer_curtains_all_is_seen() -> None:
@@ -31,8 +31,9 @@ def test_without_a_collision_and_behind_sheer_curtains_all_is_seen() -> None:
 
 @pytest.mark.parametrize("views", [[True], np.zeros((3, 2)), True, "abc", None])
 def test_views_are_of_three_moments(views: object) -> None:
-    with pytest.raises(GeometryError, match="in_view: expected"):
-        accident_visible_mask(views)
+    assert_refused(
+        (lambda: accident_visible_mask(views), GeometryError, "in_view: expected"),
+    )
 
 
 def test_a_pair_is_in_view_if_all_but_the_agent_itself_are() -> None:
@@ -99,5 +100,4 @@ def test_what_cannot_be_judged_and_what_always_counts_as_seen(tmp_path: Path, da
         curtain = watched(tmp_path / f"{number}", (), 6, name=name)
         assert accident_visibility(curtain, f"{tiny.TYPE}/{name}") == "visible"
     [calm] = [scenario for scenario in da.scenario if scenario["collision"] is None][:1]
-    assert accident_visibility(da, calm) is None
-    assert accident_visible(da, f"{calm['token']}/infrastructure/001") is True
+    assert (accident_visibility(da, calm), accident_visible(da, f"{calm['token']}/infrastructure/001")) == (None, True)

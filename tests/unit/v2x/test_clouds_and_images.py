@@ -1,4 +1,5 @@
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -35,19 +36,33 @@ def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str)
     assert len(da.aggregate_point_cloud(sample, agents="single", sweeps=99)) == sum(
         len(da.load_point_cloud(f"{scenario}/ego_vehicle/{index:03d}")) for index in range(1, 5)
     )
-    with pytest.raises(ChoiceError, match="sweeps: expected a whole number of frames from 1, found 0"):
-        da.aggregate_point_cloud(sample, sweeps=0)
+    assert_refused(
+        (
+            lambda: da.aggregate_point_cloud(sample, sweeps=0),
+            ChoiceError,
+            "sweeps: expected a whole number of frames from 1, found 0",
+        ),
+    )
 
 
 def test_missing_clouds_are_an_error_or_left_out(
     da: DeepAccident, da_partial: DeepAccident, sample: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     names = list(AGENTS[:3])
-    for call in (da_partial.aggregate_point_cloud, da_partial.message_sizes):
-        with pytest.raises(MissingFileError, match=r"no such file; .*, or leave out .* with on_missing='skip'"):
-            call(sample)
-        with pytest.raises(ChoiceError, match="on_missing: expected one of raise, skip, found 'ignore'"):
-            call(sample, on_missing="ignore")
+    assert_refused(
+        *[
+            (partial(call, sample), MissingFileError, r"no such file; .*, or leave out .* with on_missing='skip'")
+            for call in (da_partial.aggregate_point_cloud, da_partial.message_sizes)
+        ],
+        *[
+            (
+                partial(call, sample, on_missing="ignore"),
+                ChoiceError,
+                "on_missing: expected one of raise, skip, found 'ignore'",
+            )
+            for call in (da_partial.aggregate_point_cloud, da_partial.message_sizes)
+        ],
+    )
     assert not caplog.records
     cloud = da_partial.aggregate_point_cloud(sample, sweeps=2, on_missing="skip")
     assert len(cloud) == len(da.aggregate_point_cloud(sample, agents=names, sweeps=2))
@@ -196,24 +211,33 @@ def test_sensors_that_are_no_camera_or_of_another_scenario(da: DeepAccident, sam
         ),
     )
     other = f"{da.scenario[1]['token']}/ego_vehicle/001"
-    with pytest.raises(ChoiceError, match="expected two samples of one scenario"):
-        da.project_to_image(np.zeros((1, 3)), other, f"{sample}/{CAMERAS[0]}")
+    assert_refused(
+        (
+            lambda: da.project_to_image(np.zeros((1, 3)), other, f"{sample}/{CAMERAS[0]}"),
+            ChoiceError,
+            "expected two samples of one scenario",
+        ),
+    )
 
 
 def test_message_sizes(da: DeepAccident, sample: str) -> None:
     sizes = da.message_sizes(sample, bev_shape=(8, 100, 50), bev_dtype=np.float16)
     assert list(sizes) == list(AGENTS)
     mine = sizes["ego_vehicle"]
-    assert mine.images == 24 + 6 * 64 * 36 * 3
-    assert mine.cloud == 24 + 16 * len(da.load_point_cloud(sample))
-    assert mine.boxes == 24 + 45 * len(da.boxes(sample))
-    assert mine.bev == 24 + 8 * 100 * 50 * 2
+    assert (mine.images, mine.cloud) == (24 + 6 * 64 * 36 * 3, 24 + 16 * len(da.load_point_cloud(sample)))
+    assert (mine.boxes, mine.bev) == (24 + 45 * len(da.boxes(sample)), 24 + 8 * 100 * 50 * 2)
     assert da.message_sizes(sample, agents="single", clouds=False)["ego_vehicle"].cloud is None
-    for wrong in ((8, 100), (0, 1, 1), 5, (1.5, 2, 3), "abc", None, ("a", 1, 1)):
-        with pytest.raises(ChoiceError, match="bev_shape: expected"):
-            da.message_sizes(sample, bev_shape=wrong)
-    with pytest.raises(ChoiceError, match="bev_dtype: expected a type such as 'float32', found 'foo'"):
-        da.message_sizes(sample, bev_dtype="foo")
+    assert_refused(
+        *[
+            (partial(da.message_sizes, sample, bev_shape=wrong), ChoiceError, "bev_shape: expected")
+            for wrong in ((8, 100), (0, 1, 1), 5, (1.5, 2, 3), "abc", None, ("a", 1, 1))
+        ],
+        (
+            lambda: da.message_sizes(sample, bev_dtype="foo"),
+            ChoiceError,
+            "bev_dtype: expected a type such as 'float32', found 'foo'",
+        ),
+    )
     assert da.message_sizes(sample, agents="single", bev_shape=np.array((8, 100, 50)))["ego_vehicle"].bev == 24 + 160000
     assert da.message_sizes(sample, agents="single", bev_shape=(1, 1, 1))["ego_vehicle"].bev == 24 + 4
     usual = da.message_sizes(sample, agents="single")["ego_vehicle"]
@@ -231,14 +255,24 @@ def test_message_sizes_are_of_what_arrives(da: DeepAccident, sample: str) -> Non
     arrived = [message.agent for message in messages(da, sample, None, lossy)]
     assert 1 < len(arrived) < len(AGENTS)
     assert da.message_sizes(sample, link=lossy) == {agent: now[agent] for agent in arrived}
-    with pytest.raises(ConfigError, match=r"from frame 004; the longest possible is 0\.3 s"):
-        da.message_sizes(sample, link=Link(latency=0.4))
+    assert_refused(
+        (
+            lambda: da.message_sizes(sample, link=Link(latency=0.4)),
+            ConfigError,
+            r"from frame 004; the longest possible is 0\.3 s",
+        ),
+    )
 
 
 @pytest.mark.parametrize("sweeps", [0, -1, 2.0, 2.5, "a", None])
 def test_sweeps_are_whole_numbers_from_1(da: DeepAccident, sample: str, sweeps: object) -> None:
-    with pytest.raises(ChoiceError, match="sweeps: expected a whole number of frames from 1, found"):
-        da.aggregate_point_cloud(sample, sweeps=sweeps)
+    assert_refused(
+        (
+            lambda: da.aggregate_point_cloud(sample, sweeps=sweeps),
+            ChoiceError,
+            "sweeps: expected a whole number of frames from 1, found",
+        ),
+    )
 
 
 def test_numpy_whole_numbers_are_sweeps(da: DeepAccident, sample: str) -> None:
@@ -273,6 +307,13 @@ def test_frames_that_do_not_exist(da: DeepAccident, sample: str, frame: object) 
         lambda token, frame: da.transform(token, token, frame),
         lambda token, frame: da.trajectory(da.instance[0], token, frame),
     ]
-    for call in calls:
-        with pytest.raises(ChoiceError, match=r"frame: expected one of world, ego, lidar, Camera_Front, .* found"):
-            call(sample, frame)
+    assert_refused(
+        *[
+            (
+                partial(call, sample, frame),
+                ChoiceError,
+                r"frame: expected one of world, ego, lidar, Camera_Front, .* found",
+            )
+            for call in calls
+        ],
+    )

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,7 @@ def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
         "vehicles": (EGO, EGO_BEHIND, OTHER, OTHER_BEHIND),
         "all": AGENTS,
     }
-    assert (*AGENT_CONFIGS, "available") == AGENT_SETS
-    assert AgentConfig("alone").agents_for(POLE) == (POLE,)
+    assert ((*AGENT_CONFIGS, "available"), AgentConfig("alone").agents_for(POLE)) == (AGENT_SETS, (POLE,))
 
 
 @pytest.mark.parametrize(
@@ -43,8 +43,7 @@ def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
 def test_partners_are_renamed_as_in_the_released_code(ego: str, side: str, expected: tuple[str, ...]) -> None:
     """The released V2X dataset's name_mapping, written out (docs/released_code.md, Poses)."""
     everyone = AGENT_CONFIGS["all"].agents_for(ego, side=side)
-    assert everyone == (ego, *expected)
-    assert set(everyone) == set(AGENTS)
+    assert (everyone, set(everyone)) == ((ego, *expected), set(AGENTS))
 
 
 @pytest.mark.parametrize(
@@ -59,8 +58,9 @@ def test_partners_are_renamed_as_in_the_released_code(ego: str, side: str, expec
     ],
 )
 def test_wrong_roles_agents_and_sides(make: Callable[[], object], sentence: str) -> None:
-    with pytest.raises(ChoiceError, match=sentence):
-        make()
+    assert_refused(
+        (make, ChoiceError, sentence),
+    )
 
 
 def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
@@ -86,18 +86,24 @@ def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
     da = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path, agents=(EGO, POLE)), verbose=False)
     sample = f"{tiny.TOKEN}/{EGO}/001"
     assert cooperating_agents(da, sample) == (EGO, POLE)
-    for call in (da.cooperative_boxes, da.visible_instances, da.aggregate_point_cloud, da.message_sizes):
-        with pytest.raises(
-            NotAvailableError, match=r"other_vehicle is not in .* which has ego_vehicle, infrastructure"
-        ):
-            call(sample, agents="+other")
+    assert_refused(
+        *[
+            (
+                partial(call, sample, agents="+other"),
+                NotAvailableError,
+                r"other_vehicle is not in .* which has ego_vehicle, infrastructure",
+            )
+            for call in (da.cooperative_boxes, da.visible_instances, da.aggregate_point_cloud, da.message_sizes)
+        ],
+    )
     assert len(da.cooperative_boxes(sample)) > 0
-    with pytest.raises(
-        NotAvailableError,
-        match=r"; unpack its archive, name the agents that are there, or use agents='available' \(--agents available\) "
-        "for all that are there$",
-    ):
-        cooperating_agents(da, sample, "all")
+    assert_refused(
+        (
+            lambda: cooperating_agents(da, sample, "all"),
+            NotAvailableError,
+            ("; unpack its archive", "name the agents that are there", "agents='available' (--agents available)"),
+        ),
+    )
     assert cooperating_agents(da, sample, "available") == (EGO, POLE)
     assert len(da.cooperative_boxes(sample, agents="available")) == len(da.cooperative_boxes(sample))
     assert MotionLabelConfig(agents="available").digest == MotionLabelConfig().digest
@@ -105,17 +111,32 @@ def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("agents", [3, 2.5, object()])
 def test_what_names_no_agents_is_refused(da_b: DeepAccident, agents: object) -> None:
-    with pytest.raises(ChoiceError, match="agents: expected agents' names or a configuration, found"):
-        da_b.cooperative_boxes(da_b.sample[0], agents=agents)
+    assert_refused(
+        (
+            lambda: da_b.cooperative_boxes(da_b.sample[0], agents=agents),
+            ChoiceError,
+            "agents: expected agents' names or a configuration, found",
+        ),
+    )
 
 
 def test_names_of_another_kind(da_b: DeepAccident) -> None:
-    for wrong in ([None], [3], [np.zeros(2)]):
-        with pytest.raises(ChoiceError, match=r"agent: expected one of ego_vehicle, .* found"):
-            cooperating_agents(da_b, da_b.sample[0], wrong)
+    assert_refused(
+        *[
+            (
+                partial(cooperating_agents, da_b, da_b.sample[0], wrong),
+                ChoiceError,
+                r"agent: expected one of ego_vehicle, .* found",
+            )
+            for wrong in ([None], [3], [np.zeros(2)])
+        ],
+    )
     named = cooperating_agents(da_b, da_b.sample[0], np.array(["infrastructure", "ego_vehicle"]))
     assert named == ("ego_vehicle", "infrastructure")
-    for wrong in (3, "behind", None):
-        with pytest.raises(ChoiceError, match="partners: expected roles, found"):
-            AgentConfig("mine", wrong)
+    assert_refused(
+        *[
+            (partial(AgentConfig, "mine", wrong), ChoiceError, "partners: expected roles, found")
+            for wrong in (3, "behind", None)
+        ],
+    )
     assert AgentConfig("mine", ["behind"]) == AgentConfig("mine", ("behind",))

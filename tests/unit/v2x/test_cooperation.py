@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import tiny
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -135,8 +136,13 @@ def test_visible_only(stacked) -> None:
     assert_array_equal(seen["released"].actor_id, [6, 7])
     assert da.visible_instances(sample) == [f"{tiny.TOKEN}/actor/6", f"{tiny.TOKEN}/actor/7"]
     assert da.visible_instances(sample, agents="single") == []
-    with pytest.raises(ChoiceError, match="visible: expected one of camera, released, or None, found 'all'"):
-        da.cooperative_boxes(sample, visible="all")
+    assert_refused(
+        (
+            lambda: da.cooperative_boxes(sample, visible="all"),
+            ChoiceError,
+            "visible: expected one of camera, released, or None, found 'all'",
+        ),
+    )
 
 
 def test_visible_instances_of_all_agents_are_those_of_the_released_labels(da: DeepAccident) -> None:
@@ -150,13 +156,17 @@ def test_visible_instances_of_all_agents_are_those_of_the_released_labels(da: De
 def test_agents_without_labels_see_nothing(tmp_path: Path) -> None:
     da = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path, labelled=False), verbose=False)
     sample = f"{tiny.TOKEN}/ego_vehicle/001"
-    assert len(da.cooperative_boxes(sample, frame="ego")) == 0
-    assert da.visible_instances(sample) == []
+    assert (len(da.cooperative_boxes(sample, frame="ego")), da.visible_instances(sample)) == (0, [])
 
 
 def test_frames_and_samples_that_do_not_exist(da: DeepAccident) -> None:
-    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar"):
-        da.cooperative_boxes(da.sample[0], frame="map")
+    assert_refused(
+        (
+            lambda: da.cooperative_boxes(da.sample[0], frame="map"),
+            ChoiceError,
+            "frame: expected one of world, ego, lidar",
+        ),
+    )
 
 
 def test_the_callers_release_is_not_changed(da: DeepAccident) -> None:

@@ -1,6 +1,9 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3
@@ -28,11 +31,19 @@ def test_rounded_poses_are_zero_away_from_themselves() -> None:
 
 @pytest.mark.parametrize("poses", [None, "abc", SE3.identity(), [], np.eye(4), [np.eye(3)], [SE3.identity(), None]])
 def test_what_is_no_poses_is_refused(poses: object) -> None:
-    for function in (relative_pose_to_ego, future_egomotion):
-        with pytest.raises(GeometryError, match=r"world_from_(agent|ego): expected"):
-            function(poses)
+    assert_refused(
+        *[
+            (partial(function, poses), GeometryError, r"world_from_(agent|ego): expected")
+            for function in (relative_pose_to_ego, future_egomotion)
+        ],
+    )
 
 
 def test_a_pose_without_an_inverse_is_refused() -> None:
-    with pytest.raises(GeometryError, match="a transform has no inverse: its rotation is no rotation"):
-        relative_pose_to_ego(np.zeros((2, 4, 4)))
+    assert_refused(
+        (
+            lambda: relative_pose_to_ego(np.zeros((2, 4, 4))),
+            GeometryError,
+            "a transform has no inverse: its rotation is no rotation",
+        ),
+    )

@@ -99,8 +99,7 @@ class TestEntries:
         np.testing.assert_allclose(read.boxes.yaw, 2 * np.arctan2(0.8, 0.6), atol=1e-12)
         np.testing.assert_array_equal(read.boxes.velocity, [[0, 8.25, 0], [np.nan] * 3])
         np.testing.assert_array_equal(read.scores, [0.9, 0.9])
-        assert CATEGORIES[read.boxes.category[0]] == "van"
-        assert len(results.prediction(THIRD)) == 0
+        assert (CATEGORIES[read.boxes.category[0]], len(results.prediction(THIRD))) == ("van", 0)
 
     def test_a_sample_a_line(self, tmp_path: Path) -> None:
         predictions = {FIRST: [Accident(positions=np.zeros((2, 2)), time=1.0)], SECOND: []}

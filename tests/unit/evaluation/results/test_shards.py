@@ -8,6 +8,7 @@ import numpy as np
 import plain_results as plain
 import pytest
 from accident_scenes import scene
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import MotionOutput, instances_of
@@ -152,18 +153,25 @@ class TestMotion:
     def test_predictions_that_do_not_go_together(self, tmp_path: Path, output: MotionOutput, words: str) -> None:
         with ResultsWriter(tmp_path / "m", "motion", store="heads") as writer:
             writer.add(FIRST, heads())
-            with pytest.raises(ResultsError, match=f"m: {SECOND}: .*{words}"):
-                writer.add(SECOND, output)
+            assert_refused(
+                (lambda: writer.add(SECOND, output), ResultsError, f"m: {SECOND}: .*{words}"),
+            )
         assert read_results(tmp_path / "m").tokens == (FIRST,)
 
     def test_the_grid_that_was_asked_for(self, tmp_path: Path) -> None:
         with ResultsWriter(tmp_path / "m", "motion", grid=LARGE) as writer:
-            with pytest.raises(ResultsError, match="expected a prediction on BevGrid"):
-                writer.add(FIRST, heads())
+            assert_refused(
+                (lambda: writer.add(FIRST, heads()), ResultsError, "expected a prediction on BevGrid"),
+            )
             writer.add(FIRST, instances_of(np.zeros((1, 2, 200, 200)), LARGE))
 
     def test_negative_ids(self, tmp_path: Path) -> None:
         with ResultsWriter(tmp_path / "m", "motion") as writer:
-            with pytest.raises(ResultsError, match="instances: expected ids from 1, and 0 elsewhere, found -7"):
-                writer.add(FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID))
+            assert_refused(
+                (
+                    lambda: writer.add(FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID)),
+                    ResultsError,
+                    "instances: expected ids from 1, and 0 elsewhere, found -7",
+                ),
+            )
             writer.add(FIRST, heads())

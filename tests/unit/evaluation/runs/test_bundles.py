@@ -9,6 +9,7 @@ from typing import Any
 
 import pyarrow.parquet
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
@@ -85,8 +86,7 @@ def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
     summary = switched.summary()
     assert summary["switches"] == {"reading.danger_distance": 0.5}
     assert summary["settings"]["choices"]["reading"]["danger_distance"] == 0.5
-    assert summary["counts"] == {"samples": 6, "scenarios": 2, "left_out": 0}
-    assert summary["metrics"]["positives"] == 3
+    assert (summary["counts"], summary["metrics"]["positives"]) == ({"samples": 6, "scenarios": 2, "left_out": 0}, 3)
     assert {"python", "numpy"} <= summary["environment"].keys()
     assert summary["headlines"][0]["name"] == "apa"
 
@@ -94,8 +94,7 @@ def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
 def test_a_copy_of_the_results_goes_along(run: EvaluationRun, results: Results, tmp_path: Path) -> None:
     folder = save_run(run, tmp_path / "bundle", include_results=True)
     inside = read_bundle(folder).results_path
-    assert inside == folder / "results" / results.path.name
-    assert read_results(inside).fingerprint == results.fingerprint
+    assert (inside, read_results(inside).fingerprint) == (folder / "results" / results.path.name, results.fingerprint)
 
 
 def test_a_folder_of_results_is_copied_whole(
@@ -125,8 +124,9 @@ class TestPlaces:
             assert FILES - {"files.json"} <= {path.name for path in folder.iterdir()}
             raise KeyError("plot")
 
-        with pytest.raises(KeyError, match="plot"):
-            save_run(run, tmp_path / "bundle", extras=[fails])
+        assert_refused(
+            (lambda: save_run(run, tmp_path / "bundle", extras=[fails]), KeyError, "plot"),
+        )
         assert not list(tmp_path.glob("*bundle*"))
 
     def test_what_extras_write_belongs_to_it(self, run: EvaluationRun, tmp_path: Path) -> None:
@@ -137,8 +137,13 @@ class TestPlaces:
 
     def test_replaced_only_when_told(self, run: EvaluationRun, tmp_path: Path) -> None:
         folder = save_run(run, tmp_path / "bundle")
-        with pytest.raises(ResultsError, match=r"bundle: holds an evaluation; pass overwrite=True \(--overwrite\)"):
-            save_run(run, folder)
+        assert_refused(
+            (
+                lambda: save_run(run, folder),
+                ResultsError,
+                r"bundle: holds an evaluation; pass overwrite=True \(--overwrite\)",
+            ),
+        )
         save_run(replace(run, sanity={"warnings": []}), folder, overwrite=True)
         assert read_bundle(folder).summary["sanity"] == {"warnings": []}
         assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["bundle"]
@@ -165,33 +170,46 @@ class TestPlaces:
             replace_file(source, target)
 
         monkeypatch.setattr("deepaccident_devkit.support.files.os.replace", full)
-        with pytest.raises(ResultsError, match=r"bundle: cannot be written \(.*No space left"):
-            save_run(replace(run, sanity={}), folder, overwrite=True)
+        assert_refused(
+            (
+                lambda: save_run(replace(run, sanity={}), folder, overwrite=True),
+                ResultsError,
+                r"bundle: cannot be written \(.*No space left",
+            ),
+        )
         assert {name: file_checksum(folder / name) for name in FILES} == before
 
     def test_foreign_files_are_never_removed(self, run: EvaluationRun, tmp_path: Path) -> None:
         folder = save_run(run, tmp_path / "bundle")
         (folder / "thoughts.txt").write_text("mine")
-        with pytest.raises(ResultsError, match=r"bundle: holds thoughts.txt, which is not of its evaluation; move it"):
-            save_run(run, folder, overwrite=True)
+        assert_refused(
+            (
+                lambda: save_run(run, folder, overwrite=True),
+                ResultsError,
+                r"bundle: holds thoughts.txt, which is not of its evaluation; move it",
+            ),
+        )
 
     @pytest.mark.parametrize("overwrite", [False, True])
     def test_another_folder_is_never_replaced(self, run: EvaluationRun, tmp_path: Path, overwrite: bool) -> None:
         (tmp_path / "work" / "deep").mkdir(parents=True)
         (tmp_path / "work" / "deep" / "thesis.tex").touch()
-        for words, refused in (
-            (
-                r"work: is not empty and holds no evaluation",
-                lambda: save_run(run, tmp_path / "work", overwrite=overwrite),
-            ),
-            (
-                r"thesis.tex: is a file; choose a folder that is new",
-                lambda: save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite),
-            ),
-            (r"out: expected a folder, found an empty path", lambda: save_run(run, "", overwrite=overwrite)),
-        ):
-            with pytest.raises(ResultsError, match=words):
-                refused()
+        assert_refused(
+            *[
+                (refused, ResultsError, words)
+                for words, refused in (
+                    (
+                        r"work: is not empty and holds no evaluation",
+                        lambda: save_run(run, tmp_path / "work", overwrite=overwrite),
+                    ),
+                    (
+                        r"thesis.tex: is a file; choose a folder that is new",
+                        lambda: save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite),
+                    ),
+                    (r"out: expected a folder, found an empty path", lambda: save_run(run, "", overwrite=overwrite)),
+                )
+            ],
+        )
 
     def test_an_empty_folder_is_fine_and_checkpoints_go(
         self, da_b: DeepAccident, results: Results, selection: SampleSelection, run: EvaluationRun, tmp_path: Path
@@ -224,8 +242,9 @@ class TestDamaged:
             path.unlink()
         else:
             path.write_text(content)
-        with pytest.raises(ResultsError, match=sentence):
-            read_bundle(path.parent)
+        assert_refused(
+            (lambda: read_bundle(path.parent), ResultsError, sentence),
+        )
 
     @pytest.mark.parametrize("fault", MISFITS)
     def test_a_summary_against_its_schema(self, run: EvaluationRun, tmp_path: Path, fault: str) -> None:
@@ -239,8 +258,9 @@ class TestDamaged:
         assert len(str(e.value)) < 1000
 
     def test_no_folder(self, tmp_path: Path) -> None:
-        with pytest.raises(ResultsError, match=r"nowhere: no such folder"):
-            read_bundle(tmp_path / "nowhere")
+        assert_refused(
+            (lambda: read_bundle(tmp_path / "nowhere"), ResultsError, r"nowhere: no such folder"),
+        )
 
 
 def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: Path) -> None:
@@ -248,5 +268,6 @@ def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: 
     path = bundle.folder / "scenarios.json"
     stated = read(path)
     path.write_text(json.dumps({**stated, "scenarios": ["s"]}), encoding="utf-8")
-    with pytest.raises(ResultsError, match=r"scenarios.json: expected `object`, got `array` - at `\$.scenarios`"):
-        bundle.scenarios()
+    assert_refused(
+        (bundle.scenarios, ResultsError, r"scenarios.json: expected `object`, got `array` - at `\$.scenarios`"),
+    )

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from generated_bundles import MAIN, write_bundle
+from refusals import assert_refused
 from scipy.stats import binom
 
 from deepaccident_devkit import DeepAccident
@@ -192,8 +193,7 @@ class TestForms:
     def test_text_of_a_decision(self, generated: Callable[..., Comparison]) -> None:
         text = generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]).to_text()
         (line,) = (line.split() for line in text.splitlines() if line.startswith("iou 30x30"))
-        assert line[3:6] == ["37.500", "41.438", "+3.938"]
-        assert line[-5:] == ["+4.393]", "0.001", "b", "is", "better"]
+        assert (line[3:6], line[-5:]) == (["37.500", "41.438", "+3.938"], ["+4.393]", "0.001", "b", "is", "better"])
         assert "p: share of 1,000 random swaps" in text
 
     def test_json_and_csv_have_every_number(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
@@ -217,15 +217,25 @@ class TestForms:
 class TestSamples:
     def test_others_are_refused_or_left_out(self, saved: Save) -> None:
         a, b = saved("a"), saved("b", 1.0, agents=("ego_vehicle", "infrastructure"))
-        with pytest.raises(EvaluationError, match=r"2 samples only in .*a \(type1.*\); evaluate both at the same"):
-            compare_bundles(a, b, FEW)
+        assert_refused(
+            (
+                lambda: compare_bundles(a, b, FEW),
+                EvaluationError,
+                r"2 samples only in .*a \(type1.*\); evaluate both at the same",
+            ),
+        )
         comparison = compare_bundles(a, b, FEW, common=True)
         assert (comparison.samples, comparison.left_out) == (4, 2)
         assert "a, b: only the samples that both have; 2 left out" in comparison.to_text()
 
     def test_nothing_in_common(self, saved: Save) -> None:
-        with pytest.raises(EvaluationError, match=r"have no sample in common"):
-            compare_bundles(saved("a"), saved("b", split="train"), FEW, common=True)
+        assert_refused(
+            (
+                lambda: compare_bundles(saved("a"), saved("b", split="train"), FEW, common=True),
+                EvaluationError,
+                r"have no sample in common",
+            ),
+        )
 
     def test_a_partial_one_is_marked(
         self, saved: Save, run: EvaluationRun, da_b: DeepAccident, write_accidents: Write, tmp_path: Path
@@ -240,16 +250,21 @@ class TestSamples:
 class TestRefused:
     def test_other_tasks_and_rules(self, saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
         a = saved("a")
-        with pytest.raises(
-            EvaluationError, match=r"by the same rules: task 'accident' and 'motion'; protocol .*, and \d+"
-        ):
-            compare_bundles(a, motion_bundles[0], FEW)
+        assert_refused(
+            (
+                lambda: compare_bundles(a, motion_bundles[0], FEW),
+                EvaluationError,
+                r"by the same rules: task 'accident' and 'motion'; protocol .*, and \d+",
+            ),
+        )
         other = saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
-        with pytest.raises(
-            EvaluationError,
-            match=r"switches/reading.danger_distance 'absent' and 0.5; settings/choices/reading/danger_distance 1.0",
-        ):
-            compare_bundles(a, other, FEW)
+        assert_refused(
+            (
+                lambda: compare_bundles(a, other, FEW),
+                EvaluationError,
+                r"switches/reading.danger_distance 'absent' and 0.5; settings/choices/reading/danger_distance 1.0",
+            ),
+        )
 
     def test_other_cells(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
         """Labels are made on the predictions' own cells: other cells are another truth."""
@@ -258,10 +273,13 @@ class TestRefused:
         summary = json.loads(path.read_text())
         summary["results"]["form"]["x"] = [-25.0, 25.0, 0.5]
         path.write_text(json.dumps(summary))
-        with pytest.raises(
-            EvaluationError, match=r"rules: cells/x '\[-50.0, 50.0, 0.5\]' and '\[-25.0, 25.0, 0.5\]'; eval"
-        ):
-            compare_bundles(motion_bundles[0], small, FEW)
+        assert_refused(
+            (
+                lambda: compare_bundles(motion_bundles[0], small, FEW),
+                EvaluationError,
+                r"rules: cells/x '\[-50.0, 50.0, 0.5\]' and '\[-25.0, 25.0, 0.5\]'; eval",
+            ),
+        )
 
     def test_other_labels(self, saved: Save) -> None:
         a, b = saved("a"), saved("b")
@@ -270,17 +288,25 @@ class TestRefused:
         token = min(stored["scenarios"])
         stored["scenarios"][token]["label"] = "0"
         path.write_text(json.dumps(stored))
-        with pytest.raises(
-            EvaluationError, match=rf"calib files of 1 scenarios are not the same \({token}\); evaluate"
-        ):
-            compare_bundles(a, b, FEW)
+        assert_refused(
+            (
+                lambda: compare_bundles(a, b, FEW),
+                EvaluationError,
+                rf"calib files of 1 scenarios are not the same \({token}\); evaluate",
+            ),
+        )
 
     def test_another_devkit(self, saved: Save) -> None:
         a, b = saved("a"), saved("b")
         path = b / "counts.json"
         path.write_text(path.read_text().replace("of devkit ", "of devkit 9."))
-        with pytest.raises(EvaluationError, match=r"counts.json: was saved by AccidentEvaluator of devkit 9."):
-            compare_bundles(a, b, FEW)
+        assert_refused(
+            (
+                lambda: compare_bundles(a, b, FEW),
+                EvaluationError,
+                r"counts.json: was saved by AccidentEvaluator of devkit 9.",
+            ),
+        )
 
 
 @pytest.mark.slow
@@ -322,15 +348,17 @@ class TestNumbersThatAskForMemory:
         columns = {name: [[], []] for name in ("tp", "spent", "matches")}
         counts = {"token": "a", "truths": [], "scores": [0.5], "detections": [[10**12], [0]], "excused": [[]] * 3}
         evaluator.add("a", counts | columns | {"errors": [[]] * 6})
-        with pytest.raises(EvaluationError, match=r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}"):
-            evaluator.compute()
+        assert_refused(
+            (evaluator.compute, EvaluationError, r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}"),
+        )
 
     def test_of_warnings(self) -> None:
         evaluator = EvaluationSetup(task="warning", protocol="clean").evaluator()
         nothing = {"alarms": [], "unjudged": [], "references": [], "involvement": None, "ahead": None, "to_end": None}
         evaluator.add("a", {"recording": "s/t/a", "frame": 10**9, "kind": "others", "beyond": 0} | nothing)
-        with pytest.raises(EvaluationError, match="s/t/a: expected frames up to 10,000, found 1000000000"):
-            evaluator.compute()
+        assert_refused(
+            (evaluator.compute, EvaluationError, "s/t/a: expected frames up to 10,000, found 1000000000"),
+        )
 
     @pytest.mark.parametrize("value", [math.nan, math.inf])
     def test_of_accidents(self, value: float) -> None:
@@ -344,8 +372,7 @@ def test_names_of_many_samples_are_cut(tmp_path: Path, count: int, shown: int) -
     with pytest.raises(EvaluationError, match="only in") as raised:
         compare_bundles(one, more, FEW)
     told, names = str(raised.value).split(";")[0].split(" (")
-    assert told == f"{count} samples only in {more}"
-    assert len(names.split(", ")) == shown
+    assert (told, len(names.split(", "))) == (f"{count} samples only in {more}", shown)
     assert names.endswith("type1_subtype1_accident/Town03_003/ego_vehicle/001, …)") is (count > 3)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
@@ -50,9 +51,7 @@ class TestRun:
         by_hand = AccidentEvaluator("boxes")
         for token in results.tokens:
             by_hand.update(token, results.prediction(token), None, accident_context(da_b, token, 2.0))
-        assert run.result == by_hand.compute()
-        assert run.result.positives == 3
-        assert run.partial is None
+        assert (run.result, run.result.positives, run.partial) == (by_hand.compute(), 3, None)
         assert run.attributes == sample_attributes(da_b, results.tokens)
         assert set(run.times_to_impact.values()) == {0.5, None}
 
@@ -82,8 +81,13 @@ class TestRun:
         assert [each.by for each in broken.breakdowns] == ["agent", "all"]
         assert broken.breakdowns[1].groups[0].result == run.result
         assert [each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns] == list(BREAKDOWNS)
-        with pytest.raises(ChoiceError, match=r"by: expected one of all, .*, found 'wether'; did you mean 'weather'"):
-            run.broken_down(["wether"])
+        assert_refused(
+            (
+                lambda: run.broken_down(["wether"]),
+                ChoiceError,
+                r"by: expected one of all, .*, found 'wether'; did you mean 'weather'",
+            ),
+        )
 
 
 @pytest.mark.usefixtures("nothing_long")
@@ -91,15 +95,25 @@ class TestRefused:
     def test_a_kind_that_the_task_does_not_take(
         self, da_b: DeepAccident, results: Results, selection: SampleSelection
     ) -> None:
-        with pytest.raises(EvaluationError, match=r"holds accident results; motion is evaluated from motion results"):
-            evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection),
+                EvaluationError,
+                r"holds accident results; motion is evaluated from motion results",
+            ),
+        )
 
     def test_predictions_that_do_not_look_far_enough(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
     ) -> None:
         results = write_motion(tmp_path / "motion", selection.tokens(da_b))
-        with pytest.raises(EvaluationError, match=r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the"):
-            evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection),
+                EvaluationError,
+                r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the",
+            ),
+        )
 
     @pytest.mark.parametrize(("task", "protocol"), [("accident", "boxes"), ("warning", "clean")])
     def test_scenarios_without_meta_are_counted_before_the_start(
@@ -113,8 +127,15 @@ class TestRefused:
         with ResultsWriter(tmp_path / "none.json", "accident") as writer:
             for sample in every.tokens(partial):
                 writer.add(sample, [])
-        with pytest.raises(EvaluationError, match=r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'"):
-            evaluate_results(partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every)
+        assert_refused(
+            (
+                lambda: evaluate_results(
+                    partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every
+                ),
+                EvaluationError,
+                r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'",
+            ),
+        )
         save_selection(partial.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
         chosen = replace(every, split=str(tmp_path / "mine.txt"))
         check_metas(partial, chosen.tokens(partial), chosen.split)
@@ -125,25 +146,38 @@ class TestRefused:
         results = write_motion(tmp_path / "motion", selection.tokens(da_b))
         shard = next((tmp_path / "motion" / "shards").iterdir())
         shard.write_bytes(shard.read_bytes()[:-100])
-        with pytest.raises(ResultsError, match=shard.name):
-            evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection),
+                ResultsError,
+                shard.name,
+            ),
+        )
 
     def test_missing_samples(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
     ) -> None:
         results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
         missing = selection.tokens(da_b)[0]
-        with pytest.raises(
-            ResultsError, match=rf"some.json: 1 of 6 samples have no prediction \({missing}\); the pred"
-        ):
-            evaluate_results(da_b, results, SETUP, selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, SETUP, selection),
+                ResultsError,
+                rf"some.json: 1 of 6 samples have no prediction \({missing}\); the pred",
+            ),
+        )
 
     def test_nothing_in_common(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
     ) -> None:
         other = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
-        with pytest.raises(ResultsError, match=r"of the splits train .*; nothing is left to evaluate"):
-            evaluate_results(da_b, other, SETUP, selection, allow_partial=True)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, other, SETUP, selection, allow_partial=True),
+                ResultsError,
+                r"of the splits train .*; nothing is left to evaluate",
+            ),
+        )
 
 
 class TestPartial:
@@ -171,11 +205,15 @@ class TestPartial:
         tokens = selection.tokens(da_b)
         extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
         results = write_accidents(tmp_path / "more.json", [*tokens, *extra])
-        with pytest.raises(ResultsError, match=r"\); leave them out with --allow-partial .*; no sample"):
-            evaluate_results(da_b, results, SETUP, selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, SETUP, selection),
+                ResultsError,
+                r"\); leave them out with --allow-partial .*; no sample",
+            ),
+        )
         run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
-        assert run.evaluator.tokens == set(tokens)
-        assert run.partial is None
+        assert (run.evaluator.tokens, run.partial) == (set(tokens), None)
 
 
 class TestBrokenOff:
@@ -249,8 +287,7 @@ class TestBrokenOff:
                 (SETUP, ["x"], {"release": "c"}),
             )
         }
-        assert len(names) == 4
-        assert {name.parent for name in names} == {tmp_path / "out.unfinished" / "counts"}
+        assert (len(names), {name.parent for name in names}) == (4, {tmp_path / "out.unfinished" / "counts"})
 
     def test_removing_leaves_what_is_not_its_own(self, tmp_path: Path) -> None:
         folder = tmp_path / "out.unfinished"

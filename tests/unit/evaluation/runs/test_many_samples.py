@@ -14,6 +14,7 @@ from pathlib import Path
 import evaluating
 import pytest
 from evaluating import BROKEN, Sums, number, number_and_trace
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import evaluate_samples
@@ -40,13 +41,19 @@ class TestWorkers:
         assert not evaluator.repeated
 
     def test_a_number_of_workers_that_cannot_be(self) -> None:
-        with pytest.raises(ChoiceError, match="at least 1"):
-            evaluate_samples(Sums(), VALUES, number, workers=0)
+        assert_refused(
+            (lambda: evaluate_samples(Sums(), VALUES, number, workers=0), ChoiceError, "at least 1"),
+        )
 
     @pytest.mark.parametrize("load", [lambda task: (task,), partial(lambda task: (task,))])
     def test_a_function_that_workers_cannot_import(self, load: Callable[[float], tuple[float]]) -> None:
-        with pytest.raises(EvaluationError, match=r"load: 2 workers cannot import it .*a module of its own, or .*=1"):
-            evaluate_samples(Sums(), VALUES, load, workers=2)
+        assert_refused(
+            (
+                lambda: evaluate_samples(Sums(), VALUES, load, workers=2),
+                EvaluationError,
+                r"load: 2 workers cannot import it .*a module of its own, or .*=1",
+            ),
+        )
         assert evaluate_samples(Sums(), VALUES, load).compute() == sum_of_all()
 
     def test_a_function_of_the_script(self, tmp_path: Path) -> None:
@@ -74,8 +81,13 @@ class TestFaults:
     @pytest.mark.slow
     @pytest.mark.parametrize("workers", [1, 2])
     def test_the_sample_is_named(self, workers: int) -> None:
-        with pytest.raises(EvaluationError, match=r"^x: cannot be evaluated: FileNotFoundError: predictions/7\.npz$"):
-            evaluate_samples(Sums(), {**VALUES, "x": BROKEN}, number, workers=workers)
+        assert_refused(
+            (
+                lambda: evaluate_samples(Sums(), {**VALUES, "x": BROKEN}, number, workers=workers),
+                EvaluationError,
+                r"^x: cannot be evaluated: FileNotFoundError: predictions/7\.npz$",
+            ),
+        )
 
     def test_arguments_that_do_not_fit(self) -> None:
         with pytest.raises(EvaluationError, match=r"^00: cannot be evaluated: TypeError: ") as caught:
@@ -142,8 +154,15 @@ class TestCheckpoints:
 
     def test_where_none_can_be_written_is_told_at_once(self, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
-        with pytest.raises(EvaluationError, match="file/counts: cannot be written"):
-            evaluate_samples(Sums(), {"x": BROKEN}, number, workers=1, checkpoint=tmp_path / "file" / "counts")
+        assert_refused(
+            (
+                lambda: evaluate_samples(
+                    Sums(), {"x": BROKEN}, number, workers=1, checkpoint=tmp_path / "file" / "counts"
+                ),
+                EvaluationError,
+                "file/counts: cannot be written",
+            ),
+        )
 
 
 def sum_of_all() -> float:

@@ -98,9 +98,7 @@ def test_clusters_that_do_not_differ_are_not_swapped() -> None:
     first = np.arange(40.0)
     second = first + np.where(np.arange(40) % 5 == 0, 1.0, 0.0)
     made = paired(first, second)
-    assert made.swaps.swapped.shape == (2**7, 8)
-    assert made.p[0] == 2 / 2**8
-    assert paired(first, first).p[0] == 1
+    assert (made.swaps.swapped.shape, made.p[0], paired(first, first).p[0]) == ((2**7, 8), 2 / 2**8, 1)
 
 
 def test_a_swap_without_the_number_counts_as_more() -> None:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.runs import bundles
@@ -120,5 +121,6 @@ def test_evaluations_without_a_threshold(
     monkeypatch: pytest.MonkeyPatch, summary: dict[str, Any], by: Any, error: type[Exception], sentence: str
 ) -> None:
     stored(monkeypatch, **summary)
-    with pytest.raises(error, match=sentence):
-        chosen_threshold(Path("b"), by, [OTHER])
+    assert_refused(
+        (lambda: chosen_threshold(Path("b"), by, [OTHER]), error, sentence),
+    )

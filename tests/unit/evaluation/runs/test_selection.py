@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
@@ -19,8 +20,7 @@ def test_the_released_list(da_motion: DeepAccident) -> None:
 def test_scope_agents_and_horizon_choose(da_motion: DeepAccident) -> None:
     one = SampleSelection(split="train", scope="all", agents=("infrastructure",), horizon=1.0).tokens(da_motion)
     both = {f"type1_subtype1_{end}" for end in ("accident", "normal")}
-    assert {token.split("/")[0] for token in one} == both
-    assert {agent_of(token) for token in one} == {"infrastructure"}
+    assert ({token.split("/")[0] for token in one}, {agent_of(token) for token in one}) == (both, {"infrastructure"})
     assert [int(token[-3:]) for token in one] == [25, 30] * 2
 
 
@@ -53,8 +53,7 @@ def test_agents_are_put_in_order() -> None:
 def test_parts_of_tokens() -> None:
     scenario = "type1_subtype1_accident/Town01_type001_subtype0001_scenario00001"
     sample = f"{scenario}/ego_vehicle/003"
-    assert (scenario_of(sample), agent_of(sample)) == (scenario, "ego_vehicle")
-    assert agent_of("nonsense") == ""
+    assert (scenario_of(sample), agent_of(sample), agent_of("nonsense")) == (scenario, "ego_vehicle", "")
 
 
 @pytest.mark.parametrize(
@@ -67,20 +66,33 @@ def test_parts_of_tokens() -> None:
     ],
 )
 def test_wrong_choices(changes: dict[str, object], sentence: str) -> None:
-    with pytest.raises(ChoiceError, match=sentence):
-        SampleSelection(split="val", **changes)
+    assert_refused(
+        (lambda: SampleSelection(split="val", **changes), ChoiceError, sentence),
+    )
 
 
 def test_a_horizon_between_samples(da_b: DeepAccident) -> None:
-    with pytest.raises(ConfigError, match=r"horizon: samples to evaluate are 0.5 s apart, so that 1.2 s does not say"):
-        SampleSelection(split="val", horizon=1.2).tokens(da_b)
+    assert_refused(
+        (
+            lambda: SampleSelection(split="val", horizon=1.2).tokens(da_b),
+            ConfigError,
+            r"horizon: samples to evaluate are 0.5 s apart, so that 1.2 s does not say",
+        ),
+    )
 
 
 @pytest.mark.slow
 def test_nothing_to_evaluate(tmp_path: Path) -> None:
     short = make_release(tmp_path / "release", SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False))
-    with pytest.raises(NotAvailableError, match=r"val: this release has no labelled samples of ego_vehicle there"):
-        SampleSelection(split="val", agents=("ego_vehicle",)).tokens(DeepAccident("v1", short, verbose=False))
+    assert_refused(
+        (
+            lambda: SampleSelection(split="val", agents=("ego_vehicle",)).tokens(
+                DeepAccident("v1", short, verbose=False)
+            ),
+            NotAvailableError,
+            r"val: this release has no labelled samples of ego_vehicle there",
+        ),
+    )
 
 
 def test_a_horizon_may_be_rounded_a_little(da_motion: DeepAccident) -> None:

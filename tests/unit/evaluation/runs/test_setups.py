@@ -42,8 +42,7 @@ class TestSetup:
         setup = EvaluationSetup(task=task, protocol=protocol)
         evaluator = setup.evaluator()
         assert type(evaluator) is kinds[task]
-        assert setup.rules == TASK_PROTOCOLS[task][protocol]
-        assert setup.as_dict()["settings"] == evaluator.settings
+        assert (setup.rules, setup.as_dict()["settings"]) == (TASK_PROTOCOLS[task][protocol], evaluator.settings)
         assert pickle.loads(pickle.dumps(setup)) == setup
 
     def test_switches_come_to_the_evaluator_and_cannot_be_changed(self) -> None:
@@ -75,8 +74,9 @@ class TestSetup:
         ],
     )
     def test_refused(self, named: dict[str, Any], error: type[Exception], sentence: str) -> None:
-        with pytest.raises(error, match=sentence):
-            EvaluationSetup(**named)
+        assert_refused(
+            (lambda: EvaluationSetup(**named), error, sentence),
+        )
 
 
 class TestLoader:
@@ -136,10 +136,13 @@ class TestLoader:
     ) -> None:
         with ResultsWriter(tmp_path / "a.json", "accident") as writer:
             writer.add(token, [])
-        with pytest.raises(
-            EvaluationError, match=r"a.json: holds explicit accidents; the protocol 'released' compares"
-        ):
-            SampleLoader(da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident"))
+        assert_refused(
+            (
+                lambda: SampleLoader(da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident")),
+                EvaluationError,
+                r"a.json: holds explicit accidents; the protocol 'released' compares",
+            ),
+        )
 
     def test_refused(self, da_motion: DeepAccident, motion: Results) -> None:
         assert_refused(

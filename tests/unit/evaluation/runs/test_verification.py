@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError
@@ -220,16 +221,16 @@ class TestNamed:
     def test_many_are_counted(self) -> None:
         many = tuple(Difference(where=str(index), stored=0, found=1) for index in range(22))
         text = Verification(folder=Path("b"), samples=3, differences=many, notes=("so",)).to_text().splitlines()
-        assert text[0] == "b: 22 differences; 3 samples evaluated again"
-        assert text[-2:] == ["  and 2 more", "note: so"]
+        assert (text[0], text[-2:]) == ("b: 22 differences; 3 samples evaluated again", ["  and 2 more", "note: so"])
         assert len(text) == 23
 
 
 class TestRefused:
     def test_no_results(self, bundle: Path, da_b: DeepAccident, results: Results) -> None:
         results.path.unlink()
-        with pytest.raises(ResultsError, match=r"accidents.json: no such file or folder"):
-            verify(bundle, da_b)
+        assert_refused(
+            (lambda: verify(bundle, da_b), ResultsError, r"accidents.json: no such file or folder"),
+        )
 
 
 def read_scenarios(bundle: Path, ending: str) -> list[str]:
@@ -289,8 +290,13 @@ class TestStrangers:
         (bundle / name).unlink()
         os.mkfifo(bundle / name)
         if name == "metrics_summary.json":
-            with pytest.raises(ResultsError, match=r"metrics_summary.json: not a regular file \(a named pipe\)"):
-                verify(bundle, da_b)
+            assert_refused(
+                (
+                    lambda: verify(bundle, da_b),
+                    ResultsError,
+                    r"metrics_summary.json: not a regular file \(a named pipe\)",
+                ),
+            )
         else:
             assert name in found(verify(bundle, da_b))
 
@@ -298,13 +304,19 @@ class TestStrangers:
         self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path
     ) -> None:
         command = f"evaluate verify {bundle} --dataroot {da_b.dataroot} --results {results.path}"
-        with pytest.raises(ResultsError, match=f"are opened only if you give them: deepaccident {command}$"):
-            verify(bundle, da_b, results=None)
+        assert_refused(
+            (
+                lambda: verify(bundle, da_b, results=None),
+                ResultsError,
+                f"are opened only if you give them: deepaccident {command}$",
+            ),
+        )
         splits = tmp_path / "mine.txt"
         os.mkfifo(splits)
         changed(bundle / "metrics_summary.json", lambda summary: summary.update(split=str(splits)))
-        with pytest.raises(ResultsError, match=f"{command} --split {splits}$"):
-            verify(bundle, da_b)
+        assert_refused(
+            (lambda: verify(bundle, da_b), ResultsError, f"{command} --split {splits}$"),
+        )
         splits.unlink()
         scenarios = sorted({token.rsplit("/", 2)[0] for token in results.tokens})
         splits.write_text("".join(f"{token.replace('/', ' ')}\n" for token in scenarios))
@@ -325,8 +337,13 @@ class TestStrangers:
         if kind == "a pipe":
             copy.unlink()
             os.mkfifo(copy)
-        with pytest.raises(ResultsError, match=r"bundle: results(/accidents.json)? is (a link|not a regular file)"):
-            verify(bundle, da_b)
+        assert_refused(
+            (
+                lambda: verify(bundle, da_b),
+                ResultsError,
+                r"bundle: results(/accidents.json)? is (a link|not a regular file)",
+            ),
+        )
 
     @pytest.mark.parametrize(
         "resampling",
@@ -354,5 +371,6 @@ class TestStrangers:
         path.write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
         assert "counts.json" in found(verify(bundle, da_b))
         (bundle / "metrics_summary.json").write_text("[" * 900 + "]" * 900)
-        with pytest.raises(ResultsError, match="is nested more than 64 levels deep"):
-            verify(bundle, da_b)
+        assert_refused(
+            (lambda: verify(bundle, da_b), ResultsError, "is nested more than 64 levels deep"),
+        )
