@@ -17,16 +17,22 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 import tiny
-from processes import wait_for
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, LabelFilesError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    LabelFilesError,
+    NotAvailableError,
+    SomeFailedError,
+    TokenError,
+)
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -43,7 +49,16 @@ from deepaccident_devkit.motion import (
     write_label_files,
 )
 from deepaccident_devkit.motion.batch_names import BatchNames
-from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST, NOBODY, NOWHERE, StoredLabels, write_array
+from deepaccident_devkit.motion.label_folder import (
+    FORMAT_VERSION,
+    MANIFEST,
+    NOBODY,
+    NOWHERE,
+    Manifest,
+    StoredLabels,
+    label_store,
+    write_array,
+)
 from deepaccident_devkit.support.files import replacing, temporary_path
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -115,8 +130,28 @@ def tokens_of(release: DeepAccident, *frames: int, agents: tuple[str, ...] = AGE
     return [record["token"] for record in release.sample if record["token"].endswith(ends)]
 
 
-def write(release: DeepAccident, folder: Path, tokens: list[str], config: MotionLabelConfig | None = None, **more: int):
-    return write_label_files(release, folder, tokens, config, workers=more.get("workers", 1))
+def write(release: DeepAccident, folder: Path, tokens: list[str], config: MotionLabelConfig | None = None, **more: Any):
+    return write_label_files(release, folder, tokens, config, **{"workers": 1, **more})
+
+
+def restate(folder: Path, **changes: object) -> None:
+    """Other values in a folder's manifest."""
+    path = folder / MANIFEST
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def change_label(release: Path, agent: str, name: str = tiny.NAME, frame: int = 6) -> None:
+    """Take a label's last row away."""
+    label = release / tiny.TYPE / agent / "label" / name / f"{name}_{frame:03d}.txt"
+    label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
+    os.utime(label.parent)
+
+
+def lift(release: Path, agent: str, name: str = tiny.NAME, frame: int = 6) -> None:
+    """Put an agent's LiDAR at a height of 1.5 m in a frame."""
+    calib = release / tiny.TYPE / agent / "calib" / name / f"{name}_{frame:03d}.pkl"
+    calib.write_bytes(tiny.old_pickle(tiny.calib(tiny.ego_to_world(agent, frame), height=1.5)))
+    os.utime(calib.parent)
 
 
 class TestRoundTrip:
@@ -286,29 +321,19 @@ class TestBatches:
             assert contents(tmp_path / f"{stop}") == contents(tmp_path / "fresh")
 
     def test_samples_can_be_added_and_damaged_files_are_made_again(self, small: DeepAccident, out: Path) -> None:
-        some, more = tokens_of(small, 2, agents=("ego_vehicle",)), tokens_of(small, 7, agents=("ego_vehicle",))
-        write_label_files(small, out, some, names="beverse", workers=1)
-        done = write_label_files(small, out, more, names="beverse", workers=1)
-        assert (done.written, done.kept) == (1, 1)
-        before = contents(out)
-        file = out / f"{some[0]}.npz"
+        some, more = (tokens_of(small, frame, agents=("ego_vehicle",)) for frame in (2, 7))
+        done = [write(small, out, tokens, names="beverse") for tokens in (some, more)]
+        assert [(each.written, each.kept) for each in done] == [(1, 0), (1, 1)]
+        before, file = contents(out), out / f"{some[0]}.npz"
         file.write_bytes(file.read_bytes()[:-40])
         temporary_path(file).touch()  # of a killed process
-        assert (write_label_files(small, out, more, names="beverse", workers=1).written, contents(out)) == (1, before)
-
-    def test_what_the_release_changed_is_made_again(self, root: Path, out: Path) -> None:
-        tokens = tokens_of(opened(root), 1, 7, agents=("ego_vehicle",))
-        write_label_files(opened(root), out, tokens, names="fiery", workers=1)
-        label = root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_006.txt"
-        label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
-        os.utime(label.parent)
-        assert write_label_files(opened(root), out, tokens[:1], names="fiery", workers=1).written == 2
+        assert (write(small, out, more, names="beverse").written, contents(out)) == (1, before)
 
     def test_folders_of_other_names_are_refused_and_left(self, small: DeepAccident, tmp_path: Path) -> None:
         tokens = tokens_of(small, 3)
         for own, other in ((None, "fiery"), ("fiery", "beverse"), ("beverse", None)):
             folder = tmp_path / str(own)
-            write_label_files(small, folder, tokens, names=own, workers=1)
+            write(small, folder, tokens, names=own)
             before = contents(folder)
             assert_refused(
                 (
@@ -333,10 +358,9 @@ class TestBatches:
 
     def test_a_manifest_without_names_is_of_label_files(self, small: DeepAccident, out: Path) -> None:
         write(small, out, tokens_of(small, 3))
-        told = json.loads((out / MANIFEST).read_text())
-        assert told.pop("names") is None
-        (out / MANIFEST).write_text(json.dumps(told))
-        assert len(LabelFiles(out)) == 5
+        text = (out / MANIFEST).read_text()
+        (out / MANIFEST).write_text(text.replace(' "names": null,\n', ""))
+        assert (len(LabelFiles(out)), "names" in (out / MANIFEST).read_text()) == (5, False)
 
 
 class TestAdding:
@@ -352,24 +376,28 @@ class TestAdding:
         for token in files:
             assert_same(files[token], motion_labels(small, token))
 
-    def test_what_the_release_changed_is_made_again(self, root: Path, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("names", [None, "fiery"])
+    def test_what_the_release_changed_is_made_again(self, root: Path, out: Path, names: BatchNames | None) -> None:
+        """A label row of an agent that is not asked for, a LiDAR's pose; then nothing."""
         tokens = tokens_of(opened(root), 1, agents=("ego_vehicle", "infrastructure"))
-        write(opened(root), tmp_path / "labels", tokens)
-        label = root / tiny.TYPE / "other_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_006.txt"
-        label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
-        os.utime(label.parent)
-        changed = opened(root)
-        assert write(changed, tmp_path / "labels", tokens) == LabelsWritten(samples=2, written=2, kept=0)
-        assert write(changed, tmp_path / "labels", tokens) == LabelsWritten(samples=2, written=0, kept=2)
-        calib = root / tiny.TYPE / "ego_vehicle" / "calib" / tiny.NAME / f"{tiny.NAME}_006.pkl"
-        pose = tiny.calib(tiny.ego_to_world("ego_vehicle", 6), height=1.5)
-        calib.write_bytes(tiny.old_pickle(pose))
-        os.utime(calib.parent)
-        lifted = opened(root)
-        assert write(lifted, tmp_path / "labels", tokens).written == 2
-        calib.with_name(f"{tiny.NAME}_007.pkl").write_bytes(tiny.old_pickle(pose))
-        os.utime(calib.parent)
-        assert write(opened(root), tmp_path / "labels", tokens).written == 2
+        write(opened(root), out, tokens, names=names)
+        change_label(root, "other_vehicle")
+        assert write(opened(root), out, tokens, names=names) == LabelsWritten(samples=2, written=2, kept=0)
+        lift(root, "ego_vehicle")
+        assert [write(opened(root), out, tokens, names=names).written for _ in range(2)] == [2, 0]
+
+    def test_a_file_depends_on_the_rows_of_its_own_scenario_alone(self, tmp_path: Path, out: Path) -> None:
+        """Of two scenarios of one frame and of two, each change makes its own file again."""
+        names = [tiny.NAME, tiny.NAME.replace("24", "25")]
+        for name, frames in zip(names, (1, 2), strict=True):
+            tiny.write_tiny_release(tmp_path, frames=frames, name=name, agents=("infrastructure",))
+        tokens = [f"{tiny.TYPE}/{name}/infrastructure/001" for name in names]
+        write(opened(tmp_path), out, tokens)
+        for name, change in ((name, change) for name in names for change in (change_label, lift)):
+            before, _ = contents(out), change(tmp_path, "infrastructure", name, 1)
+            assert write(opened(tmp_path), out, tokens) == LabelsWritten(samples=2, written=1, kept=1)
+            changed = {path for path, content in contents(out).items() if content != before[path]}
+            assert changed == {f"{tiny.TYPE}/{name}/infrastructure.npz"}
 
     def test_frames_that_the_release_has_no_more(self, root: Path, tmp_path: Path) -> None:
         write(opened(root), tmp_path / "labels", tokens_of(opened(root), 1, 12))
@@ -511,10 +539,11 @@ class TestReading:
         with pytest.raises(TypeError, match="does not support item assignment"):
             labels.id_map[3] = 4
 
-    def test_few_files_are_open_at_a_time(self, files: LabelFiles) -> None:
+    def test_eight_files_are_open_at_a_time(self, files: LabelFiles) -> None:
         for token in [*files, *files]:
             assert files[token].valid[2]
-        assert len(files._open) == label_files._OPEN_FILES < 10
+        opened = [str(each.resolve()) for each in Path("/proc/self/fd").iterdir()]
+        assert sum(each.startswith(str(files.folder)) for each in opened) == 8 < 10
 
     def test_it_outlives_a_change_of_folder(
         self, files: LabelFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -678,11 +707,8 @@ class TestDamage:
         ],
     )
     def test_a_manifest_with_a_wrong_value(self, folder: Path, change: dict[str, object]) -> None:
-        path = folder / MANIFEST
-        path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-        assert_refused(
-            (lambda: LabelFiles(folder), LabelFilesError, r"manifest\.json: cannot be read"),
-        )
+        restate(folder, **change)
+        assert_refused((lambda: LabelFiles(folder), LabelFilesError, r"manifest\.json: cannot be read"))
 
     def test_a_manifest_that_is_a_pipe_or_a_giant(self, folder: Path) -> None:
         path = folder / MANIFEST
@@ -706,13 +732,8 @@ class TestDamage:
         )
 
     def test_a_configuration_changed_by_hand(self, folder: Path) -> None:
-        path = folder / MANIFEST
-        told = json.loads(path.read_text())
-        told["config"]["draw_ego"] = False
-        path.write_text(json.dumps(told))
-        assert_refused(
-            (lambda: LabelFiles(folder), LabelFilesError, "its digest is not that of its configuration"),
-        )
+        restate(folder, config={**MotionLabelConfig().as_dict(), "draw_ego": False})
+        assert_refused((lambda: LabelFiles(folder), LabelFilesError, "its digest is not that of its configuration"))
 
     @pytest.mark.parametrize(("version", "kind"), [(FORMAT_VERSION + 1, "newer"), (0, "older")])
     def test_another_devkits_labels_are_refused_and_kept(
@@ -808,30 +829,6 @@ class TestStops:
         assert kept
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("workers", [1, 2])
-    def test_killed_at_any_moment(self, da_motion: DeepAccident, tmp_path: Path, workers: int) -> None:
-        verb = labels_verb(
-            da_motion.dataroot,
-            "--split",
-            "train",
-            "--out",
-            tmp_path / "labels",
-            "--workers",
-            workers,
-            "--samples",
-            "all",
-        )
-        write(da_motion, tmp_path / "fresh", da_motion.samples("train", "all"))
-        for files in (1, 3):
-            with subprocess.Popen(verb, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-                wait_for(lambda least=files: len(list((tmp_path / "labels").glob("*/*/*.npz"))) >= least)
-                process.kill()
-        done = write(da_motion, tmp_path / "labels", da_motion.samples("train", "all"))
-        assert done.samples == 70
-        assert done.kept > 0
-        assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
-
-    @pytest.mark.slow
     def test_a_full_disk(self, root: Path, tmp_path: Path) -> None:
         small, out = opened(root), tmp_path / "labels"
         for limit, there in ((100, 0), (12_000, 1)):
@@ -914,13 +911,85 @@ def test_members_are_for_all_to_read_and_have_no_date(tmp_path: Path) -> None:
     assert (entry.date_time, entry.compress_type) == ((1980, 1, 1, 0, 0, 0), zipfile.ZIP_DEFLATED)
 
 
-def test_a_file_depends_on_the_rows_of_its_own_scenario_alone(tmp_path: Path) -> None:
-    """Poses, LiDARs, agents and counts of its samples, and seven columns of its boxes."""
-    for number, frames in ((24, 1), (25, 2)):
-        tiny.write_tiny_release(
-            tmp_path, frames=frames, name=tiny.NAME.replace("24", str(number)), agents=("infrastructure",)
+def two_agents(release: DeepAccident, *frames: int) -> list[str]:
+    return tokens_of(release, *(frames or (2, 4)), agents=("ego_vehicle", "infrastructure"))
+
+
+@pytest.fixture(scope="module")
+def whole(da_b: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What one call writes for the frames 2 and 4 of six scenarios."""
+    folder = tmp_path_factory.mktemp("labels")
+    write(da_b, folder, two_agents(da_b))
+    return contents(folder)
+
+
+class TestSharing:
+    """Labels written on executors and by several processes: the very bytes of one call."""
+
+    def test_an_executor_writes_the_same_bytes(self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
+        with ThreadPoolExecutor(3) as executor:
+            done = write_label_files(da_b, out, two_agents(da_b), executor=executor)
+        assert (done, contents(out)) == (LabelsWritten(samples=24, written=12, kept=0), whole)
+
+    def test_several_calls_share_the_scenarios(self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
+        with ThreadPoolExecutor(3) as threads:
+            done = list(threads.map(lambda _: write(da_b, out, two_agents(da_b)), range(3)))
+        assert sum(each.written for each in done) == 12
+        assert ({(each.samples, each.written + each.kept) for each in done}, contents(out)) == ({(24, 12)}, whole)
+
+    def test_calls_for_other_samples_take_turns(self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
+        with ThreadPoolExecutor(2) as threads:
+            list(threads.map(lambda frame: write(da_b, out, two_agents(da_b, frame)), (4, 2)))
+        assert (len(LabelFiles(out)), contents(out)) == (24, whole)
+
+    def test_nothing_is_listed_before_all_is_there(
+        self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]
+    ) -> None:
+        """And what a killed process has begun is removed, unless others are at work."""
+        store = label_store(out, "")
+        with store.shared():
+            Manifest(MotionLabelConfig(), {}).write(out)
+            assert_refused(
+                (lambda: LabelFiles(out), LabelFilesError, "its labels are not complete"),
+            )
+        begun = temporary_path(out / "manifest.json")
+        begun.touch()
+        assert write(da_b, out, two_agents(da_b)).written == 12
+        assert not begun.exists()
+        assert contents(out) == whole
+
+    def test_files_that_were_cut_off_are_written_again(
+        self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]
+    ) -> None:
+        write(da_b, out, two_agents(da_b))
+        path = next(out.rglob("*.npz"))
+        path.write_bytes(path.read_bytes()[:-1])
+        assert (write(da_b, out, two_agents(da_b)), contents(out)) == (
+            LabelsWritten(samples=24, written=1, kept=11),
+            whole,
         )
-    release = opened(tmp_path)
-    for scenario, frames in zip(release.scenario, (1, 2), strict=True):
-        lengths = [len(array) for array in label_files._scenario_arrays(release, scenario["token"])]
-        assert lengths == [frames] * 4 + [2 * frames] * 7
+
+    def test_what_fails_is_listed_and_the_rest_is_done(
+        self, da_b: DeepAccident, out: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        made, broken = label_files.motion_labels, two_agents(da_b, 4)[3]
+
+        def fail_once(dataset: DeepAccident, token: str, *more: object) -> MotionLabels:
+            if token == broken:
+                raise NotAvailableError("nothing to see")
+            return made(dataset, token, *more)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(label_files, "motion_labels", fail_once)
+            assert_refused(
+                (
+                    lambda: write(da_b, out, two_agents(da_b)),
+                    SomeFailedError,
+                    rf"1 of 12 failed:\n  {broken[:-4]}: nothing to see\n",
+                ),
+            )
+        assert (len(list(out.rglob("*.npz"))), write(da_b, out, two_agents(da_b))) == (
+            11,
+            LabelsWritten(samples=24, written=1, kept=11),
+        )
+        assert contents(out) == whole
