@@ -207,8 +207,7 @@ def test_twins_together_disjoint_nothing_lost_caps_kept(scenarios: list[dict], s
     made = split_records(scenarios, seed, released_skip=skip)
     everything = [*made.train, *made.val, *made.test]
     assert sorted(everything) == sorted(one["token"] for one in scenarios)
-    cap = round(0.15 * len(scenarios))
-    assert max(len(made.val), len(made.test)) <= cap
+    assert max(len(made.val), len(made.test)) <= round(0.15 * len(scenarios))
     family = {token: (token.split("_")[1], token.split("/")[1]) for token in everything}
     for tokens in made.by_name().values():
         assert list(tokens) == sorted(set(tokens))
@@ -217,8 +216,7 @@ def test_twins_together_disjoint_nothing_lost_caps_kept(scenarios: list[dict], s
     for mini, whole in ((made.train_mini, made.train), (made.val_mini, made.val)):
         assert set(mini) <= set(whole)
         assert len(mini) <= round(0.2 * len(whole))
-        rest = set(whole) - set(mini)
-        assert not {family[token] for token in mini} & {family[token] for token in rest}
+        assert not {family[token] for token in mini} & {family[token] for token in (set(whole) - set(mini))}
     assert split_records(scenarios[::-1], seed, released_skip=skip) == made
 
 
@@ -267,8 +265,7 @@ def test_the_report_counts_every_attribute_of_every_split(da_b: DeepAccident) ->
 
 def test_saved_splits_are_read_back_and_never_overwritten_unasked(da_b: DeepAccident, tmp_path: Path) -> None:
     long_ones = many_twins(12) + singles(30, "subtype1_normal", "t")
-    made = split_records(long_ones)
-    folder = tmp_path / "new" / "splits"
+    made, folder = split_records(long_ones), tmp_path / "new" / "splits"
     paths = made.save(folder)
     assert {path.name for path in folder.iterdir()} == {path.name for path in paths}
     assert {path.stem: tuple(read_split_file(path)) for path in paths} == made.by_name()
@@ -340,8 +337,7 @@ def test_a_name_that_would_not_be_read_back_is_refused(tmp_path: Path, token: st
 
 @given(st.text(), st.text())
 def test_what_is_saved_is_read_back(tmp_path_factory: pytest.TempPathFactory, scenario_type: str, name: str) -> None:
-    path = tmp_path_factory.getbasetemp() / "any.txt"
-    token = f"{scenario_type}/{name}"
+    path, token = tmp_path_factory.getbasetemp() / "any.txt", f"{scenario_type}/{name}"
     try:
         save_selection([token], path, overwrite=True)
     except TokenError:
@@ -359,8 +355,7 @@ def test_split_files_of_ones_own(da_b: DeepAccident, tmp_path: Path) -> None:
     assert_refused(
         (lambda: da_b.split_scenarios(path), SplitFileError, rf"mine\.txt:4: '{lines[0]}' stands in line 1 already"),
     )
-    absent = [f"type1_subtype1_normal TownX{number}" for number in range(4)]
-    path.write_text("\n".join([lines[2], *absent]))
+    path.write_text("\n".join([lines[2], *[f"type1_subtype1_normal TownX{number}" for number in range(4)]]))
     message = r"mine\.txt: 4 of its 5 scenarios are not in .*: type1_subtype1_normal/TownX0, .*TownX2, …; pass missing"
     assert_refused(
         (lambda: da_b.split_scenarios(path), NotAvailableError, message),

@@ -118,8 +118,7 @@ def test_without_a_warning_or_brakers_nothing_changes() -> None:
 def test_latency_and_reaction_delay_the_braking() -> None:
     case = rear_end()
     late = outcomes_of(case, FIRST, [3.7], brakings=[Braking(reaction=0.5, deceleration=5.0)], latency=0.3)
-    same = outcomes_of(case, FIRST, [4.5], brakings=AT_ONCE)
-    assert 5 < late.time[0, 0] == same.time[0, 0] < np.inf
+    assert 5 < late.time[0, 0] == outcomes_of(case, FIRST, [4.5], brakings=AT_ONCE).time[0, 0] < np.inf
     from_start = outcomes_of(case, FIRST, [0.0], brakings=AT_ONCE)
     before = outcomes_of(case, FIRST, [-7.0], brakings=AT_ONCE)
     np.testing.assert_array_equal(from_start.reduction, before.reduction)
@@ -147,8 +146,7 @@ def test_the_gap_at_the_end_counts_as_contact_up_to_a_metre(gap: float, usable: 
 def test_delta_v_and_its_range() -> None:
     np.testing.assert_allclose(delta_v_of([1000, 3000], [8.0, 0.0]), [[6, 2], [0, 0]])
     ranges = delta_v_ranges([1000, 3000], 8.0)
-    expected = [[8 * 2100 / 3400, 8 * 3900 / 4600], [8 * 700 / 4600, 8 * 1300 / 3400]]
-    np.testing.assert_allclose(ranges, expected)
+    np.testing.assert_allclose(ranges, [[8 * 2100 / 3400, 8 * 3900 / 4600], [8 * 700 / 4600, 8 * 1300 / 3400]])
 
 
 def test_no_delta_v_in_the_recording() -> None:
@@ -166,17 +164,14 @@ def test_earlier_braking_of_a_striker_from_behind_never_hits_faster(
     speed: float, share: float, deceleration: float, seed: int
 ) -> None:
     """The leader may brake and speed up as it likes."""
-    rng = np.random.default_rng(seed)
-    frames = 41
-    leader = np.maximum(share * speed + np.repeat(rng.normal(0, 2, 8), 5), 0)
-    way = np.append(0, np.cumsum(leader)) / 10
+    rng, frames = np.random.default_rng(seed), 41
+    way = np.append(0, np.cumsum(np.maximum(share * speed + np.repeat(rng.normal(0, 2, 8), 5), 0))) / 10
     second = np.column_stack([way - way[-1] + 3.9 + speed * (frames - 1) / 10, np.zeros(frames), np.zeros(frames)])
     case = accident(straight((0, 0), 0, speed, frames), second)
     assume(undisturbed(case).time > 3.9)  # else it drives into the leader before, and may do so more than once
     starts = np.arange(0, 4.05, 0.05)
     told = outcomes_of(case, FIRST, starts, brakings=[Braking(reaction=0, deceleration=deceleration)])
-    hits = np.nan_to_num(told.speeds[:, 0, 0], nan=-1.0)
-    assert (np.diff(hits) >= -1e-3).all()
+    assert (np.diff(np.nan_to_num(told.speeds[:, 0, 0], nan=-1.0)) >= -1e-3).all()
 
 
 @settings(max_examples=6)
@@ -195,8 +190,7 @@ def test_pairs_are_symmetric(case: Accident) -> None:
 @settings(max_examples=15)
 @given(wild_accidents())
 def test_a_replay_without_braking_is_the_recording(case: Accident) -> None:
-    check = undisturbed(case)
-    told = outcomes_of(case, BOTH, [np.nan])
+    check, told = undisturbed(case), outcomes_of(case, BOTH, [np.nan])
     assert check.collides
     assert check.time <= case.duration
     assert (told.time == check.time).all()

@@ -22,8 +22,7 @@ def test_the_pair_of_an_accident(da_motion: DeepAccident) -> None:
     assert accident.paths.shape == (2, accident.num_frames, 3)
     assert accident.duration == pytest.approx((accident.num_frames - 1) / 10)
     for which, token in enumerate(contact.instances):
-        track = da_motion.trajectory(token)
-        np.testing.assert_allclose(accident.paths[which, :, :2], track.center[:, :2])
+        np.testing.assert_allclose(accident.paths[which, :, :2], da_motion.trajectory(token).center[:, :2])
     assert (accident.masses > 0).all()
 
 
@@ -53,20 +52,17 @@ def test_scenarios_that_lack_something_are_named_and_the_others_stay(own_release
     (
         own_release / without_meta["folder"] / without_meta["scenario_type"] / "meta" / f"{without_meta['name']}.txt"
     ).unlink()
-    first = str(seen_once["collision"]["ids"][0])
-    agent = seen_once["collision"]["agents"][0]
+    first, agent = str(seen_once["collision"]["ids"][0]), seen_once["collision"]["agents"][0]
     for label in (own_release / seen_once["folder"] / seen_once["scenario_type"]).glob(
         f"*/label/{seen_once['name']}/*.txt"
     ):
         if not label.stem.endswith("_002"):
-            own = f"/{agent}/" in str(label)
-            rows = label.read_text().splitlines(keepends=True)
+            own, rows = f"/{agent}/" in str(label), label.read_text().splitlines(keepends=True)
             label.write_text(
                 "".join(row for row in rows if row.split()[-3:-2] not in ([first], ["-100"] if own else [first]))
             )
     shutil.rmtree(own_release / ".deepaccident")
-    da = DeepAccident("v1", own_release, verbose=False)
-    found, skipped = accidents_of(da)
+    found, skipped = accidents_of(DeepAccident("v1", own_release, verbose=False))
     assert {each.scenario for each in found} == {each["token"] for each in accidents[2:]}
     reasons = {each.scenario: each.reason for each in skipped}
     assert reasons.keys() == {without_meta["token"], seen_once["token"]}

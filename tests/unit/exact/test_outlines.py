@@ -113,8 +113,7 @@ def test_instances_are_nearer_than_they_are_drawn(boxes) -> None:
     """By 0.9 and 0.95 cells: each outline runs where the interpolated id is 0.1."""
     gaps = gaps_of(boxes, 1, 2, 3)
     assert (list(gaps), gaps[1, 2], gaps[2, 3]) == ([(1, 2), (1, 3), (2, 3)], pytest.approx(8 - 0.9 - 0.95), 0)
-    outline = first_outline(boxes, 2, find_objects(boxes)[1])
-    assert outline[:, 1].min() == 20 - 0.95
+    assert first_outline(boxes, 2, find_objects(boxes)[1])[:, 1].min() == 20 - 0.95
 
 
 def test_pairs_that_cannot_be_near_are_left_out(boxes) -> None:

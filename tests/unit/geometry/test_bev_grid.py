@@ -33,8 +33,7 @@ def test_rows_and_columns_of_each_orientation() -> None:
 
 
 def test_the_devkits_raster_is_the_released_upside_down_and_fierys_transposed() -> None:
-    devkit = BevGrid((0, 3, 1), (0, 2, 1))
-    raster = np.arange(12).reshape(2, 2, 3)
+    devkit, raster = BevGrid((0, 3, 1), (0, 2, 1)), np.arange(12).reshape(2, 2, 3)
     assert_array_equal(devkit.reorient(raster, "released"), raster[..., ::-1, :])
     assert_array_equal(devkit.reorient(raster, "fiery"), raster.swapaxes(1, 2))
     assert_array_equal(devkit.with_orientation("released").reorient(raster[..., ::-1, :], "devkit"), raster)

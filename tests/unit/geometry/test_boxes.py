@@ -27,8 +27,7 @@ def two() -> Boxes:
 
 def test_corners_in_the_nuscenes_order(two: Boxes) -> None:
     ahead = [[12, 1, 1.75], [12, -1, 1.75], [12, -1, 0.25], [12, 1, 0.25]]
-    behind = [[8, 1, 1.75], [8, -1, 1.75], [8, -1, 0.25], [8, 1, 0.25]]
-    assert_allclose(two.corners()[0], ahead + behind)
+    assert_allclose(two.corners()[0], ahead + [[8, 1, 1.75], [8, -1, 1.75], [8, -1, 0.25], [8, 1, 0.25]])
     # front right, front left, rear left, rear right of a box that heads to y
     assert_allclose(two.bottom_corners()[1], [[0.25, 5.5, 0.1], [-0.25, 5.5, 0.1], [-0.25, 4.5, 0.1], [0.25, 4.5, 0.1]])
 
@@ -125,8 +124,7 @@ def test_no_boxes_at_all() -> None:
 
 
 def test_concatenate_joins_boxes_of_one_frame(two: Boxes) -> None:
-    joined = concatenate([two, two.select([1])], "lidar")
-    assert_array_equal(joined.actor_id, [-100, 7, 7])
+    assert_array_equal(concatenate([two, two.select([1])], "lidar").actor_id, [-100, 7, 7])
     assert_refused(
         (
             lambda: concatenate([two], "world"),

@@ -76,8 +76,7 @@ def test_a_box_is_seen_whole_in_part_or_not() -> None:
 
 def test_all_corners_must_be_a_little_in_front() -> None:
     camera = PinholeCamera.from_field_of_view(100, 100, np.pi / 2)
-    nearest = np.array([0.2, 0.11, 0.09, -0.05])
-    sizes = np.column_stack([np.ones((4, 2)), 3 - nearest])
+    sizes = np.column_stack([np.ones((4, 2)), 3 - np.array([0.2, 0.11, 0.09, -0.05])])
     boxes = Boxes.from_arrays(
         np.column_stack([np.zeros((4, 2)), 3 - sizes[:, 2] / 2]), sizes, [0] * 4, frame="Camera_Back"
     )

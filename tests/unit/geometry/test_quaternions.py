@@ -16,8 +16,7 @@ def test_half_turns_have_one_part(part: int, rotation: np.ndarray) -> None:
 
 
 def test_against_pyquaternion() -> None:
-    rng = np.random.default_rng(0)
-    oracles = [Quaternion(part).unit for part in rng.normal(size=(200, 4))]
+    oracles = [Quaternion(part).unit for part in np.random.default_rng(0).normal(size=(200, 4))]
     elements = np.array([q.elements if q.w >= 0 else -q.elements for q in oracles])
     matrices = np.array([q.rotation_matrix for q in oracles])
     assert_allclose(quaternions.to_matrix(elements), matrices, atol=1e-12)

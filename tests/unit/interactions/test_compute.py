@@ -32,8 +32,7 @@ def pairs_in(paths, **options) -> list[tuple[int, int]]:
 
 
 def test_one_that_drives_up_to_another() -> None:
-    paths = {7: straight(11, 0, 0, 10), 3: straight(11, 30, 0, 0)}
-    motion, measured, found = of_scene(paths)
+    motion, measured, found = of_scene({7: straight(11, 0, 0, 10), 3: straight(11, 30, 0, 0)})
     assert motion.ids.tolist() == [3, 7]
     gaps = 26 - np.arange(11.0)
     np.testing.assert_allclose(measured.values["gap"][0], gaps)
@@ -90,10 +89,8 @@ def test_what_rides_on_another_is_no_pair_and_one_that_is_hit_is() -> None:
     sizes = {2: BIKE, 3: PEDESTRIAN}
     ride = {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 6)}
     assert pairs_in(ride, sizes=sizes) == []
-    jumps_off = {**ride, 3: [*straight(3, 0.2, 0, 6), *straight(3, 1.9, 3, 0)]}
-    assert pairs_in(jumps_off, sizes=sizes) == [(2, 3)]
-    hit = {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 0)}
-    assert pairs_in(hit, sizes=sizes) == [(2, 3)]
+    assert pairs_in({**ride, 3: [*straight(3, 0.2, 0, 6), *straight(3, 1.9, 3, 0)]}, sizes=sizes) == [(2, 3)]
+    assert pairs_in({2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 0)}, sizes=sizes) == [(2, 3)]
 
 
 def test_who_is_not_there_and_nobody_at_all() -> None:
@@ -108,12 +105,10 @@ def test_who_is_not_there_and_nobody_at_all() -> None:
 
 
 def test_an_unknown_velocity_is_the_displacement_or_makes_no_numbers() -> None:
-    paths = {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0)}
-    motion, measured, _ = of_scene(paths, unknown=(1,))
+    motion, measured, _ = of_scene({1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0)}, unknown=(1,))
     np.testing.assert_allclose(motion.velocity[0], np.tile([10, 0], (5, 1)))
     np.testing.assert_allclose(measured.values["ttc"][0], (26 - np.arange(5)) / 10)
-    once = {1: [(6.0, 0.0, 0.0), *[None] * 4], 2: straight(5, 0, 0, 5)}
-    _, measured, found = of_scene(once, unknown=(1,))
+    _, measured, found = of_scene({1: [(6.0, 0.0, 0.0), *[None] * 4], 2: straight(5, 0, 0, 5)}, unknown=(1,))
     for name in ("ttc", "ttc_1d", "drac", "mttc", "closing_speed", "delta_v"):
         assert np.isnan(measured.values[name][0, 0]).all(), name
     assert measured.values["gap"][0, 0] == pytest.approx(2)

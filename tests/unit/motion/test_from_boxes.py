@@ -95,8 +95,7 @@ def test_who_is_drawn_when() -> None:
         "now": [{1, 3}, {3}, {2, 3}, {2, 3}, {2, 3}],
     }.items():
         config = MotionLabelConfig(protocol=replace(RELEASED, drawn_when=when), draw_ego=False)
-        drawn = box_polygons(frames, config)
-        assert [set(one.key.tolist()) for one in drawn] == expected
+        assert [set(one.key.tolist()) for one in box_polygons(frames, config)] == expected
     everybody = box_polygons(frames, MotionLabelConfig(filter_invisible=False, draw_ego=False))
     assert [set(one.key.tolist()) for one in everybody] == [{1, 2, 3}] * 5
 
@@ -139,8 +138,7 @@ def test_where_the_agent_leans_the_middle_of_a_boxs_bottom_counts(protocol: str)
     if protocol == "released":
         own = lidar.apply((own - [0, 0, 0.75])[None])[0]
     config = MotionLabelConfig(protocol=protocol)
-    drawn = box_polygons([boxes] * 5, config)[0]
-    assert_allclose(drawn.corners.mean(axis=1), [own[:2], other[:2]], atol=1e-5)
+    assert_allclose(box_polygons([boxes] * 5, config)[0].corners.mean(axis=1), [own[:2], other[:2]], atol=1e-5)
     high = replace(frame((10, 5, 7, 0, 1), (9, 9, 8, 0, 1), lidar=lidar), center=[[10, 5, 2.0], [9, 9, 4]])
     keys = box_polygons([high] * 5, config)[0].key.tolist()
     assert keys == ([OWN_BOX_ID, 7, 8] if protocol == "released" else [7, 8])
@@ -195,8 +193,7 @@ def test_untracked_rows_are_one_or_each_its_own() -> None:
 
 def test_ids_go_on_where_another_sample_left_off() -> None:
     given = {5: 1, 9: 2}
-    made = labels([frame((0, 10, 9, 0, 1), (0, 20, 3, 0, 1))] * 5, draw_ego=False)
-    assert made.id_map == {9: 1, 3: 2}
+    assert labels([frame((0, 10, 9, 0, 1), (0, 20, 3, 0, 1))] * 5, draw_ego=False).id_map == {9: 1, 3: 2}
     continued = motion_labels_from_boxes(
         [frame((0, 10, 9, 0, 1), (0, 20, 3, 0, 1))] * 5, STILL, MotionLabelConfig(draw_ego=False), id_map=given
     )
@@ -239,8 +236,7 @@ def test_missing_frames_are_the_same_at_the_present(protocol) -> None:
         present = made.to_present(mode)
         assert present.instance[2].any()
         for name in ("segmentation", "instance", "centerness"):
-            values = 0 if protocol == "released" else 255
-            assert (getattr(present, name)[3:] == values).all()
+            assert (getattr(present, name)[3:] == (0 if protocol == "released" else 255)).all()
         if protocol != "released":
             assert (present.offset[3:] == 255).all()
             assert (present.flow[3:] == 255).all()
@@ -263,8 +259,7 @@ def test_a_small_mark_is_no_vector() -> None:
 
 
 def test_huge_peaks_and_far_boxes() -> None:
-    made = labels([frame((0, 0, 1, 0, 1))] * 5, sigma=10_000, draw_ego=False)
-    assert made.centerness.min() > 0.999
+    assert labels([frame((0, 0, 1, 0, 1))] * 5, sigma=10_000, draw_ego=False).centerness.min() > 0.999
     for protocol in LABEL_PROTOCOLS:
         far = labels([frame((1e30, 0, 1, 0, 1), (0, 0, 2, 0, 1))] * 5, protocol=protocol, draw_ego=False)
         assert np.unique(far.instance).tolist() == [0, 2]
@@ -300,8 +295,7 @@ def test_nobody_at_all() -> None:
         empty = labels([frame()] * 5, protocol=protocol, draw_ego=False)
         assert not empty.instance.any()
         assert (empty.flow == 255).all()
-    nothing = labels([None] * 5)
-    assert not nothing.label_valid.any()
+    assert not labels([None] * 5).label_valid.any()
 
 
 def test_other_grids_sigmas_and_horizons() -> None:

@@ -260,8 +260,7 @@ class TestPage:
         assert {key: (array.dtype, array.shape[1:]) for key, array in run["batch"].items()} == {
             key: (array.dtype, array.shape) for key, array in expected.items()
         }
-        axes = {5: "T", 7: "R", 200: "H"}
-        page = PAGE.read_text(encoding="utf-8")
+        axes, page = {5: "T", 7: "R", 200: "H"}, PAGE.read_text(encoding="utf-8")
         for key, array in expected.items():
             shape = str(tuple(axes.get(length, length) for length in array.shape)).replace("'", "")
             assert f"`{key}` {shape.replace('H, H', 'H, W')}" in page
@@ -358,8 +357,7 @@ class TestBatches:
 
     def test_a_manifest_without_names_is_of_label_files(self, small: DeepAccident, out: Path) -> None:
         write(small, out, tokens_of(small, 3))
-        text = (out / MANIFEST).read_text()
-        (out / MANIFEST).write_text(text.replace(' "names": null,\n', ""))
+        (out / MANIFEST).write_text((out / MANIFEST).read_text().replace(' "names": null,\n', ""))
         assert (len(LabelFiles(out)), "names" in (out / MANIFEST).read_text()) == (5, False)
 
 

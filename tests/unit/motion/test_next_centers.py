@@ -27,8 +27,7 @@ MOTIONS = st.tuples(
 def footprints(corners: list, config: MotionLabelConfig) -> Footprints:
     """All in the second of two frames."""
     shape = config.grid.with_orientation(config.rules.native).shape
-    image = np.ones(len(corners), dtype=np.int64)
-    given = np.array(corners, dtype=np.int64)
+    image, given = np.ones(len(corners), dtype=np.int64), np.array(corners, dtype=np.int64)
     return Footprints(given, image, 1 + np.arange(len(given)) // 2, topmost(given, shape, image, 2))
 
 
@@ -57,8 +56,7 @@ def test_points_that_do_not_lie_evenly_are_looked_at_one_by_one(motion: tuple[fl
     matrices = sampling_matrix(conventions.matrices_of_six([motion]), config.rules)
     lines = drawing.sampling_lines(matrices, config.grid.with_orientation("released"), config.rules)
     assert drawing._spread(lines, config.grid.with_orientation("released")) is None
-    centers = following_centers(shown, matrices, config, 1)
-    assert np.isnan(centers[0, 1]).all() == (motion[0] > 0)
+    assert np.isnan(following_centers(shown, matrices, config, 1)[0, 1]).all() == (motion[0] > 0)
 
 
 def test_one_frame_that_does_not_lie_evenly_is_enough_to_look_at_every_cell() -> None:

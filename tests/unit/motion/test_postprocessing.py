@@ -148,8 +148,7 @@ def test_redrawn_boxes_are_cut_to_a_cars_size_and_later_ids_lie_on_top() -> None
 
 
 def test_trajectories_undo_the_half_cell() -> None:
-    grid = BevGrid(x=(-10, 10, 0.5), y=(-5, 10, 0.5))
-    heads = drawn({(5, 8): (0, 0)})
+    grid, heads = BevGrid(x=(-10, 10, 0.5), y=(-5, 10, 0.5)), drawn({(5, 8): (0, 0)})
     assert_allclose(trajectories(predict_instances(heads), grid)[1], [[-6.0, 7.5]])
     assert_allclose(trajectories(predict_instances(heads), grid, half_cell_shift=False)[1], [[-5.75, 7.25]])
     turned = predict_instances(heads.in_orientation("devkit"))

@@ -106,8 +106,7 @@ def by_public_calls(release: DeepAccident, record: dict, config: MotionLabelConf
             )
         )
     there = [token is not None for token in tokens]
-    motion = egomotion(poses, there, config.rules)
-    is_vehicle = record["agent"] != "infrastructure"
+    motion, is_vehicle = egomotion(poses, there, config.rules), record["agent"] != "infrastructure"
     return motion_labels_from_boxes(frames, motion, config, valid=there[:-1], is_vehicle=is_vehicle)
 
 
@@ -217,8 +216,7 @@ class TestWhoIsDrawn:
 class TestIds:
     def test_ids_go_on_from_the_sample_before(self, small: DeepAccident) -> None:
         """As a worker of the released code has them; what nobody met before comes behind."""
-        first = small.motion_labels(f"{EGO}/001")
-        assert {*first.id_map} == {OWN_BOX_ID, VAN, WALKER}
+        assert {*small.motion_labels(f"{EGO}/001").id_map} == {OWN_BOX_ID, VAN, WALKER}
         before = {VAN: 1, 4711: 2}
         second = small.motion_labels(f"{EGO}/016", id_map=before)
         assert dict(second.id_map) == {VAN: 1, 4711: 2, OWN_BOX_ID: 3, LATER: 4, WALKER: 5}
@@ -263,8 +261,7 @@ class TestAtPresent:
 def spread(labels: MotionLabels, t: int, actor: int) -> float:
     """How far apart, in cells, the places are that an actor's cells and their offsets lead to: half of the longer."""
     cells = np.argwhere(labels.instance[t] == labels.id_map[actor])
-    ends = cells + labels.offset[t][:, cells[:, 0], cells[:, 1]].T
-    return float(np.ptp(ends, axis=0).max()) / 2
+    return float(np.ptp(cells + labels.offset[t][:, cells[:, 0], cells[:, 1]].T, axis=0).max()) / 2
 
 
 class TestErrors:
@@ -314,8 +311,7 @@ class TestErrors:
     def test_an_agent_without_labels_sees_nothing(self, tmp_path: Path) -> None:
         tiny.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)
         release = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle",)))
-        labels = release.motion_labels(f"{EGO}/002")
-        assert {*labels.id_map} == {OWN_BOX_ID, VAN}
+        assert {*release.motion_labels(f"{EGO}/002").id_map} == {OWN_BOX_ID, VAN}
         alone = release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",)))
         assert {*alone.id_map} == {OWN_BOX_ID}
 

@@ -58,8 +58,7 @@ def test_an_agent_that_looks_left_sees_ahead_what_the_ego_sees_on_its_left(orien
 
 
 def test_fierys_sideways_shift_has_the_wrong_sign() -> None:
-    to_the_left = [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
-    maps = np.stack([at(0.5, 0.5)] * 2)
+    to_the_left, maps = [[0] * 6, [0, 1.0, 0, 0, 0, 0]], np.stack([at(0.5, 0.5)] * 2)
     assert_array_equal(agents_to_ego(maps, to_the_left, grid=GRID, protocol="clean")[1], at(0.5, 1.5))
     assert_array_equal(agents_to_ego(maps, to_the_left, grid=GRID, protocol="fiery")[1], at(0.5, -0.5))
 
@@ -85,8 +84,7 @@ def test_oblong_grids_that_are_not_centred_keep_their_cells_where_nothing_moves(
 def test_released_bilinear_sampling_blurs_without_motion_and_the_exact_one_does_not() -> None:
     raster = np.random.default_rng(0).random(GRID.shape).astype(np.float32)
     assert_array_equal(warp(raster, np.eye(4), GRID, CLEAN, "bilinear"), raster)
-    blurred = warp(raster, np.eye(4), GRID, RELEASED, "bilinear")
-    assert not np.allclose(blurred, raster, atol=0.05)
+    assert not np.allclose(warp(raster, np.eye(4), GRID, RELEASED, "bilinear"), raster, atol=0.05)
     assert warp(raster.astype(np.int16), np.eye(4), GRID, RELEASED).dtype == np.int16
 
 
@@ -142,8 +140,7 @@ def test_one_moment_alone_and_the_ego_alone_stay_as_they_are() -> None:
 
 def test_augmented_maps_move_along_the_augmented_axes() -> None:
     """Mirrored maps of an agent one metre to the left stand one metre to the right."""
-    augmentation = Augmentation(flip=True)
-    pose = [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
+    augmentation, pose = Augmentation(flip=True), [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
     found = agents_to_ego(np.stack([at(0.5, 0.5)] * 2), pose, grid=GRID, protocol="clean", augmentation=augmentation)
     assert_array_equal(found[1], at(0.5, -0.5))
 
@@ -183,8 +180,7 @@ def test_sines_are_torchs_and_not_the_nearest_float32() -> None:
 
 def make_labels(config: MotionLabelConfig, step: list[float]) -> MotionLabels:
     """One cell of an instance, 2.5 m ahead and 0.5 m to the left of each frame's own ego, which moves by `step`."""
-    frames = config.label_frames
-    mask = np.broadcast_to(at(2.5, 0.5, config.grid) > 0, (frames, *config.grid.shape))
+    mask = np.broadcast_to(at(2.5, 0.5, config.grid) > 0, (config.label_frames, *config.grid.shape))
     ahead = {"devkit": (0, 1), "released": (0, 1), "fiery": (1, 0)}[config.grid.orientation]
     vectors = np.where(mask[:, None], np.reshape(ahead, (1, 2, 1, 1)), config.ignore_index).astype(np.float32)
     return MotionLabels(

@@ -23,8 +23,7 @@ def sample(da: DeepAccident) -> str:
 
 
 def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str) -> None:
-    scenario = da.scenario[0]["token"]
-    cloud = da.aggregate_point_cloud(sample, sweeps=2)
+    scenario, cloud = da.scenario[0]["token"], da.aggregate_point_cloud(sample, sweeps=2)
     parts = [
         da.load_point_cloud(f"{scenario}/{agent}/{index}", "world") for index in ("004", "003") for agent in AGENTS
     ]
@@ -122,8 +121,7 @@ def test_a_point_keeps_its_place_in_its_box() -> None:
     then = Boxes.from_arrays([[0.0, 0, 0], [50, 0, 0]], [[4.0, 2, 2]] * 2, [0.0, 0], actor_id=[7, 8])
     now = Boxes.from_arrays([[10.0, 5, 1], [0, 0, 0]], [[4.0, 2, 2]] * 2, [np.pi / 2, 0], actor_id=[7, 9])
     points = np.array([[1.5, 0.5, 0.2], [3, 0, 0], [50, 0, 0]])
-    moved = moved_points(points, then, now)
-    assert_allclose(moved, [[9.5, 6.5, 1.2], [3, 0, 0], [50, 0, 0]])
+    assert_allclose(moved_points(points, then, now), [[9.5, 6.5, 1.2], [3, 0, 0], [50, 0, 0]])
     assert_allclose(points[0], [1.5, 0.5, 0.2])
 
 
@@ -158,8 +156,7 @@ def test_lost_clouds_leave_no_points(da: DeepAccident, sample: str) -> None:
 
 def test_a_cloud_in_an_image_of_its_own_agent(da: DeepAccident, sample: str) -> None:
     camera = f"{sample}/Camera_Front"
-    image = da.load_image(camera)
-    shown = da.map_pointcloud_to_image(camera)
+    image, shown = da.load_image(camera), da.map_pointcloud_to_image(camera)
     cloud = da.load_point_cloud(sample, "lidar")
     optical = da.transform(sample, sample, "Camera_Front", "lidar").apply(cloud.xyz)
     assert_allclose(shown.depth, optical[:, 2], atol=1e-9)
@@ -186,8 +183,7 @@ def test_an_image_that_was_stored_smaller_is_read_at_the_same_place() -> None:
 
 def test_points_of_any_agent_in_any_camera_and_frame(da: DeepAccident, sample: str) -> None:
     pole = sample.replace("ego_vehicle", "infrastructure").replace("/004", "/002")
-    camera = f"{sample}/Camera_Back"
-    cloud = da.load_point_cloud(pole, "lidar")
+    camera, cloud = f"{sample}/Camera_Back", da.load_point_cloud(pole, "lidar")
     shown = da.map_pointcloud_to_image(camera, pole, colors=False)
     world = da.load_point_cloud(pole, "world")
     for again in (

@@ -24,8 +24,7 @@ def test_the_union_has_each_actor_once_and_nobody_else(da: DeepAccident) -> None
             tokens = [token for token in samples if token.split("/")[-2] in agents]
             view = cooperative_view(da, tokens[0], agents=agents)
             ids = view.boxes.actor_id
-            tracked = ids[ids >= 0].tolist()
-            assert tracked == sorted(set.union(*(label_ids(da, token) for token in tokens)))
+            assert ids[ids >= 0].tolist() == sorted(set.union(*(label_ids(da, token) for token in tokens)))
             assert -100 not in ids
             for agent in AGENTS:
                 seen = (view.seen_by >> AGENTS.index(agent) & 1).astype(bool)
@@ -128,8 +127,7 @@ def test_visible_only(stacked) -> None:
         "ego_vehicle": [row(0.0, -100), row(20.0, 5, 1), row(40.0, 6, 9, camera=False), row(12.0, -1)],
         "infrastructure": [row(40.0, 6, 2), row(14.0, 7, 1, camera=False)],
     }
-    da = stacked(rows)
-    sample = f"{tiny.TOKEN}/ego_vehicle/001"
+    da, sample = stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001"
     seen = {visible: da.cooperative_boxes(sample, visible=visible) for visible in (None, "camera", "released")}
     assert_array_equal(seen[None].actor_id, [5, 6, 7, 1223, -1])
     assert_array_equal(seen["camera"].actor_id, [5, 6, 1223, -1])
@@ -183,8 +181,7 @@ def test_a_row_that_a_label_repeats_counts_once(stacked) -> None:
         "ego_vehicle": [row(20.0, 5, 3), row(20.4, 5, 8), row(0.0, -100), row(0.1, -100, 70)],
         "infrastructure": [row(20.2, 5, 4), row(20.2, 5, 4), row(0.0, 1223, 6), row(0.0, 1223, 6)],
     }
-    da = stacked(rows)
-    view = cooperative_view(da, f"{tiny.TOKEN}/ego_vehicle/001")
+    view = cooperative_view(stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001")
     assert_array_equal(view.boxes.actor_id, [5, 1223])
     assert_array_equal(view.boxes.num_lidar_pts, [7, 6])
     assert_allclose(view.boxes.center[:, 0], [20.0, 0.0])

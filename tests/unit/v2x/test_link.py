@@ -124,8 +124,7 @@ def test_a_wrong_heading_turns_about_the_partner(da_b: DeepAccident, sample: str
     link = Link(pose_noise=PoseNoise(std=0, heading_std=0.1))
     pole = da_b.world_from(sample.replace("ego_vehicle", "infrastructure"), "ego").translation
     true, noisy = (da_b.cooperative_boxes(sample, agents=["infrastructure"], link=way) for way in (None, link))
-    distances = [np.linalg.norm(boxes.center - pole, axis=1) for boxes in (true, noisy)]
-    assert_allclose(*distances, atol=1e-9)
+    assert_allclose(*[np.linalg.norm(boxes.center - pole, axis=1) for boxes in (true, noisy)], atol=1e-9)
     turned = np.angle(np.exp(1j * (noisy.yaw - true.yaw)))
     assert_allclose(turned, turned[0], atol=1e-6)
     assert abs(turned[0]) > 1e-3

@@ -39,8 +39,7 @@ def painted(scene: Scene, camera: Camera, ground_from_camera: SE3) -> np.ndarray
     directions = ray_directions(ground_from_camera, right[None, :], down[:, None])
     _, face = scene.cast(ground_from_camera.translation, directions.reshape(-1, 3))
     owner = scene.face_owner[face]
-    ids = np.where(owner >= 0, scene.actors.actor_id[np.maximum(owner, 0)], -1)
-    return ids.reshape(directions.shape[:2])
+    return np.where(owner >= 0, scene.actors.actor_id[np.maximum(owner, 0)], -1).reshape(directions.shape[:2])
 
 
 def unoccluded(scene: Scene, ground_from_camera: SE3) -> set[int]:

@@ -30,8 +30,7 @@ def test_a_trajectory_is_the_rows_of_the_track_table(da: DeepAccident) -> None:
 def test_a_trajectory_in_a_samples_frame(da: DeepAccident) -> None:
     sample = da.get_sample(da.scenario[0], "other_vehicle", 3)
     instance = f"{da.scenario[0]['token']}/actor/{da.agent.get(sample['agent_token'])['actor_id']}"
-    path = da.trajectory(instance, sample, "ego")
-    world = da.trajectory(instance)
+    path, world = da.trajectory(instance, sample, "ego"), da.trajectory(instance)
     assert_allclose(path.center, da.world_from(sample, "ego").inverse().apply(world.center), atol=1e-9)
     assert path.present == 3
     assert (np.diff(path.center[:, 0]) > 0).all()
@@ -100,8 +99,7 @@ def test_a_car_that_drives_into_anothers_left_side(tmp_path: Path) -> None:
             f"car {19.4 + 0.2 * frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1212 9 True",
         ]
 
-    da = accident(tmp_path, lines)
-    found = da.collision(tiny.TOKEN)
+    found = accident(tmp_path, lines).collision(tiny.TOKEN)
     assert found.instances == (f"{tiny.TOKEN}/actor/1223", f"{tiny.TOKEN}/actor/1212")
     assert (found.frame, found.gap) == (f"{tiny.TOKEN}/003", pytest.approx(0.5))
     assert_allclose(found.point, [20.0, 1.25, 0.0], atol=0.02)

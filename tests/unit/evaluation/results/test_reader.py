@@ -454,8 +454,7 @@ def npy(array: np.ndarray, version: tuple[int, int] = (1, 0)) -> bytes:
 def claiming(shape: tuple[int, ...]) -> bytes:
     """The header of a larger array before the bytes of a good one."""
     good, buffer = plain.instance_arrays()["instance"], io.BytesIO()
-    header = {"descr": "|u1", "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(buffer, header)
+    np.lib.format.write_array_header_1_0(buffer, {"descr": "|u1", "fortran_order": False, "shape": shape})
     return buffer.getvalue() + good.tobytes()
 
 
@@ -609,8 +608,7 @@ def test_no_bit_of_a_shard_is_read_wrongly(tmp_path: Path) -> None:
     """A shard whose checksum was made after the damage: the archive's own sums say it, or nothing is changed."""
     folder = plain.write_motion(tmp_path / "motion")
     path, expected = folder / "shards" / "00000.npz", plain.instance_arrays()["instance"]
-    content = path.read_bytes()
-    outcomes = set()
+    content, outcomes = path.read_bytes(), set()
     for position in range(0, len(content), 29):
         path.write_bytes(content[:position] + bytes([content[position] ^ 0x5A]) + content[position + 1 :])
         plain.relist(folder)

@@ -97,8 +97,7 @@ def test_what_the_schema_refuses_the_reader_refuses(task: str, tmp_path: Path) -
     """Every value of good results in turn made another one; the reader may know better, never less."""
     folder = tmp_path / "m"
     told, schema = document(task, folder), validator(task)
-    path = folder / "results.json"
-    refused = 0
+    path, refused = folder / "results.json", 0
     for place in list(places(told)):
         for value in STRANGE:
             strange = changed(told, place, value)
@@ -122,8 +121,7 @@ def test_the_examples_of_the_page(tmp_path: Path) -> None:
 
 
 def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
-    token = plain.TOKENS[0]
-    ids = np.zeros((6, 5, 200, 200), dtype=int)
+    token, ids = plain.TOKENS[0], np.zeros((6, 5, 200, 200), dtype=int)
     ids[:, :, 120:124, 90:99] = 3
     given = {
         "folder": str(tmp_path),

@@ -82,8 +82,7 @@ def test_every_file_says_version_protocol_and_partial(run: EvaluationRun, tmp_pa
 
 
 def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
-    switched = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
-    summary = switched.summary()
+    summary = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5})).summary()
     assert summary["switches"] == {"reading.danger_distance": 0.5}
     assert summary["settings"]["choices"]["reading"]["danger_distance"] == 0.5
     assert (summary["counts"], summary["metrics"]["positives"]) == ({"samples": 6, "scenarios": 2, "left_out": 0}, 3)
@@ -112,8 +111,7 @@ def test_a_folder_of_results_is_copied_whole(
 
 
 def test_rows_are_plain_columns(run: EvaluationRun, tmp_path: Path) -> None:
-    folder = save_run(run, tmp_path / "bundle")
-    schema = pyarrow.parquet.read_schema(folder / "samples.parquet")
+    schema = pyarrow.parquet.read_schema(save_run(run, tmp_path / "bundle") / "samples.parquet")
     kinds = {name: str(schema.field(name).type) for name in ("token", "frame", "time_to_impact", "positive", "tp_10m")}
     assert list(kinds.values()) == ["string", "int64", "double", "bool", "int64"]
 
@@ -266,8 +264,7 @@ class TestDamaged:
 def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: Path) -> None:
     bundle = read_bundle(save_run(run, tmp_path / "run"))
     path = bundle.folder / "scenarios.json"
-    stated = read(path)
-    path.write_text(json.dumps({**stated, "scenarios": ["s"]}), encoding="utf-8")
+    path.write_text(json.dumps({**read(path), "scenarios": ["s"]}), encoding="utf-8")
     assert_refused(
         (bundle.scenarios, ResultsError, r"scenarios.json: expected `object`, got `array` - at `\$.scenarios`"),
     )

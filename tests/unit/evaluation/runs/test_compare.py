@@ -99,8 +99,7 @@ HARD = [5 * number for number in range(16)]
 
 class TestNumbers:
     def test_the_better_one_is_named(self, generated: Callable[..., Comparison]) -> None:
-        better = [each + 3 + number % 3 for number, each in enumerate(HARD)]
-        iou = by_name(generated(HARD, better))[MAIN]
+        iou = by_name(generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]))[MAIN]
         assert (iou.family, iou.real, iou.better, iou.decision) == ("main", True, "b", "b is better")
         assert iou.difference == pytest.approx(iou.b - iou.a)
         assert 3 < iou.low < iou.difference < iou.high < 5
@@ -137,8 +136,7 @@ class TestNumbers:
 
     def test_the_other_headlines_are_tested_together(self, generated: Callable[..., Comparison]) -> None:
         """Both ranges have the same numbers: by itself one is real, of several it is not."""
-        worse = [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]
-        numbers = by_name(generated([50] * 10, [50 + each for each in worse]))
+        numbers = by_name(generated([50] * 10, [50 + each for each in [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]]))
         alone, together = numbers[MAIN], numbers["iou 100x100"]
         assert alone.p == together.p == alone.adjusted_p <= 0.05 < together.adjusted_p
         assert (alone.real, together.real, together.better) == (True, False, None)
@@ -181,8 +179,7 @@ class TestNumbers:
 
 class TestForms:
     def test_text(self, motion_bundles: tuple[Path, Path]) -> None:
-        comparison = compare_bundles(*motion_bundles, FEW)
-        text = comparison.to_text()
+        text = compare_bundles(*motion_bundles, FEW).to_text()
         head = "motion, protocol released: 6 samples of 2 scenarios\nclusters: 1 (an accident and its twin are one)"
         assert text.startswith(f"{head}\na: {motion_bundles[0]}\n")
         (line,) = (line for line in text.splitlines() if line.startswith("iou 100x100"))
@@ -315,11 +312,9 @@ def test_equally_good_runs_are_rarely_called_really_different(tmp_path: Path, cl
     """Of two runs of the same law, with clusters that are hard for both, at most 5 % but for chance."""
     source, real = np.random.default_rng(clusters), 0
     for pair in range(pairs):
-        hard = source.normal(0, 1, clusters)
-        folders = []
+        hard, folders = source.normal(0, 1, clusters), []
         for name in "ab":
-            share = 1 / (1 + np.exp(hard + source.normal(0, 0.7, clusters)))
-            found = source.binomial(20, share)
+            found = source.binomial(20, 1 / (1 + np.exp(hard + source.normal(0, 0.7, clusters))))
             folders.append(
                 write_bundle(tmp_path / f"{pair}{name}", [(each, 20 - each) for each in found.tolist()], twins=True)
             )

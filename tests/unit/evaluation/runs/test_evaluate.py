@@ -253,8 +253,7 @@ class TestBrokenOff:
         first = broken_after(9)
         with pytest.raises(KeyboardInterrupt):
             self.run_of(da_b, ten, tmp_path / "out")
-        then = broken_after(None)
-        run = self.run_of(da_b, ten, tmp_path / "out")
+        then, run = broken_after(None), self.run_of(da_b, ten, tmp_path / "out")
         assert [*first[:8], *then] == list(ten.tokens)
         assert run.summary() == self.run_of(da_b, ten, tmp_path / "elsewhere").summary()
 

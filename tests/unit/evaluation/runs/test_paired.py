@@ -96,8 +96,7 @@ def test_pairs_are_what_is_tested() -> None:
 
 def test_clusters_that_do_not_differ_are_not_swapped() -> None:
     first = np.arange(40.0)
-    second = first + np.where(np.arange(40) % 5 == 0, 1.0, 0.0)
-    made = paired(first, second)
+    made = paired(first, first + np.where(np.arange(40) % 5 == 0, 1.0, 0.0))
     assert (made.swaps.swapped.shape, made.p[0], paired(first, first).p[0]) == ((2**7, 8), 2 / 2**8, 1)
 
 
@@ -146,8 +145,7 @@ class TestUndecided:
 
     def test_how_many_would_decide(self) -> None:
         """A difference of 0.5 with a spread of 2: (1.96 + 0.84)² = 7.849 times the square of their ratio."""
-        second = 0.5 + np.tile([2.0, -2.0], 10)
-        made = paired(np.zeros(20), second)
+        made = paired(np.zeros(20), 0.5 + np.tile([2.0, -2.0], 10))
         assert made.p[0] > 0.05
         clusters = 7.849 * 20 / 19 * 4 / 0.5**2
         needed = math.ceil(clusters * 2 / 10) * 10  # two scenarios each, with two digits

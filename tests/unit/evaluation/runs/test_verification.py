@@ -123,11 +123,9 @@ class TestNamed:
     @pytest.mark.parametrize("kind", ["label", "meta", "calib"])
     def test_a_file_of_a_scenario(self, bundle: Path, own_release: Path, kind: str) -> None:
         opened = DeepAccident(dataroot=own_release, verbose=False)
-        pattern = "val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*"
-        path = min(own_release.glob(pattern))
+        path = min(own_release.glob("val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*"))
         path.write_bytes(path.read_bytes() + b"\n")
-        token = min(opened.split_scenarios("val"))
-        verification = verify(bundle, opened)
+        token, verification = min(opened.split_scenarios("val")), verify(bundle, opened)
         assert found(verification) == ["metrics_summary.json: release/fingerprint", f"scenarios.json: {token}/{kind}"]
         assert "edited in place" in verification.notes[0]
 
@@ -367,8 +365,7 @@ class TestStrangers:
         assert "all numbers" in found(verify(bundle, da_b))
 
     def test_deep_nesting_is_refused(self, bundle: Path, da_b: DeepAccident) -> None:
-        path = bundle / "counts.json"
-        path.write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
+        (bundle / "counts.json").write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
         assert "counts.json" in found(verify(bundle, da_b))
         (bundle / "metrics_summary.json").write_text("[" * 900 + "]" * 900)
         assert_refused(
