@@ -15,10 +15,10 @@ from deepaccident_devkit.accidents.outcomes import (
     MOST_MARGIN,
     OUTCOMES,
     Braking,
-    _reductions,
     delta_v_of,
     delta_v_ranges,
     outcomes_of,
+    reductions_of,
     undisturbed,
 )
 from deepaccident_devkit.accidents.recorded import Accident
@@ -155,7 +155,7 @@ def test_no_delta_v_in_the_recording() -> None:
     told = outcomes_of(case, FIRST, [np.nan, 1.0], brakings=AT_ONCE)
     assert names(told.outcome) == ["unchanged", "unchanged"]  # they touch before anyone brakes
     np.testing.assert_array_equal(told.reduction, 0)
-    np.testing.assert_array_equal(_reductions(np.array([2.0, 0.0, 0.0])), [-np.inf, 0.0, 0.0])
+    np.testing.assert_array_equal(reductions_of(np.array([2.0, 0.0, 0.0])), [-np.inf, 0.0, 0.0])
 
 
 @settings(max_examples=12)

@@ -27,7 +27,7 @@ def two() -> Boxes:
 
 def test_corners_in_the_nuscenes_order(two: Boxes) -> None:
     ahead = [[12, 1, 1.75], [12, -1, 1.75], [12, -1, 0.25], [12, 1, 0.25]]
-    assert_allclose(two.corners()[0], ahead + [[8, 1, 1.75], [8, -1, 1.75], [8, -1, 0.25], [8, 1, 0.25]])
+    assert_allclose(two.corners()[0], [*ahead, [8, 1, 1.75], [8, -1, 1.75], [8, -1, 0.25], [8, 1, 0.25]])
     # front right, front left, rear left, rear right of a box that heads to y
     assert_allclose(two.bottom_corners()[1], [[0.25, 5.5, 0.1], [-0.25, 5.5, 0.1], [-0.25, 4.5, 0.1], [0.25, 4.5, 0.1]])
 
@@ -255,8 +255,8 @@ def test_many_pairs_are_worked_off_in_pieces(monkeypatch: pytest.MonkeyPatch) ->
     some = Boxes.from_arrays(rng.normal(size=(40, 3)) * 5, rng.uniform(1, 5, (40, 3)), rng.uniform(-3, 3, 40))
     points = rng.normal(size=(300, 3)) * 5
     whole = some.iou_bev(some), some.distance_bev(some), some.contains(points)
-    monkeypatch.setattr(box_arrays, "_PAIRS_AT_ONCE", 7)
-    monkeypatch.setattr(box_arrays, "_POINTS_AT_ONCE", 7)
+    monkeypatch.setattr(box_arrays, "PAIRS_AT_ONCE", 7)
+    monkeypatch.setattr(box_arrays, "POINTS_AT_ONCE", 7)
     for have, want in zip((some.iou_bev(some), some.distance_bev(some), some.contains(points)), whole, strict=True):
         assert_array_equal(have, want)
 

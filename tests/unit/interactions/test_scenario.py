@@ -39,13 +39,13 @@ def assert_same(one: Interactions, other: Interactions) -> None:
 def computed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The scenarios that are computed while a test runs."""
     tokens: list[str] = []
-    compute = scenario._computed
+    compute = scenario.computed_interactions
 
     def noted(dataset: DeepAccident, token: str, config: InteractionConfig) -> Interactions:
         tokens.append(token)
         return compute(dataset, token, config)
 
-    monkeypatch.setattr(scenario, "_computed", noted)
+    monkeypatch.setattr(scenario, "computed_interactions", noted)
     return tokens
 
 

@@ -9,20 +9,11 @@ from deepaccident_devkit.evaluation import runs
 from deepaccident_devkit.evaluation.runs.further import further_results
 
 
-def test_a_missing_room_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_room_is_named_and_other_names_are_no_names(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rooms, "find_spec", lambda _: None)
     assert_refused(
-        (
-            lambda: list(further_results({"prevented": {"notes": []}})),
-            MissingRoomError,
-            "prevented: needs the room `safety`, which this installation lacks",
-        ),
+        (lambda: list(further_results({"prevented": {"notes": []}})), MissingRoomError, ("prevented: ", "`safety`")),
+        (lambda: runs.with_prevented, MissingRoomError, ("evaluation.runs.with_prevented", "`safety`")),
+        (lambda: runs.mine, AttributeError, ("deepaccident_devkit.evaluation.runs", "'mine'")),
     )
-    with pytest.raises(MissingRoomError, match=r"evaluation\.runs\.with_prevented: needs the room `safety`"):
-        runs.with_prevented  # noqa: B018
     assert not list(further_results({"metrics": {}, "prevented": {}}))
-
-
-def test_other_names_are_no_names() -> None:
-    with pytest.raises(AttributeError, match=r"module 'deepaccident_devkit\.evaluation\.runs' has no attribute 'mine'"):
-        runs.mine  # noqa: B018

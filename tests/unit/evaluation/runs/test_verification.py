@@ -223,14 +223,6 @@ class TestNamed:
         assert len(text) == 23
 
 
-class TestRefused:
-    def test_no_results(self, bundle: Path, da_b: DeepAccident, results: Results) -> None:
-        results.path.unlink()
-        assert_refused(
-            (lambda: verify(bundle, da_b), ResultsError, r"accidents.json: no such file or folder"),
-        )
-
-
 def read_scenarios(bundle: Path, ending: str) -> list[str]:
     stored = json.loads((bundle / "scenarios.json").read_text())["scenarios"]
     return [token for token in stored if f"{ending}/" in token]
@@ -363,6 +355,10 @@ class TestStrangers:
             lambda summary: summary["breakdowns"]["all"].update(resampling=resampling),
         )
         assert "all numbers" in found(verify(bundle, da_b))
+
+    def test_no_results(self, bundle: Path, da_b: DeepAccident, results: Results) -> None:
+        results.path.unlink()
+        assert_refused((lambda: verify(bundle, da_b), ResultsError, ("accidents.json", "no such file or folder")))
 
     def test_deep_nesting_is_refused(self, bundle: Path, da_b: DeepAccident) -> None:
         (bundle / "counts.json").write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")

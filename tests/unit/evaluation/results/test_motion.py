@@ -136,7 +136,7 @@ class TestMotion:
         assert results.tokens == tuple(tokens)
 
     def test_shards_of_some_megabytes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("deepaccident_devkit.evaluation.results.writer._MOST_BYTES", 2000)
+        monkeypatch.setattr("deepaccident_devkit.evaluation.results.writer.MOST_BYTES", 2000)
         written(tmp_path / "m", "motion", {token: heads(1) for token in plain.TOKENS}, store="heads")
         assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
 

@@ -13,7 +13,7 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.clouds import moved_points
 from deepaccident_devkit.v2x.messages import messages
-from deepaccident_devkit.v2x.poses import _colors_at
+from deepaccident_devkit.v2x.poses import colors_at
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -177,7 +177,7 @@ def test_an_image_that_was_stored_smaller_is_read_at_the_same_place() -> None:
     image = np.arange(75, dtype=np.uint8).reshape(5, 5, 3)
     last = np.nextafter(13.0, 0)  # times 5/13 that is 5, which is no column any more
     lens, pixels = PinholeCamera(np.eye(3), 13, 13), np.array([[last, last], [0, 3.0], [20, 1]])
-    colors = _colors_at(image, lens, pixels, np.array([True, True, False]))
+    colors = colors_at(image, lens, pixels, np.array([True, True, False]))
     assert_array_equal(colors, [image[4, 4], image[1, 0], [0, 0, 0]])
 
 
