@@ -86,8 +86,9 @@ def test_a_stopped_one_is_hit() -> None:
 
 def test_one_of_two_who_brake_stands_and_the_other_does_not() -> None:
     """At 3.9 s 26.4 m are left: the slow one stands after 1.6 m, the fast one comes with 12 m/s."""
-    case = accident(straight((0, 0), 0, 4, 51), straight((124, 0), np.pi, 20, 51))
-    told = outcomes_of(case, BOTH, [3.9], brakings=AT_ONCE)
+    told = outcomes_of(
+        accident(straight((0, 0), 0, 4, 51), straight((124, 0), np.pi, 20, 51)), BOTH, [3.9], brakings=AT_ONCE
+    )
     assert told.speeds[0, 0] == pytest.approx([0, np.sqrt(400 - 2 * 5 * 24.8)], abs=1e-3)
     assert names(told.outcome) == ["mitigated"]
 
@@ -120,8 +121,7 @@ def test_latency_and_reaction_delay_the_braking() -> None:
     late = outcomes_of(case, FIRST, [3.7], brakings=[Braking(reaction=0.5, deceleration=5.0)], latency=0.3)
     assert 5 < late.time[0, 0] == outcomes_of(case, FIRST, [4.5], brakings=AT_ONCE).time[0, 0] < np.inf
     from_start = outcomes_of(case, FIRST, [0.0], brakings=AT_ONCE)
-    before = outcomes_of(case, FIRST, [-7.0], brakings=AT_ONCE)
-    np.testing.assert_array_equal(from_start.reduction, before.reduction)
+    np.testing.assert_array_equal(from_start.reduction, outcomes_of(case, FIRST, [-7.0], brakings=AT_ONCE).reduction)
 
 
 def test_the_check_of_a_recording() -> None:
@@ -151,8 +151,9 @@ def test_delta_v_and_its_range() -> None:
 
 def test_no_delta_v_in_the_recording() -> None:
     """Both drive side by side at the same speed and touch all the time: only braking makes a difference of speeds."""
-    case = accident(straight((0, 0), 0, 10, 31), straight((0, 2), 0, 10, 31))
-    told = outcomes_of(case, FIRST, [np.nan, 1.0], brakings=AT_ONCE)
+    told = outcomes_of(
+        accident(straight((0, 0), 0, 10, 31), straight((0, 2), 0, 10, 31)), FIRST, [np.nan, 1.0], brakings=AT_ONCE
+    )
     assert names(told.outcome) == ["unchanged", "unchanged"]  # they touch before anyone brakes
     np.testing.assert_array_equal(told.reduction, 0)
     np.testing.assert_array_equal(reductions_of(np.array([2.0, 0.0, 0.0])), [-np.inf, 0.0, 0.0])
@@ -169,8 +170,7 @@ def test_earlier_braking_of_a_striker_from_behind_never_hits_faster(
     second = np.column_stack([way - way[-1] + 3.9 + speed * (frames - 1) / 10, np.zeros(frames), np.zeros(frames)])
     case = accident(straight((0, 0), 0, speed, frames), second)
     assume(undisturbed(case).time > 3.9)  # else it drives into the leader before, and may do so more than once
-    starts = np.arange(0, 4.05, 0.05)
-    told = outcomes_of(case, FIRST, starts, brakings=[Braking(reaction=0, deceleration=deceleration)])
+    told = outcomes_of(case, FIRST, np.arange(0, 4.05, 0.05), brakings=[Braking(reaction=0, deceleration=deceleration)])
     assert (np.diff(np.nan_to_num(told.speeds[:, 0, 0], nan=-1.0)) >= -1e-3).all()
 
 

@@ -40,8 +40,7 @@ def test_without_braking_it_is_the_recording_and_goes_straight_on() -> None:
 
 @pytest.mark.parametrize(("step", "moves"), [(0.0009, False), (0.0011, True)])
 def test_who_hardly_moved_at_the_end_stands_afterwards(step: float, moves: bool) -> None:
-    motion = motion_of([[0, 0, 0], [1, 0, 0], [1 + step, 0, 0]])
-    assert (at(motion, np.array([3.0])).poses[0, 0] > 1 + step) == moves
+    assert (at(motion_of([[0, 0, 0], [1, 0, 0], [1 + step, 0, 0]]), np.array([3.0])).poses[0, 0] > 1 + step) == moves
 
 
 def test_braking_from_constant_speed() -> None:
@@ -105,5 +104,6 @@ def test_a_replay_stays_on_its_path(path: np.ndarray, start: float, deceleration
     motion = motion_of(path)
     braked = at(motion, np.linspace(0, motion.duration + HORIZON, 300), start, deceleration)
     for axis in (0, 1):
-        on_path = np.interp(braked.arcs, motion.arcs, motion.poses[:, axis])
-        np.testing.assert_allclose(braked.poses[:, axis], on_path, atol=1e-6)
+        np.testing.assert_allclose(
+            braked.poses[:, axis], np.interp(braked.arcs, motion.arcs, motion.poses[:, axis]), atol=1e-6
+        )

@@ -173,8 +173,7 @@ def square() -> Boxes:
 
 def test_iou_by_hand(square: Boxes) -> None:
     centers = [[0, 0, 0], [1, 0, 0], [1, 1, 1], [2, 0, 0], [0, 0, 3], [5, 5, 0], [0, 0, 0]]
-    sizes = [[2, 2, 2]] * 6 + [[1, 1, 1]]
-    others = Boxes.from_arrays(centers, sizes, [0, np.pi / 2, np.pi, 0, 0, 0, 0], frame="lidar")
+    others = Boxes.from_arrays(centers, [[2, 2, 2]] * 6 + [[1, 1, 1]], [0, np.pi / 2, np.pi, 0, 0, 0, 0], frame="lidar")
     assert_allclose(square.iou_bev(others), [[1, 1 / 3, 1 / 7, 0, 1, 0, 1 / 4]], atol=1e-15)
     assert_allclose(square.iou_3d(others), [[1, 1 / 3, 1 / 15, 0, 0, 0, 1 / 8]], atol=1e-15)
     star = Boxes.from_arrays([[0, 0, 0]], [[2, 2, 2]], [np.pi / 4], frame="lidar")  # a regular octagon in common

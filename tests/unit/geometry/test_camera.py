@@ -94,8 +94,9 @@ def test_boxes_must_be_in_the_cameras_frame() -> None:
             for other in others
         ],
     )
-    camera_from_lidar = SE3.from_rotation([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    assert camera.boxes_in_image(box.transform(camera_from_lidar, "Camera_Front")).all()
+    assert camera.boxes_in_image(
+        box.transform(SE3.from_rotation([[0, -1, 0], [0, 0, -1], [1, 0, 0]]), "Camera_Front")
+    ).all()
 
 
 def test_cameras_and_pixels_that_cannot_be() -> None:

@@ -21,8 +21,9 @@ def test_y_changes_its_sign_and_nothing_else() -> None:
 
 def test_matrices_by_hand() -> None:
     matrix = np.arange(1.0, 17).reshape(4, 4)
-    flipped = [[1, -2, 3, 4], [-5, 6, -7, -8], [9, -10, 11, 12], [13, -14, 15, 16]]
-    assert_array_equal(conventions.flip_pose(matrix), flipped)
+    assert_array_equal(
+        conventions.flip_pose(matrix), [[1, -2, 3, 4], [-5, 6, -7, -8], [9, -10, 11, 12], [13, -14, 15, 16]]
+    )
 
 
 def test_camera_back_by_hand() -> None:

@@ -31,8 +31,9 @@ def test_arrays_are_read_only_and_the_callers_are_not() -> None:
 
 @pytest.fixture
 def cloud() -> LidarPointCloud:
-    xyz = [[0.0, 0, 0], [1, 1, 0], [1.4, 1.4, 0.4], [-3, 4, 1], [10, -2, 2]]
-    return LidarPointCloud(np.array(xyz), np.arange(5) / 10)
+    return LidarPointCloud(
+        np.array([[0.0, 0, 0], [1, 1, 0], [1.4, 1.4, 0.4], [-3, 4, 1], [10, -2, 2]]), np.arange(5) / 10
+    )
 
 
 def rows(part: LidarPointCloud) -> list[int]:

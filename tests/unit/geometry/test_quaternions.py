@@ -25,10 +25,10 @@ def test_against_pyquaternion() -> None:
     assert_allclose(quaternions.yaw_of(elements), np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]), atol=1e-9)
     products = [(one * two).elements for one, two in zip(oracles[:100], oracles[100:], strict=True)]
     left = quaternions.left_multiplier(np.array([q.elements for q in oracles[:100]]))
-    right = np.array([q.elements for q in oracles[100:]])
-    assert_allclose((left @ right[:, :, None])[..., 0], products, atol=1e-12)
-    single = quaternions.single_left_multiplier(matrices[0])
-    assert_allclose(single, quaternions.left_multiplier(elements[0]), atol=1e-9)
+    assert_allclose((left @ np.array([q.elements for q in oracles[100:]])[:, :, None])[..., 0], products, atol=1e-12)
+    assert_allclose(
+        quaternions.single_left_multiplier(matrices[0]), quaternions.left_multiplier(elements[0]), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (3,), (2, 3)])

@@ -37,8 +37,7 @@ def test_constructors_agree() -> None:
 def test_stored_transforms_have_the_last_row_of_every_transform() -> None:
     pose = SE3.from_yaw(0.3, (1, 2, 3)).matrix
     for kept in (12, 16):
-        numbers = np.tile(pose.ravel()[:kept], (2, 5, 1))
-        assert_array_equal(stored_transforms(numbers), np.tile(pose, (2, 5, 1, 1)))
+        assert_array_equal(stored_transforms(np.tile(pose.ravel()[:kept], (2, 5, 1))), np.tile(pose, (2, 5, 1, 1)))
 
 
 def test_the_matrix_is_a_read_only_copy_and_the_callers_stays_writable() -> None:
@@ -170,11 +169,9 @@ def test_ways_there_and_back_end_where_they_began_though_poses_are_rounded(how: 
         assert_allclose((a @ a.inverse()).matrix, np.eye(4), atol=1e-9)
         points = source.uniform(-600, 600, (9, 3))
         assert_allclose(b_from_a.apply(a_from_b.apply(points)), points, atol=1e-9)
-        around = (a.inverse() @ b) @ (b.inverse() @ c) @ (c.inverse() @ a)
-        assert_allclose(around.apply(points), points, atol=1e-9)
+        assert_allclose(((a.inverse() @ b) @ (b.inverse() @ c) @ (c.inverse() @ a)).apply(points), points, atol=1e-9)
         boxes = Boxes.from_arrays(points, np.full((9, 3), 8.0), source.uniform(-3, 3, 9), frame="a")
-        back = boxes.transform(b_from_a, "b").transform(a_from_b, "a")
-        assert_allclose(back.corners(), boxes.corners(), atol=1e-5)
+        assert_allclose(boxes.transform(b_from_a, "b").transform(a_from_b, "a").corners(), boxes.corners(), atol=1e-5)
 
 
 def test_a_rounded_pose_keeps_its_numbers_and_has_the_nearest_rotations_quaternion() -> None:

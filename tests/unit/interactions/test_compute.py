@@ -20,8 +20,9 @@ DEFAULT = InteractionConfig()
 
 
 def of_scene(paths, sizes=None, unknown=(), config=DEFAULT) -> tuple[ActorMotion, Measured, dict[str, np.ndarray]]:
-    frames = max((len(path) for path in paths.values()), default=0)
-    motion = actor_motion(tracks_of(paths, sizes or {}, unknown), frames, config)
+    motion = actor_motion(
+        tracks_of(paths, sizes or {}, unknown), max((len(path) for path in paths.values()), default=0), config
+    )
     measured = measured_pairs(motion, config)
     return motion, measured, pair_summaries(motion, measured, config)
 
@@ -59,8 +60,10 @@ def test_one_that_drives_up_to_another() -> None:
     ],
 )
 def test_thresholds_decide_and_so_does_the_radius(config: InteractionConfig, expected: list[tuple[int, int]]) -> None:
-    paths = {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0), 3: straight(5, 0, 5.5, 10)}
-    assert pairs_in(paths, config=config) == expected
+    assert (
+        pairs_in({1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0), 3: straight(5, 0, 5.5, 10)}, config=config)
+        == expected
+    )
 
 
 def test_one_dimension_is_that_of_the_one_who_drives_up() -> None:
@@ -80,8 +83,7 @@ def test_side_by_side_there_is_a_gap_and_no_time() -> None:
 
 def test_two_that_stand_are_none_and_frames_at_which_both_stand_do_not_count() -> None:
     assert pairs_in({1: straight(4, 0, 0, 0), 2: straight(4, 3, 0, 0.4)}) == []  # one in the other
-    stops = [*straight(4, 0, 0, 10), *[(3.0, 0.0, 0.0)] * 4]
-    _, measured, found = of_scene({1: stops, 2: straight(8, 9, 0, 0)})
+    _, measured, found = of_scene({1: [*straight(4, 0, 0, 10), *[(3.0, 0.0, 0.0)] * 4], 2: straight(8, 9, 0, 0)})
     assert (measured.counts[0].tolist(), found["num_frames"].tolist()) == ([True] * 4 + [False] * 4, [4])
 
 
@@ -94,8 +96,7 @@ def test_what_rides_on_another_is_no_pair_and_one_that_is_hit_is() -> None:
 
 
 def test_who_is_not_there_and_nobody_at_all() -> None:
-    seen_once = {1: straight(6, 0, 0, 10), 2: [None, None, (15.0, 0.0, 0.0), None, None, None]}
-    motion, measured, found = of_scene(seen_once)
+    motion, measured, found = of_scene({1: straight(6, 0, 0, 10), 2: [None, None, (15.0, 0.0, 0.0), None, None, None]})
     assert measured.counts.sum() == found["num_frames"].item() == 1
     assert (found["min_ttc"].item(), found["min_ttc_frame"].item()) == (pytest.approx(0.9), 2)
     assert motion.acceleration[1].tolist() == [0] * 6

@@ -40,8 +40,7 @@ def test_who_stands_is_always_there() -> None:
 
 
 def test_one_behind_the_other_follows_at_its_headway() -> None:
-    behind = np.array([-40.0, 0.0, 4.0, 2.0, 0.0])
-    assert post_encroachment_time(EAST, behind, TEN_EAST, TEN_EAST) == pytest.approx(1.6)
+    assert post_encroachment_time(EAST, np.array([-40.0, 0.0, 4.0, 2.0, 0.0]), TEN_EAST, TEN_EAST) == pytest.approx(1.6)
 
 
 places = st.floats(-25, 25)

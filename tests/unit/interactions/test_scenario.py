@@ -121,8 +121,10 @@ def test_many_at_once_are_as_one_by_one(own: DeepAccident, computed: list[str]) 
     )
     assert [each.scenario for each in list(interactions_of(own))] == tokens == computed
     shutil.rmtree(own.tables_folder / scenario.FOLDER)
-    narrow = list(interactions_of(own, tokens[:2], InteractionConfig(max_ttc=1)))
-    assert [each.config.max_ttc for each in narrow] == [1, 1]
+    assert [each.config.max_ttc for each in list(interactions_of(own, tokens[:2], InteractionConfig(max_ttc=1)))] == [
+        1,
+        1,
+    ]
     assert not (own.tables_folder / scenario.FOLDER).exists()
 
 

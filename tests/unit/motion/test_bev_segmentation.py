@@ -51,8 +51,7 @@ def test_wide_classes_need_half_a_cell_and_thin_ones_a_pixel() -> None:
     assert not targets.mask("road")[tuple(cell)]
     assert targets.mask("lane_line")[tuple(cell)]
     assert targets.mask("lane_line").sum() == 1
-    more = segmentation_of(_image(columns, (ROAD, slice(595, 598), slice(597, 598))), grid)
-    assert more.mask("road")[tuple(cell)]
+    assert segmentation_of(_image(columns, (ROAD, slice(595, 598), slice(597, 598))), grid).mask("road")[tuple(cell)]
 
 
 def test_cells_beyond_the_camera_are_unknown_and_empty() -> None:
@@ -121,6 +120,7 @@ def test_oblong_cells_count_their_own_pixels() -> None:
         cell = semantic[first_row : first_row + 5, first_column : first_column + 4]
         counts = {name: np.count_nonzero(cell == tag) for name, tag in tags.items()}
         halves += counts["road"] == 10
-        expected = [counts[name] >= (10 if COVERAGE[name] else 1) for name in BEV_CLASSES]
-        assert targets.masks[:, row, column].tolist() == expected
+        assert targets.masks[:, row, column].tolist() == [
+            counts[name] >= (10 if COVERAGE[name] else 1) for name in BEV_CLASSES
+        ]
     assert halves > 3

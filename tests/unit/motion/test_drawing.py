@@ -55,8 +55,7 @@ def labels(frames, motion=STILL, **changes):
 
 @pytest.mark.parametrize("augmentation", [None, Augmentation(rotation=0.2, scale=1.1, flip=True)])
 def test_without_a_lean_both_rules_of_poses_give_the_same_corners(augmentation: Augmentation | None) -> None:
-    rows = ((10, -5, 7, 0, 1), (-3, 8, 8, 0, 1), (0, 30, 9, 0, 1))
-    boxes = frame(*rows, lidar=SE3.from_yaw(0.3, (1.0, -2.0, 0.5)))
+    boxes = frame(*((10, -5, 7, 0, 1), (-3, 8, 8, 0, 1), (0, 30, 9, 0, 1)), lidar=SE3.from_yaw(0.3, (1.0, -2.0, 0.5)))
     size = boxes.size * ([1, 1, 1], [2, 1, 1], [-1, -1, 1])  # a release may have negative ones
     boxes = replace(boxes, yaw=np.array([0.4, -2.0, 3.0]), size=size)
     found = []
@@ -116,8 +115,7 @@ def test_nobody_is_drawn_where_the_present_is_missing_in_the_released_way() -> N
 
 def test_vehicles_alone() -> None:
     frames = [frame(*((0, 5 * category, category + 1, category, 1) for category in range(6)))] * 5
-    drawn = box_polygons(frames, MotionLabelConfig(only_vehicle=True, draw_ego=False))
-    assert drawn[0].key.tolist() == [1, 2, 3, 4, 5]
+    assert box_polygons(frames, MotionLabelConfig(only_vehicle=True, draw_ego=False))[0].key.tolist() == [1, 2, 3, 4, 5]
 
 
 def test_the_egos_own_box_and_its_slips() -> None:
@@ -148,8 +146,9 @@ def test_where_the_agent_leans_the_middle_of_a_boxs_bottom_counts(protocol: str)
     config = MotionLabelConfig(protocol=protocol)
     assert_allclose(box_polygons([boxes] * 5, config)[0].corners.mean(axis=1), [own[:2], other[:2]], atol=1e-5)
     high = replace(frame((10, 5, 7, 0, 1), (9, 9, 8, 0, 1), lidar=lidar), center=[[10, 5, 2.0], [9, 9, 4]])
-    keys = box_polygons([high] * 5, config)[0].key.tolist()
-    assert keys == ([OWN_BOX_ID, 7, 8] if protocol == "released" else [7, 8])
+    assert box_polygons([high] * 5, config)[0].key.tolist() == (
+        [OWN_BOX_ID, 7, 8] if protocol == "released" else [7, 8]
+    )
     if protocol == "released":  # a default box at the height of the first row's middle
         default = lidar.apply(np.array([[0, 0, 2.0 - 1.62 / 2]]))[0]
         assert_allclose(box_polygons([high] * 5, config)[0].corners[0].mean(axis=0), default[:2], atol=1e-5)
@@ -178,11 +177,9 @@ def test_half_a_cell_more_or_less() -> None:
 def test_beverse_rounds_in_its_own_right_handed_frame() -> None:
     """BEVerse draws corners at round((x + 50) / 0.5), round((y + 50) / 0.5); its y points left."""
     for y in (0.3, 0.2, -0.3, 5.4):
-        drawn = labels([frame((2.2, y, 7, 0, 1))] * 5, protocol="beverse", draw_ego=False).instance[0]
-        found = np.argwhere(drawn)
+        found = np.argwhere(labels([frame((2.2, y, 7, 0, 1))] * 5, protocol="beverse", draw_ego=False).instance[0])
         for axis, (low, high) in enumerate(((y - 1, y + 1), (0.2, 4.2))):
-            rounded = [round((edge + 50) / 0.5) for edge in (low, high)]
-            assert [found[:, axis].min(), found[:, axis].max()] == rounded
+            assert [found[:, axis].min(), found[:, axis].max()] == [round((edge + 50) / 0.5) for edge in (low, high)]
     released = labels([frame((2.2, 0.3, 7, 0, 1))] * 5, draw_ego=False).instance[0]
     assert np.argwhere(released)[:, 0].min() == 199 - round((0.7 + 50) / 0.5)
 
@@ -255,8 +252,9 @@ def test_a_frame_that_is_not_valid_is_missing() -> None:
     made = motion_labels_from_boxes(frames, STILL, "beverse", valid=[True] * 6 + [False])
     assert made.label_valid.tolist() == [True] * 4 + [False]
     assert (made.instance[4] == 255).all()
-    gone = motion_labels_from_boxes([*frames[:4], None], STILL, valid=[True] * 7)
-    assert gone.label_valid.tolist() == [True] * 4 + [False]
+    assert motion_labels_from_boxes([*frames[:4], None], STILL, valid=[True] * 7).label_valid.tolist() == [True] * 4 + [
+        False
+    ]
 
 
 def test_a_small_mark_is_no_vector() -> None:
@@ -411,8 +409,9 @@ def test_few_cells_are_looked_at() -> None:
     """Else the shortcut could be lost without any other test failing."""
     shown = footprints([[(30, 20), (38, 20), (38, 24), (30, 24)]], CONFIG)
     lines = drawing.sampling_lines(np.eye(4)[None], CONFIG.grid, CONFIG.rules)
-    runs = drawing.runs_near(shown, *drawing.even_spread(lines, CONFIG.grid), CONFIG.grid)
-    assert 9 * 5 <= runs.length.sum() <= 12 * 8
+    assert (
+        9 * 5 <= drawing.runs_near(shown, *drawing.even_spread(lines, CONFIG.grid), CONFIG.grid).length.sum() <= 12 * 8
+    )
 
 
 @pytest.mark.parametrize("motion", [(1e7, 0, 0, 0, 0, 0), (0, 0, 0, np.pi / 2, 0, 0)], ids=["far away", "upright"])

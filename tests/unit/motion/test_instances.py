@@ -109,8 +109,7 @@ def test_labels_are_not_taken_for_logits(orientation) -> None:
     encoded = replace(heads, segmentation=np.stack([~actor, actor], axis=1) * np.float32(10))
     for rules in (POST_PROCESSING["accident"], PostProcessing(foreground="sigmoid")):
         assert (predict_instances(encoded, rules).instance > 0).sum() == 25
-        literal = replace(rules, labels_bypass_sigmoid=False)
-        assert (predict_instances(encoded, literal).frame_instance == 0).all()
+        assert (predict_instances(encoded, replace(rules, labels_bypass_sigmoid=False)).frame_instance == 0).all()
 
 
 def test_the_sigmoid_is_above_its_threshold_where_its_logit_is() -> None:
@@ -122,8 +121,7 @@ def test_the_sigmoid_is_above_its_threshold_where_its_logit_is() -> None:
 
 
 def test_redrawn_boxes_follow_the_path_but_not_across_a_gap() -> None:
-    heads = drawn({(5, 5): (0, 8)}, {(5, 13): (0, 8)}, {(5, 21): (0, 0)})
-    redrawn = predict_instances(heads, "accident").redrawn
+    redrawn = predict_instances(drawn({(5, 5): (0, 8)}, {(5, 13): (0, 8)}, {(5, 21): (0, 0)}), "accident").redrawn
     assert redrawn is not None
     for frame, column in zip(redrawn, (5, 13, 21), strict=True):
         rows, columns = np.nonzero(frame)
@@ -259,8 +257,10 @@ def test_a_redrawn_box_turns_after_a_move_of_four_cells_and_is_10_by_4_at_most(m
     hull = [(28, 8), (28, 16), (12, 16), (12, 8)]  # 16 × 8, along a row
     centers = np.array([[[12.0, 20.0], [12.0 + move, 20.0], [13.0 + move, 20.0]]])
     positions, ids = redrawn_cells([hull], centers, np.ones((1, 3), dtype=bool), (40, 40))
-    extents = [tuple(np.ptp(position, axis=1).tolist()) for position in positions]
-    assert extents == [(4, 10), *[(10, 4) if turns else (4, 10)] * 2]
+    assert [tuple(np.ptp(position, axis=1).tolist()) for position in positions] == [
+        (4, 10),
+        *[(10, 4) if turns else (4, 10)] * 2,
+    ]
     assert [position.mean(axis=1).tolist() for position in positions] == centers[0].tolist()
     assert all((one == 1).all() for one in ids)
 

@@ -158,8 +158,9 @@ class TestRoundTrip:
     @pytest.mark.slow
     def test_every_sample_reads_as_it_is_made(self, da_motion: DeepAccident, tmp_path: Path) -> None:
         tokens = [record["token"] for record in da_motion.sample]
-        done = write(da_motion, tmp_path / "a" / "new folder", tokens, workers=2)
-        assert done == LabelsWritten(samples=350, written=10, kept=0)
+        assert write(da_motion, tmp_path / "a" / "new folder", tokens, workers=2) == LabelsWritten(
+            samples=350, written=10, kept=0
+        )
         files = LabelFiles(tmp_path / "a" / "new folder", MotionLabelConfig())
         assert (list(files), len(files)) == (tokens, len(tokens))
         for token in tokens[::3]:

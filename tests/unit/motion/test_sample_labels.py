@@ -177,8 +177,7 @@ class TestWhoIsDrawn:
 
     def test_only_vehicle_leaves_out_pedestrians(self, small: DeepAccident) -> None:
         assert min(drawn(small.motion_labels(f"{EGO}/006"), WALKER)) > 0
-        labels = small.motion_labels(f"{EGO}/006", MotionLabelConfig(only_vehicle=True))
-        assert {*labels.id_map} == {OWN_BOX_ID, VAN}
+        assert {*small.motion_labels(f"{EGO}/006", MotionLabelConfig(only_vehicle=True)).id_map} == {OWN_BOX_ID, VAN}
 
     def test_who_appears_later(self, small: DeepAccident) -> None:
         """Present at 6: the car is seen from 11 on. Released: never drawn; clean: from then on."""
@@ -191,8 +190,11 @@ class TestWhoIsDrawn:
 
     def test_untracked_actors_are_seen_by_nobody(self, small: DeepAccident) -> None:
         for protocol in ("released", "clean"):
-            labels = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
-            assert not labels.segmentation[:, 70:130, 50:70].any()
+            assert (
+                not small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
+                .segmentation[:, 70:130, 50:70]
+                .any()
+            )
             everybody = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol, filter_invisible=False))
             left = [len(np.unique(frame[70:130, 50:70])) - 1 for frame in everybody.instance]
             assert left == [1 if protocol == "released" else 2] * 5
@@ -216,8 +218,9 @@ class TestWhoIsDrawn:
             "vehicles": False,
             ("ego_vehicle", "other_vehicle"): False,
         }.items():
-            labels = release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents))
-            assert (VAN in labels.id_map) == there, agents
+            assert (VAN in release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)).id_map) == there, (
+                agents
+            )
 
 
 class TestIds:
@@ -302,8 +305,7 @@ class TestErrors:
                 for agents in ("+other", "all", ("ego_vehicle", "other_vehicle"))
             ],
         )
-        unfiltered = MotionLabelConfig(agents="+other", filter_invisible=False)
-        assert VAN in two.motion_labels(f"{EGO}/002", unfiltered).id_map
+        assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+other", filter_invisible=False)).id_map
 
     @pytest.mark.parametrize("agents", ["everybody", "ego_vehicle", ("pole",), ()])
     def test_agents_that_do_not_exist(self, small: DeepAccident, agents: object) -> None:
@@ -319,8 +321,9 @@ class TestErrors:
         tiny.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)
         release = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle",)))
         assert {*release.motion_labels(f"{EGO}/002").id_map} == {OWN_BOX_ID, VAN}
-        alone = release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",)))
-        assert {*alone.id_map} == {OWN_BOX_ID}
+        assert {*release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",))).id_map} == {
+            OWN_BOX_ID
+        }
 
 
 def test_a_label_without_boxes(tmp_path: Path) -> None:
@@ -368,8 +371,9 @@ def test_the_paper_leaves_horizon_and_scope_open(da_motion: DeepAccident, every_
         assert _frames(tokens, scenario["token"], "infrastructure") == [5, 10, 15, 20, 25, 30]
     assert len(samples(da_motion, every_scenario, "all")) == 2 * 5 * 7
     assert samples(da_motion, every_scenario, "every") == [sample["token"] for sample in da_motion.sample]
-    shortest = samples(da_motion, every_scenario, "evaluate", "paper", horizon=0.5, scope="all")
-    assert {token[-3:] for token in shortest} == {"030"}
+    assert {
+        token[-3:] for token in samples(da_motion, every_scenario, "evaluate", "paper", horizon=0.5, scope="all")
+    } == {"030"}
 
 
 def test_a_split_belongs_to_its_scenarios_alone(da_motion: DeepAccident, tmp_path: Path) -> None:

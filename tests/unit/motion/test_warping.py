@@ -45,8 +45,9 @@ def at(x: float, y: float, grid: BevGrid = GRID, value: float = 1) -> np.ndarray
 def test_an_agent_that_stands_ahead_sees_things_further_ahead(protocol: str, orientation: Any) -> None:
     grid = GRID.with_orientation(orientation)
     maps = np.stack([at(0.5, 1.5, grid), at(0.5, 1.5, grid)])
-    found = agents_to_ego(maps, [[0] * 6, ONE_AHEAD], grid=grid, protocol=protocol)
-    assert_array_equal(found, [maps[0], at(1.5, 1.5, grid)])
+    assert_array_equal(
+        agents_to_ego(maps, [[0] * 6, ONE_AHEAD], grid=grid, protocol=protocol), [maps[0], at(1.5, 1.5, grid)]
+    )
 
 
 @ORIENTATIONS
@@ -218,8 +219,7 @@ def test_what_is_ahead_of_an_ego_that_turned_left_is_on_the_presents_left(orient
 
 @pytest.mark.parametrize(("protocol", "beside"), [("released", 0), ("clean", 255)])
 def test_what_comes_in_from_beside_the_grid(protocol: str, beside: int) -> None:
-    config = MotionLabelConfig(grid=GRID, protocol=protocol, future_frames=1)
-    labels = make_labels(config, [-3.0, 0, 0, 0, 0, 0])
+    labels = make_labels(MotionLabelConfig(grid=GRID, protocol=protocol, future_frames=1), [-3.0, 0, 0, 0, 0, 0])
     present = labels.to_present(centerness="bilinear")
     assert_array_equal(present.flow[1][:, :, :2], beside)
     assert_array_equal(present.offset[1][:, :, 4:7], 255)
@@ -228,8 +228,9 @@ def test_what_comes_in_from_beside_the_grid(protocol: str, beside: int) -> None:
 
 
 def test_released_vectors_keep_their_values_when_the_frame_turns() -> None:
-    config = MotionLabelConfig(grid=GRID, future_frames=1)
-    present = make_labels(config, np.negative(QUARTER_LEFT).tolist()).to_present()
+    present = make_labels(
+        MotionLabelConfig(grid=GRID, future_frames=1), np.negative(QUARTER_LEFT).tolist()
+    ).to_present()
     assert_array_equal(present.offset[1][:, present.instance[1] > 0][:, 0], [0, 1])
 
 

@@ -240,7 +240,8 @@ def test_what_cannot_be_judged_and_what_always_counts_as_seen(tmp_path: Path, da
     assert accident_visibility(pole, tiny.TOKEN) is None
     assert [accident_visible(pole, f"{tiny.TOKEN}/infrastructure/{frame:03d}") for frame in (5, 6)] == [False, True]
     for number, name in enumerate(SHEER_CURTAINS):
-        curtain = watched(tmp_path / f"{number}", (), 6, name=name)
-        assert accident_visibility(curtain, f"{tiny.TYPE}/{name}") == "visible"
+        assert (
+            accident_visibility(watched(tmp_path / f"{number}", (), 6, name=name), f"{tiny.TYPE}/{name}") == "visible"
+        )
     [calm] = [scenario for scenario in da.scenario if scenario["collision"] is None][:1]
     assert (accident_visibility(da, calm), accident_visible(da, f"{calm['token']}/infrastructure/001")) == (None, True)

@@ -157,8 +157,7 @@ def test_lost_clouds_leave_no_points(da: DeepAccident, sample: str) -> None:
 def test_a_cloud_in_an_image_of_its_own_agent(da: DeepAccident, sample: str) -> None:
     camera = f"{sample}/Camera_Front"
     image, shown = da.load_image(camera), da.map_pointcloud_to_image(camera)
-    cloud = da.load_point_cloud(sample, "lidar")
-    optical = da.transform(sample, sample, "Camera_Front", "lidar").apply(cloud.xyz)
+    optical = da.transform(sample, sample, "Camera_Front", "lidar").apply(da.load_point_cloud(sample, "lidar").xyz)
     assert_allclose(shown.depth, optical[:, 2], atol=1e-9)
     assert shown.mask.sum() > 100
     assert not shown.mask[optical[:, 2] <= 0].any()
@@ -177,8 +176,9 @@ def test_an_image_that_was_stored_smaller_is_read_at_the_same_place() -> None:
     image = np.arange(75, dtype=np.uint8).reshape(5, 5, 3)
     last = np.nextafter(13.0, 0)  # times 5/13 that is 5, which is no column any more
     lens, pixels = PinholeCamera(np.eye(3), 13, 13), np.array([[last, last], [0, 3.0], [20, 1]])
-    colors = colors_at(image, lens, pixels, np.array([True, True, False]))
-    assert_array_equal(colors, [image[4, 4], image[1, 0], [0, 0, 0]])
+    assert_array_equal(
+        colors_at(image, lens, pixels, np.array([True, True, False])), [image[4, 4], image[1, 0], [0, 0, 0]]
+    )
 
 
 def test_points_of_any_agent_in_any_camera_and_frame(da: DeepAccident, sample: str) -> None:
@@ -288,8 +288,9 @@ def test_the_lidars_frame_has_one_name(da: DeepAccident, sample: str) -> None:
     ]
     assert [result.frame for result in results] == ["lidar"] * len(results)
     assert_array_equal(da.world_from(sample, "lidar01").matrix, da.world_from(sample, "lidar").matrix)
-    overlap = da.boxes(sample, "lidar01").iou_bev(da.cooperative_boxes(sample, frame="lidar")).max()
-    assert overlap == pytest.approx(1, abs=1e-12)
+    assert da.boxes(sample, "lidar01").iou_bev(da.cooperative_boxes(sample, frame="lidar")).max() == pytest.approx(
+        1, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("frame", ["map", "", None, 3, ["ego"]])

@@ -51,8 +51,9 @@ def test_each_box_is_its_sources_own_in_the_frame_asked_for(da: DeepAccident) ->
 def test_actor_ids_are_those_of_the_instances(da: DeepAccident) -> None:
     for sample in (da.sample[7], da.sample[-1]):
         instances = [box.instance_token for box in da.get_boxes(sample)]
-        expected = [-1 if token is None else int(token.rsplit("/", 1)[1]) for token in instances]
-        assert_array_equal(da.actor_ids(sample), expected)
+        assert_array_equal(
+            da.actor_ids(sample), [-1 if token is None else int(token.rsplit("/", 1)[1]) for token in instances]
+        )
 
 
 def scene(rows: dict[str, Sequence[str]]):
@@ -77,8 +78,9 @@ def row(x: float, actor: int, points: int = 9, category: str = "car", camera: bo
 
 
 def test_own_rows_become_actors_and_give_way_to_what_others_see(stacked) -> None:
-    own = {"ego_vehicle": [row(0.1, -100, 900, camera=False)], "other_vehicle": [row(30.0, -100), row(0.0, 1223, 7)]}
-    da = stacked(own)
+    da = stacked(
+        {"ego_vehicle": [row(0.1, -100, 900, camera=False)], "other_vehicle": [row(30.0, -100), row(0.0, 1223, 7)]}
+    )
     view = cooperative_view(da, f"{tiny.TOKEN}/ego_vehicle/001")
     assert_array_equal(view.boxes.actor_id, [1212, 1223])
     assert_allclose(view.boxes.center[:, 0], [30.0, 0.0])
@@ -146,8 +148,9 @@ def test_visible_only(stacked) -> None:
 def test_visible_instances_of_all_agents_are_those_of_the_released_labels(da: DeepAccident) -> None:
     for sample in (da.sample[0], da.sample[33]):
         instances = {int(token.rsplit("/", 1)[1]) for token in da.visible_instances(sample)}
-        ids = da.boxes(sample, visible="released").actor_id
-        assert set(ids.tolist()) == instances & set(da.boxes(sample).actor_id.tolist())
+        assert set(da.boxes(sample, visible="released").actor_id.tolist()) == instances & set(
+            da.boxes(sample).actor_id.tolist()
+        )
         assert len(instances) >= len(da.visible_instances(sample, agents="single")) > 0
 
 

@@ -191,8 +191,7 @@ def test_equal_links_draw_alike_whatever_their_numbers_types() -> None:
     for link in links:
         assert (type(link.latency), type(link.packet_loss), type(link.seed)) == (float, float, int)
         assert type(link.pose_noise.mean) is float
-        draws = [link.pose_error("scenario", "agent", 4, np.zeros(3)).matrix.tobytes() for link in links]
-        assert len(set(draws)) == 1
+        assert len({link.pose_error("scenario", "agent", 4, np.zeros(3)).matrix.tobytes() for link in links}) == 1
     assert Link(pose_noise=np.int64(1)) == Link(pose_noise=1.0) == Link(pose_noise=PoseNoise(mean=np.uint8(1)))
 
 

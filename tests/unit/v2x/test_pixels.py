@@ -45,8 +45,7 @@ def painted(scene: Scene, camera: Camera, ground_from_camera: SE3) -> np.ndarray
 def unoccluded(scene: Scene, ground_from_camera: SE3) -> set[int]:
     """The actors (true poses) towards whose middle the first surface is their own."""
     middle = scene.frames[:, :3, 3] + scene.frames[:, :3, 2] * scene.actors.size[:, 2:] / 2
-    rays = (middle - ground_from_camera.translation).astype(np.float32)
-    _, face = scene.cast(ground_from_camera.translation, rays)
+    _, face = scene.cast(ground_from_camera.translation, (middle - ground_from_camera.translation).astype(np.float32))
     return set(scene.actors.actor_id[scene.face_owner[face] == np.arange(len(scene.actors))].tolist())
 
 

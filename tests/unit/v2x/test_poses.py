@@ -27,8 +27,9 @@ def test_transforms_are_taken_as_they_are() -> None:
         assert_array_equal(future_egomotion(given), future_egomotion(matrices))
     assert_allclose(relative_pose_to_ego(POSES)[1], (POSES[0].inverse() @ POSES[1]).to_six(), atol=1e-9)
     assert_allclose(future_egomotion(POSES)[0], (POSES[1].inverse() @ POSES[0]).to_six(), atol=1e-9)
-    valid = [True, False, True]
-    assert_array_equal(future_egomotion([POSES[0], np.full((4, 4), np.nan), POSES[2]], valid), np.zeros((2, 6)))
+    assert_array_equal(
+        future_egomotion([POSES[0], np.full((4, 4), np.nan), POSES[2]], [True, False, True]), np.zeros((2, 6))
+    )
 
 
 def test_rounded_poses_are_zero_away_from_themselves() -> None:
@@ -84,8 +85,10 @@ def da(way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DeepAccident:
     exact = tiny.calib
 
     def changed(ego_to_world: np.ndarray, *, height: float) -> dict[str, np.ndarray]:
-        arrays = exact(ego_to_world, height=height)
-        return {name: array if "intrinsic" in name else way(array) for name, array in arrays.items()}
+        return {
+            name: array if "intrinsic" in name else way(array)
+            for name, array in exact(ego_to_world, height=height).items()
+        }
 
     monkeypatch.setattr(tiny, "ego_to_world", tilted)
     monkeypatch.setattr(tiny, "calib", changed)

@@ -46,12 +46,14 @@ def thirty_cars(seed: int, noise: float = 2.0) -> MotionOutput:
     predictions = []
     for _ in range(5):
         segmentation = good.segmentation + source.normal(0, noise, good.segmentation.shape)
-        flipped = edge & (source.random(edge.shape) < 0.3)
-        segmentation = np.where(flipped[:, None], segmentation[:, ::-1], segmentation)
+        segmentation = np.where(
+            (edge & (source.random(edge.shape) < 0.3))[:, None], segmentation[:, ::-1], segmentation
+        )
         offset, flow = (maps + source.normal(0, 0.7, maps.shape) for maps in (good.offset, good.flow))
         predictions.append((segmentation, good.centerness, offset, flow))
-    stacked = [np.stack(each).astype(np.float32) for each in zip(*predictions, strict=True)]
-    return MotionOutput.from_arrays(*stacked, grid=LARGE)
+    return MotionOutput.from_arrays(
+        *[np.stack(each).astype(np.float32) for each in zip(*predictions, strict=True)], grid=LARGE
+    )
 
 
 def labelled(ignore: int | None = None, frames: int = 3) -> MotionHeads:
@@ -108,8 +110,9 @@ class TestMotion:
     def test_paths_that_earlier_files_have_are_not_read(self, tmp_path: Path) -> None:
         folder = plain.write_motion(tmp_path / "b")
         paths = {"trajectory_id": np.array([1, 7]), "trajectory": np.zeros((2, 3, 2))}
-        samples = {token: plain.instance_arrays() | paths for token in (FIRST, SECOND)}
-        plain.write_shard(folder / "shards" / "00000.npz", samples)
+        plain.write_shard(
+            folder / "shards" / "00000.npz", {token: plain.instance_arrays() | paths for token in (FIRST, SECOND)}
+        )
         plain.relist(folder)
         read_results(folder).check()
 
@@ -122,8 +125,7 @@ class TestMotion:
             assert isinstance(read, MotionOutput)
             assert len(read) == 5
             assert len(np.unique(read.instances)) > 25  # type: ignore[arg-type]
-        size = sum(path.stat().st_size for path in (tmp_path / "m").rglob("*") if path.is_file())
-        assert size / len(tokens) < 50_000
+        assert sum(path.stat().st_size for path in (tmp_path / "m").rglob("*") if path.is_file()) / len(tokens) < 50_000
 
     def test_shards_of_64_samples(self, tmp_path: Path) -> None:
         maps = instances_of(plain.instance_arrays()["instance"], GRID)

@@ -338,8 +338,8 @@ def test_manifests(tmp_path: Path, kind: str) -> None:
 
 def test_links_out_of_the_folder(tmp_path: Path) -> None:
     folder = plain.write_motion(tmp_path / "motion")
-    outside = (folder / "shards" / "00001.npz").rename(tmp_path / "outside.npz")
-    (folder / "shards" / "00001.npz").symlink_to(outside)
+    shard = folder / "shards" / "00001.npz"
+    shard.symlink_to(shard.rename(tmp_path / "outside.npz"))
     refused(folder, "shards[1]: file: shards/00001.npz is a link that leads out of the folder")
 
 
@@ -431,8 +431,12 @@ def test_arrays(tmp_path: Path, kind: str) -> None:
     good = plain.instance_arrays() if stored == "instances" else plain.head_arrays()
     plain.write_shard(folder / "shards" / "00000.npz", {FIRST: good, SECOND: arrays})
     plain.relist(folder)
-    where = () if "belongs to no sample" in words[0] else (f"{SECOND}: ",)
-    refused(folder, "results.json: shards/00000.npz: ", *where, *words)
+    refused(
+        folder,
+        "results.json: shards/00000.npz: ",
+        *(() if "belongs to no sample" in words[0] else (f"{SECOND}: ",)),
+        *words,
+    )
 
 
 @pytest.mark.parametrize("missing", ["centerness", "flow"])

@@ -98,7 +98,7 @@ class TestWriter:
             pass
         assert_refused(
             (
-                lambda: lambda: ResultsWriter(tmp_path / "file" / "x", task).__enter__(),
+                lambda: ResultsWriter(tmp_path / "file" / "x", task).__enter__(),
                 ResultsError,
                 r"x: results cannot be written \(.*choose another path",
             ),
@@ -398,6 +398,7 @@ class TestEntries:
 
 def test_a_velocity_that_is_known_in_part_is_unknown() -> None:
     columns = {"center": np.zeros((2, 3)), "size": np.ones((2, 3)), "yaw": np.zeros(2), "frame": "world"}
-    velocity = np.array([[1.0, np.nan, 0.0], [1.0, 2.0, 0.0]])
-    detected = DetectedBoxes.from_arrays(scores=np.ones(2), velocity=velocity, **columns)
+    detected = DetectedBoxes.from_arrays(
+        scores=np.ones(2), velocity=np.array([[1.0, np.nan, 0.0], [1.0, 2.0, 0.0]]), **columns
+    )
     assert [each["velocity"] for each in detection_entries("s", detected)] == [None, [1.0, 2.0]]

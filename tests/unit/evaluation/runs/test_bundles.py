@@ -73,8 +73,7 @@ def test_holds_all_and_reads_back(run: EvaluationRun, results: Results, tmp_path
 
 
 def test_every_file_says_version_protocol_and_partial(run: EvaluationRun, tmp_path: Path) -> None:
-    mark = Partial(missing=1, extra=0, expected=7, evaluated=6)
-    folder = save_run(replace(run, partial=mark), tmp_path / "bundle")
+    folder = save_run(replace(run, partial=Partial(missing=1, extra=0, expected=7, evaluated=6)), tmp_path / "bundle")
     stamps = [read(folder / name) for name in JSON_FILES] + [read_rows(folder / "samples.parquet")[1]]
     for stamp in stamps:
         assert (stamp["devkit_version"], stamp["task"], stamp["protocol"]) == (__version__, "accident", "boxes")

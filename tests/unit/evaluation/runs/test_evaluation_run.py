@@ -328,8 +328,9 @@ class Job:
     setup: EvaluationSetup = SETUP
 
     def whole(self, out: Path | None = None, **how: Any) -> EvaluationRun:
-        arguments = (self.dataset, self.results, self.setup, self.selection)
-        return evaluate_results(*arguments, **{"workers": 1, **how}, out=out)
+        return evaluate_results(
+            *(self.dataset, self.results, self.setup, self.selection), **{"workers": 1, **how}, out=out
+        )
 
 
 @pytest.fixture(scope="module")

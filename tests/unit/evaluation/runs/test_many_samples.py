@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import evaluating
 import pytest
@@ -68,7 +69,11 @@ class TestWorkers:
 class TestFaults:
     def test_what_cannot_be_is_named(self, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
-        broken, evaluate = {**VALUES, "x": BROKEN}, partial(evaluate_samples, Sums())
+        broken = {**VALUES, "x": BROKEN}
+
+        def evaluate(*arguments: Any, **how: Any) -> None:
+            evaluate_samples(Sums(), *arguments, **how)
+
         assert_refused(
             (partial(evaluate, VALUES, number, workers=0), ChoiceError, "at least 1"),
             *[

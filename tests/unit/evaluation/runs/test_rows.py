@@ -62,8 +62,11 @@ def test_accidents(run: EvaluationRun) -> None:
     rows = sample_rows(run)
     assert sum(column(rows, "positive")) == run.result.positives == 3
     for distance, within in run.result.within.items():
-        sums = [sum(column(rows, f"{case}_{distance:g}m")) for case in ("tp", "fp", "fn")]
-        assert sums == [within.tp, within.fp, within.fn]
+        assert [sum(column(rows, f"{case}_{distance:g}m")) for case in ("tp", "fp", "fn")] == [
+            within.tp,
+            within.fp,
+            within.fn,
+        ]
     errors = [each for each in column(rows, "position_error") if each is not None]
     assert math.fsum(errors) / len(errors) == pytest.approx(run.result.position_error)
     assert len(errors) == run.result.within[15.0].tp
@@ -100,8 +103,9 @@ def test_detection(da_b: DeepAccident, selection: SampleSelection, tmp_path: Pat
 
 
 def test_warning(da_b: DeepAccident, results: Results, selection: SampleSelection) -> None:
-    run = evaluate_results(da_b, results, EvaluationSetup(task="warning", protocol="clean"), selection, workers=1)
-    rows = sample_rows(run)
+    rows = sample_rows(
+        evaluate_results(da_b, results, EvaluationSetup(task="warning", protocol="clean"), selection, workers=1)
+    )
     assert column(rows, "alarms_count") == [len(results.prediction(token)) for token in sorted(selection.tokens(da_b))]
     assert len(rows) == 6
 

@@ -330,8 +330,9 @@ def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
 
 @pytest.mark.parametrize(("right", "every", "told"), [(4, 10, True), (5, 10, False), (0, 9, False)])
 def test_when_headings_look_random(right: int, every: int, *, told: bool) -> None:
-    seen = [Seen(tallies={}, headings=(right, every - 3)), Seen(tallies={}, headings=(0, 3))]
-    warnings = list(mistakes_of(seen, "detection"))
+    warnings = list(
+        mistakes_of([Seen(tallies={}, headings=(right, every - 3)), Seen(tallies={}, headings=(0, 3))], "detection")
+    )
     assert [each.split(",")[0] for each in warnings] == [f"headings look random: {right} of {every} are right"] * told
 
 

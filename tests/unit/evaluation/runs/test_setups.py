@@ -111,8 +111,10 @@ class TestLoader:
 
     def test_the_protocol_says_which_labels_and_else_the_results(self, motion: Results) -> None:
         for task, protocol, expected in (("accident", "paper", "released"), ("accident", "boxes", "clean")):
-            rules = EvaluationSetup(task=task, protocol=protocol).rules
-            assert label_config(rules, motion.form, horizon=2.0).protocol == expected
+            assert (
+                label_config(EvaluationSetup(task=task, protocol=protocol).rules, motion.form, horizon=2.0).protocol
+                == expected
+            )
 
     def test_accidents_have_their_context(self, da_motion: DeepAccident, token: str, tmp_path: Path) -> None:
         alarm = Accident(positions=np.zeros((2, 2)), time=1.0)

@@ -72,16 +72,16 @@ def test_intervals_and_why_there_is_none(run: EvaluationRun) -> None:
 
 
 def test_switches_and_no_intervals(run: EvaluationRun) -> None:
-    switched = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
-    lines = lines_of(summary_text(switched.summary()))
+    lines = lines_of(
+        summary_text(replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5})).summary())
+    )
     assert "task accident, protocol boxes with reading.danger_distance=0.5" in lines
     assert "number value" in lines
 
 
 def test_the_bundle_on_disk_reads_alike(run: EvaluationRun, tmp_path: Path) -> None:
     broken = run.broken_down(["all", "agent"], Resampling(resamples=10))
-    stored = read_bundle(save_run(broken, tmp_path / "bundle")).summary
-    assert summary_text(stored) == summary_text(broken.summary())
+    assert summary_text(read_bundle(save_run(broken, tmp_path / "bundle")).summary) == summary_text(broken.summary())
 
 
 def test_results_of_other_choices_stand_beside(
@@ -359,8 +359,9 @@ def test_numbers(value: float | None, text: str) -> None:
 
 def stored(monkeypatch: pytest.MonkeyPatch, **summary: Any) -> None:
     """A bundle with this summary, of one scenario."""
-    whole = {"task": "warning", "protocol": "clean", **summary}
-    bundle = SimpleNamespace(summary=whole, scenarios=lambda: {TRAINED: "hash"})
+    bundle = SimpleNamespace(
+        summary={"task": "warning", "protocol": "clean", **summary}, scenarios=lambda: {TRAINED: "hash"}
+    )
     monkeypatch.setattr(bundles, "read_bundle", lambda _: bundle)
 
 

@@ -154,8 +154,9 @@ class TestNamed:
     def test_other_results(
         self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
     ) -> None:
-        other = write_accidents(tmp_path / "other.json", results.tokens, moved=1.0)
-        differing = found(verify(bundle, da_b, results=other.path))
+        differing = found(
+            verify(bundle, da_b, results=write_accidents(tmp_path / "other.json", results.tokens, moved=1.0).path)
+        )
         assert {each.split(": ")[0] for each in differing} == {"metrics_summary.json", "counts.json", "samples.parquet"}
         assert "metrics_summary.json: results/fingerprint" in differing
 
@@ -224,8 +225,9 @@ class TestNamed:
 
 
 def read_scenarios(bundle: Path, ending: str) -> list[str]:
-    stored = json.loads((bundle / "scenarios.json").read_text())["scenarios"]
-    return [token for token in stored if f"{ending}/" in token]
+    return [
+        token for token in json.loads((bundle / "scenarios.json").read_text())["scenarios"] if f"{ending}/" in token
+    ]
 
 
 @pytest.mark.parametrize(
@@ -246,8 +248,7 @@ def test_differing(stored: Any, found: Any, expected: list[tuple[str, Any, Any]]
 
 
 def test_long_values_are_cut_in_a_line() -> None:
-    text = Difference(where="x", stored="y" * 100, found=ABSENT).text()
-    assert text == f"x: stored '{'y' * 58}…, found absent"
+    assert Difference(where="x", stored="y" * 100, found=ABSENT).text() == f"x: stored '{'y' * 58}…, found absent"
 
 
 class TestStrangers:
