@@ -1,9 +1,6 @@
 """An evaluator and loaders for tests of whole runs: in a module that a spawned process can import by name."""
 
-import os
-import time
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import Any
 
 from deepaccident_devkit import DeepAccident
@@ -35,13 +32,6 @@ def number(task: float) -> Sequence[Any]:
     if task == BROKEN:
         raise FileNotFoundError("predictions/7.npz")
     return (task,)
-
-
-def number_and_trace(folder: Path, task: float) -> Sequence[Any]:
-    """Leaves a file that says that this task was done, and takes its time."""
-    (folder / f"{task}.{os.getpid()}.{time.monotonic_ns()}").touch()
-    time.sleep(0.01)
-    return number(task)
 
 
 def labels_as_maps(dataset: DeepAccident, token: str) -> Sequence[Any]:

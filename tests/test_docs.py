@@ -51,7 +51,7 @@ RUN_ELSEWHERE = {
     "docs/testing.md": "tests/unit/testing/test_page.py",
     "docs/training.md": "tests/torch_extra/test_batches.py",
     "schema/motion_labels.md": "tests/unit/motion/test_label_files.py",
-    "schema/results/README.md": "tests/unit/evaluation/results/test_schemas.py",
+    "schema/results/README.md": "tests/unit/evaluation/results/test_records.py",
 }
 """Pages whose Python needs more than the demo's release, and the tests that run it."""
 STAND_FOR = {

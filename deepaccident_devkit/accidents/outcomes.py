@@ -167,7 +167,7 @@ def outcomes_of(
     times = contact_times(pair, begun, distinct[:, 1])
     impact = impacts(pair, begun, distinct[:, 1], times)
     delta_v = np.nan_to_num(delta_v_of(accident.masses, impact.relative_speeds))
-    reduction = _reductions(delta_v[:, 0])
+    reduction = reductions_of(delta_v[:, 0])
     outcome = _classes(impact.speeds[:, brakers], times, reduction)
     return Outcomes(
         outcome=outcome[places],
@@ -197,7 +197,7 @@ def _distinct(starts: FloatArray, decelerations: FloatArray) -> tuple[FloatArray
     return distinct, places.ravel()[:-1].reshape(starts.shape)
 
 
-def _reductions(delta_v: FloatArray) -> FloatArray:
+def reductions_of(delta_v: FloatArray) -> FloatArray:
     """(N,) shares that are saved of the last one, which is without braking; −inf if that is 0 and another is not."""
     if delta_v[-1] > 0:
         return np.asarray(1 - delta_v / delta_v[-1])

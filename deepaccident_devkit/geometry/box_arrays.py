@@ -29,11 +29,11 @@ _UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from 1; it is then scaled to 1."""
 _SIGNS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
 """Corners as shares of (length, width), counter-clockwise from front left."""
-_PAIRS_AT_ONCE = 1 << 14
+PAIRS_AT_ONCE = 1 << 14
 """Pairs that are computed together; it limits the memory for the areas and gaps of many pairs."""
 _CELLS = 128
 """Cells of the coarse grid along x and along y, over the ground that the boxes cover."""
-_POINTS_AT_ONCE = 1 << 13
+POINTS_AT_ONCE = 1 << 13
 """Points that are processed together: the arrays are so small that their memory is reused, which halves the time."""
 _WINDOWS_AT_ONCE = 1 << 17
 """Pairs of windows and points that are processed together: their memory fits into the processor's cache."""
@@ -90,8 +90,8 @@ def intersection_areas(first: FloatArray, second: FloatArray) -> FloatArray:
     apart = np.hypot(first[:, None, 0] - second[:, 0], first[:, None, 1] - second[:, 1])
     rows, columns = np.nonzero(apart <= reach / 2 * (1 + 1e-9))
     result = np.zeros((len(first), len(second)))
-    for start in range(0, len(rows), _PAIRS_AT_ONCE):
-        a, b = rows[start : start + _PAIRS_AT_ONCE], columns[start : start + _PAIRS_AT_ONCE]
+    for start in range(0, len(rows), PAIRS_AT_ONCE):
+        a, b = rows[start : start + PAIRS_AT_ONCE], columns[start : start + PAIRS_AT_ONCE]
         result[a, b] = _areas_of_pairs(first[a], second[b])
     return result
 
@@ -102,7 +102,7 @@ def gaps(first: FloatArray, second: FloatArray) -> FloatArray:
     0 if they touch; NaN if one of the two has a NaN.
     """
     result = np.zeros((len(first), len(second)))
-    step = max(1, _PAIRS_AT_ONCE // max(1, len(second)))
+    step = max(1, PAIRS_AT_ONCE // max(1, len(second)))
     for start in range(0, len(first), step):
         result[start : start + step] = gaps_of_pairs(first[start : start + step, None], second[None])
     return result
@@ -330,8 +330,8 @@ def _near_any(points: FloatArray, low: FloatArray, high: FloatArray) -> IntArray
     for (column, row), (last_column, last_row) in zip(first.tolist(), last.tolist(), strict=True):
         touched[column : last_column + 1, row : last_row + 1] = True
     found = [np.zeros(0, dtype=np.int64)]
-    for start in range(0, len(points), _POINTS_AT_ONCE):
-        x, y = np.ascontiguousarray(points[start : start + _POINTS_AT_ONCE, :2].T)
+    for start in range(0, len(points), POINTS_AT_ONCE):
+        x, y = np.ascontiguousarray(points[start : start + POINTS_AT_ONCE, :2].T)
         within = (x >= origin[0]) & (x <= end[0])
         within &= (y >= origin[1]) & (y <= end[1])
         rows = np.flatnonzero(within)

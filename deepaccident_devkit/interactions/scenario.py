@@ -172,11 +172,11 @@ def interactions(dataset: Dataset, scenario: RowArgument, config: InteractionCon
     token = dataset.scenario[dataset.getind("scenario", scenario)]["token"]
     chosen = InteractionConfig() if config is None else config
     if chosen != InteractionConfig():
-        return _computed(dataset, token, chosen)
+        return computed_interactions(dataset, token, chosen)
     kept = read_kept(dataset, token, chosen)
     if kept is not None:
         return kept
-    found = _computed(dataset, token, chosen)
+    found = computed_interactions(dataset, token, chosen)
     if found.labelled:
         keep(dataset, found)
     return found
@@ -280,6 +280,7 @@ def interactions_of_tracks(
     )
 
 
-def _computed(dataset: Dataset, token: str, config: InteractionConfig) -> Interactions:
+def computed_interactions(dataset: Dataset, token: str, config: InteractionConfig) -> Interactions:
+    """The interactions of a scenario, made anew."""
     frames = dataset.get("scenario", token)["num_frames"]
     return interactions_of_tracks(token, scenario_tracks(dataset, token), frames, config)

@@ -322,8 +322,8 @@ def following_centers(
     """
     grid, rules = config.grid.with_orientation(config.rules.native), config.rules
     lines = sampling_lines(next_from_this, grid, rules)
-    spread = _spread(lines, grid)
-    runs = None if spread is None else _runs_near(footprints, *spread, grid)
+    spread = even_spread(lines, grid)
+    runs = None if spread is None else runs_near(footprints, *spread, grid)
     polygon, row, column = (
         _seen_anywhere(footprints, next_from_this, grid, rules)
         if runs is None
@@ -377,7 +377,7 @@ def _seen_near(
     return runs.polygon[of_run], runs.row[of_run], column[seen] - runs.frame[of_run] * columns
 
 
-def _runs_near(footprints: Footprints, origin: FloatArray, inverse: FloatArray, grid: BevGrid) -> _Runs | None:
+def runs_near(footprints: Footprints, origin: FloatArray, inverse: FloatArray, grid: BevGrid) -> _Runs | None:
     """The cells around the footprints of all frames but the first; None if these are more than a few frames' cells."""
     polygon = np.flatnonzero(footprints.frame > 0)
     corners, frame = footprints.corners[polygon, :, ::-1], footprints.frame[polygon] - 1
@@ -400,7 +400,7 @@ def _runs_near(footprints: Footprints, origin: FloatArray, inverse: FloatArray, 
     )
 
 
-def _spread(lines: tuple[SamplingLine, SamplingLine], grid: BevGrid) -> tuple[FloatArray, FloatArray] | None:
+def even_spread(lines: tuple[SamplingLine, SamplingLine], grid: BevGrid) -> tuple[FloatArray, FloatArray] | None:
     """The first cells' sample points (N, 2), and (N, 2, 2) how far target cells lie apart for each cell of the source.
 
     None where the points are too far away, or too near to each other or too far apart, for what is done with it.

@@ -163,7 +163,7 @@ def project_to_image(
     optical_from_source = transform(dataset, record["sample_token"], sample, record["channel"], source)
     pixels, depth = lens.project(optical_from_source.apply(xyz))
     mask = lens.in_image(pixels)
-    color = _colors_at(dataset.load_image(record), lens, pixels, mask) if colors else None
+    color = colors_at(dataset.load_image(record), lens, pixels, mask) if colors else None
     return ImagePoints(pixels=pixels, depth=depth, color=color, mask=mask)
 
 
@@ -197,7 +197,7 @@ def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
     return dataset.camera(camera)
 
 
-def _colors_at(image: ByteArray, lens: PinholeCamera, pixels: FloatArray, mask: BoolArray) -> ByteArray:
+def colors_at(image: ByteArray, lens: PinholeCamera, pixels: FloatArray, mask: BoolArray) -> ByteArray:
     """Colours (N, 3) uint8; pixels are scaled if the image was stored smaller than its calib says."""
     height, width = image.shape[:2]
     columns = (pixels[mask, 0] * (width / lens.width)).astype(np.intp)

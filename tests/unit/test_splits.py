@@ -3,13 +3,15 @@
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import assert_refused
 from tiny import write_tiny_release
+from written_out import written_out
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import (
@@ -67,96 +69,8 @@ def test_shares_of_designed_twins_and_of_the_others() -> None:
     made = split_records(scenarios)
     assert len(scenarios) == 200  # so 30 is the cap: 8 designed, 6 others, and what is left of 21 single ones
     for split in (made.val, made.test):
-        assert [len(names(split, prefix)) for prefix in "abc"] == [4, 3, 16]
-        assert len(split) == 30
+        assert ([len(names(split, prefix)) for prefix in "abc"], len(split)) == ([4, 3, 16], 30)
     assert [len(names(made.train, prefix)) for prefix in "abc"] == [2, 14, 108]
-
-
-def test_shares_are_rounded_to_the_nearest_count() -> None:
-    made = split_records(singles(12, "subtype1_normal", "t"))  # 0.15 of 12 are 1.8, a fifth of 8 are 1.6, of 2 are 0.4
-    assert [len(tokens) for tokens in (made.train, made.val, made.test)] == [8, 2, 2]
-    assert [len(tokens) for tokens in (made.train_mini, made.val_mini)] == [2, 0]
-
-
-@pytest.mark.parametrize(
-    ("pair", "designed"),
-    [
-        (("ego", "other"), True),
-        (("other_behind", "ego_behind"), True),
-        (("ego", "ego_behind"), False),
-        (("other", "other_behind"), False),
-        (("ego", "none"), False),
-        (None, False),
-    ],
-)
-def test_which_pairs_are_designed(pair, designed: bool) -> None:
-    made = split_records(many_twins(10, pair=pair) + singles(100, "subtype1_normal", "t"))
-    assert len(names(made.val, "s")) == (4 if designed else 2)  # 0.4 of ten, else 0.15
-
-
-def test_a_normal_twin_with_a_collision_or_without_meta_is_not_designed() -> None:
-    filling = singles(100, "subtype1_normal", "t")
-    for odd in ({"pair": DESIGNED}, {"meta": False}):
-        scenarios = [
-            one
-            for index in range(10)
-            for one in (
-                record("subtype1_normal", f"s{index}", **odd),
-                record("subtype1_accident", f"s{index}", DESIGNED),
-            )
-        ]
-        assert len(names(split_records(scenarios + filling).val, "s")) == 2
-
-
-def test_meta_that_does_not_say_who_collided_is_not_designed() -> None:
-    scenarios = many_twins(10) + singles(100, "subtype1_normal", "t")
-    for one in scenarios:
-        if one["collision"]:
-            one["collision"]["agents"] = None
-    assert len(names(split_records(scenarios).val, "s")) == 2
-
-
-def test_a_pair_takes_two_places_and_is_cut_off_where_val_or_test_is_full() -> None:
-    made = split_records(many_twins(10))  # 0.4 of ten were four pairs, but three places hold one
-    assert [len(tokens) for tokens in (made.val, made.test, made.train)] == [2, 2, 16]
-    assert [len(names(tokens, "s")) for tokens in (made.val, made.test, made.train)] == [1, 1, 8]
-
-
-def test_every_stratum_gives_its_own_share() -> None:
-    scenarios = (
-        many_twins(5, "three", road=THREE, side="opposite")
-        + many_twins(5, "opposite", side="opposite")
-        + many_twins(5, "left", side="left")
-        + many_twins(5, "unsaid", road=None, side=None)  # with the left and right ones
-        + singles(200, "subtype1_normal", "t")
-    )
-    for seed in range(5):
-        made = split_records(scenarios, seed)
-        for split in (made.val, made.test):
-            assert len(names(split, "three")) == len(names(split, "opposite")) == 2
-            assert len(names(split, "left")) + len(names(split, "unsaid")) == 4
-
-
-def test_strata_of_twins_span_subtypes() -> None:
-    scenarios = [one for index in range(8) for one in twins(1 + index % 2, f"s{index}")]
-    made = split_records(scenarios + singles(100, "subtype1_normal", "t"))
-    assert len(names(made.val, "s")) == 3  # round(0.4 · 8); for each subtype alone it were 2 · round(0.4 · 4) = 4
-
-
-def test_single_scenarios_are_dealt_by_subtype_normal_and_accident_apart() -> None:
-    kinds = ("subtype1_normal", "subtype1_accident", "subtype2_normal", "subtype2_accident")
-    made = split_records([one for kind in kinds for one in singles(20, kind, kind)])
-    for split in (made.val, made.test):
-        assert Counter(token.split("/")[0] for token in split) == {f"type1_{kind}": 3 for kind in kinds}
-
-
-def test_same_names_in_two_subtypes_are_no_twins() -> None:
-    scenarios = [record("subtype1_normal", "s"), record("subtype2_accident", "s", DESIGNED)]
-    scenarios += singles(20, "subtype1_normal", "t")
-    apart = {
-        sum(one["token"] in split_records(scenarios, seed).val for one in scenarios[:2]) == 1 for seed in range(30)
-    }
-    assert True in apart  # in some split they part, which twins never do
 
 
 def test_the_released_loop_passes_over_the_twin_after_each_one_found() -> None:
@@ -168,17 +82,6 @@ def test_the_released_loop_passes_over_the_twin_after_each_one_found() -> None:
     mixed = [one for i in range(10) for one in twins(1, f"s{i:03d}", DESIGNED if i % 2 == 0 else None)]
     mixed += singles(200, "subtype1_normal", "t")
     assert split_records(mixed, released_skip=True) == split_records(mixed)
-
-
-def test_minis_are_a_fifth_at_most_and_prefer_designed_twins() -> None:
-    made = split_records(many_twins(20) + singles(160, "subtype1_normal", "t"))
-    for mini, whole in ((made.train_mini, made.train), (made.val_mini, made.val)):
-        assert set(mini) < set(whole)
-        assert 0 < len(mini) <= round(0.2 * len(whole))
-    assert len(made.val) == 30
-    assert [len(names(made.val_mini, prefix)) for prefix in "st"] == [3, 0]  # 0.4 of eight designed twins fill it
-    assert len(names(made.train, "s")) == 4
-    assert [len(names(made.train_mini, prefix)) for prefix in "st"] == [2, 28 - 4]  # 28 is a fifth of train
 
 
 def test_the_seed_decides_and_the_order_of_listing_does_not() -> None:
@@ -199,28 +102,78 @@ def scenario_sets(draw: st.DrawFn) -> list[dict]:
         options["side"] = draw(st.sampled_from(["left", "right", "opposite", None]))
         pair = draw(st.just(DESIGNED) | st.just(DESIGNED) | st.none() | st.tuples(shorts, shorts))
         both = twins(subtype, f"s{index:03d}", pair, **options)
+        odd = draw(st.sampled_from(["no", "no", "no", "both collide", "no meta", "nobody is named"]))
+        both[0]["collision"] = both[1]["collision"] if odd == "both collide" else None
+        both[0]["weather"] = None if odd == "no meta" else "Clear"
+        both[1]["collision"] = pair and {"agents": None} if odd == "nobody is named" else both[1]["collision"]
         found += both if which == "both" else [one for one in both if one["scenario_type"].endswith(which)]
     return draw(st.permutations(found))
 
 
+def test_every_default_and_constant_written_out() -> None:
+    assert written_out("deepaccident_devkit.splits") == {
+        "splits.OFFICIAL_SEED": "17",
+        "splits.Splits": "left_out=()",
+        "splits.Splits.save": "overwrite=False",
+        "splits.official_split": "seed=17, released_skip=False",
+        "splits.split_records": "seed=17, released_skip=False, left_out=()",
+        "splits.save_selection": "overwrite=False",
+    }
+
+
+def plain_split(scenarios: list[dict], seed: int, *, skip: bool) -> list[set[str]]:
+    """Train, val, test and the minis by steps 2 to 4 of `official_split`, written again."""
+
+    def strata(those: list[dict]) -> list[tuple[float, list[list[str]]]]:
+        place = {(one["scenario_type"].rsplit("_", 1)[0], one["designed_accident"], one["name"]): one for one in those}
+        order, pairs, alone = sorted(place), [], {}
+        for subtype, is_accident, name in order:
+            normal, accident = place.get((subtype, False, name)), place.get((subtype, True, name))
+            if normal and accident:
+                pairs += [] if is_accident else [(normal, accident)]
+            else:
+                one = normal or accident
+                alone.setdefault((subtype, is_accident), []).append([one["token"]])
+        found, after = {(designed, at): [] for designed in (True, False) for at in range(3)}, False
+        for normal, accident in pairs:
+            agents = accident["collision"] and accident["collision"]["agents"]
+            sides = agents and {name.split("_")[0] for name in agents if "vehicle" in str(name)}
+            designed = bool(sides) and len(sides) == 2 and not (normal["collision"] or normal["weather"] is None)
+            after, designed = designed and not after and skip, designed and not after
+            three, opposite = accident["road_type"] == THREE, accident["spawn_side"] == "opposite"
+            found[designed, 0 if three else 1 if opposite else 2].append([normal["token"], accident["token"]])
+        return [(0.4 * designed, units) for (designed, _), units in found.items()] + [
+            (0, one) for one in alone.values()
+        ]
+
+    def deal(those: list[dict], most: int, other: float, parts: int) -> list[set[str]]:
+        rng, dealt = Random(seed), [set() for _ in range(parts + 1)]  # noqa: S311
+        for share, stratum in strata(those):
+            units = stratum.copy()
+            rng.shuffle(units)
+            count = round((share or other) * len(units))
+            for part in range(parts):
+                taken = units[: min(count, (most - len(dealt[part])) // len(units[0]) if units else 0)]
+                dealt[part].update(token for unit in taken for token in unit)
+                units = units[len(taken) :]
+            dealt[parts].update(token for unit in units for token in unit)
+        return dealt
+
+    val, test, train = deal(scenarios, round(0.15 * len(scenarios)), 0.15, 2)
+    minis = [
+        deal([one for one in scenarios if one["token"] in split], round(0.2 * len(split)), 0.2, 1)[0]
+        for split in (train, val)
+    ]
+    return [train, val, test, *minis]
+
+
+@settings(max_examples=150)
 @given(scenario_sets(), st.integers(0, 3), st.booleans())
-def test_twins_together_disjoint_nothing_lost_caps_kept(scenarios: list[dict], seed: int, skip: bool) -> None:
+def test_as_the_procedure_written_again_has_it(scenarios: list[dict], seed: int, skip: bool) -> None:
     made = split_records(scenarios, seed, released_skip=skip)
-    everything = [*made.train, *made.val, *made.test]
-    assert sorted(everything) == sorted(one["token"] for one in scenarios)
-    cap = round(0.15 * len(scenarios))
-    assert max(len(made.val), len(made.test)) <= cap
-    family = {token: (token.split("_")[1], token.split("/")[1]) for token in everything}
-    for tokens in made.by_name().values():
-        assert list(tokens) == sorted(set(tokens))
-    for first, second in ((made.train, made.val), (made.train, made.test), (made.val, made.test)):
-        assert not {family[token] for token in first} & {family[token] for token in second}
-    for mini, whole in ((made.train_mini, made.train), (made.val_mini, made.val)):
-        assert set(mini) <= set(whole)
-        assert len(mini) <= round(0.2 * len(whole))
-        rest = set(whole) - set(mini)
-        assert not {family[token] for token in mini} & {family[token] for token in rest}
     assert split_records(scenarios[::-1], seed, released_skip=skip) == made
+    assert [list(tokens) == sorted(set(tokens)) for tokens in made.by_name().values()] == [True] * 5
+    assert list(map(set, made.by_name().values())) == plain_split(scenarios, seed, skip=skip)
 
 
 # on releases
@@ -235,8 +188,7 @@ def test_only_scenarios_with_more_than_five_labels_of_ego_count(tmp_path: Path) 
     da = DeepAccident(dataroot=tmp_path, verbose=False)
     made = official_split(da)
     tokens = [scenario["token"] for scenario in da.scenario]
-    assert made.train == (tokens[1],)
-    assert made.left_out == (tokens[0], tokens[2], tokens[3])
+    assert (made.train, made.left_out) == ((tokens[1],), (tokens[0], tokens[2], tokens[3]))
     report = split_report(da, made)
     assert "five labels or fewer: 3 scenarios" in report.to_text()
     assert (report.scenarios["train"], report.frames["train"]) == (1, 6)
@@ -253,8 +205,7 @@ def test_the_report_counts_every_attribute_of_every_split(da_b: DeepAccident) ->
     tokens = [scenario["token"] for scenario in da_b.scenario]
     assert "2 ( 67 %)" in split_report(da_b, {"three": tokens[:3]}).to_text()  # two of three collide
     report = split_report(da_b, {"one": tokens[:1], "rest": tokens[1:], "none": []})
-    assert report.scenarios == {"one": 1, "rest": 5, "none": 0}
-    assert report.frames == {"one": 4, "rest": 20, "none": 0}
+    assert (report.scenarios, report.frames) == ({"one": 1, "rest": 5, "none": 0}, {"one": 4, "rest": 20, "none": 0})
     for counts in report.attributes.values():
         for name, total in report.scenarios.items():
             assert sum(row[name] for row in counts.values()) == total
@@ -263,28 +214,30 @@ def test_the_report_counts_every_attribute_of_every_split(da_b: DeepAccident) ->
     squeezed = " ".join(report.to_text().split())
     assert "split one rest none scenarios 1 5 0 frames 4 20 0" in squeezed
     assert f"yes 1 (100 %) {collided['yes'] - 1} ( 40 %) 0 ( 0 %)" in squeezed
-    with pytest.raises(TokenError, match="nowhere"):
-        split_report(da_b, {"one": ["type1_subtype1_normal/nowhere"]})
+    assert_refused(
+        (lambda: split_report(da_b, {"one": ["type1_subtype1_normal/nowhere"]}), TokenError, "nowhere"),
+    )
 
 
 def test_saved_splits_are_read_back_and_never_overwritten_unasked(da_b: DeepAccident, tmp_path: Path) -> None:
     long_ones = many_twins(12) + singles(30, "subtype1_normal", "t")
-    made = split_records(long_ones)
-    folder = tmp_path / "new" / "splits"
+    made, folder = split_records(long_ones), tmp_path / "new" / "splits"
     paths = made.save(folder)
     assert {path.name for path in folder.iterdir()} == {path.name for path in paths}
     assert {path.stem: tuple(read_split_file(path)) for path in paths} == made.by_name()
     before = (folder / "train.txt").read_bytes()
     (folder / "test.txt").unlink()
-    with pytest.raises(ConfigError, match=r"train\.txt: is there already"):
-        split_records(long_ones, 3).save(folder)
+    assert_refused(
+        (lambda: split_records(long_ones, 3).save(folder), ConfigError, r"train\.txt: is there already"),
+    )
     assert (folder / "train.txt").read_bytes() == before
     assert not (folder / "test.txt").exists()
     split_records(long_ones, 3).save(str(folder), overwrite=True)
     assert (folder / "train.txt").read_bytes() != before
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="file: is a file; give a folder"):
-        made.save(tmp_path / "file")
+    assert_refused(
+        (lambda: made.save(tmp_path / "file"), ConfigError, "file: is a file; give a folder"),
+    )
 
 
 def test_splits_that_cannot_be_written_leave_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,8 +247,9 @@ def test_splits_that_cannot_be_written_leave_nothing(tmp_path: Path, monkeypatch
         path.write_text("half")
 
     monkeypatch.setattr("deepaccident_devkit.splits.write_split_file", failing)
-    with pytest.raises(OSError, match="disk full"):
-        split_records(many_twins(3)).save(tmp_path)
+    assert_refused(
+        (lambda: split_records(many_twins(3)).save(tmp_path), OSError, "disk full"),
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -304,8 +258,9 @@ def test_a_selection_saved_is_a_split(da_b: DeepAccident, tmp_path: Path) -> Non
     path = save_selection([*chosen[::-1], chosen[0]["token"]], tmp_path / "mine.txt")
     assert read_split_file(path) == [scenario["token"] for scenario in chosen[::-1]]
     assert da_b.split_scenarios(path) == da_b.split_scenarios(str(path)) == {one["token"] for one in chosen}
-    with pytest.raises(ConfigError, match="is there already"):
-        save_selection(chosen, path)
+    assert_refused(
+        (lambda: save_selection(chosen, path), ConfigError, "is there already"),
+    )
     save_selection([], path, overwrite=True)
     assert da_b.split_scenarios(path) == set()
     assert_refused(
@@ -318,18 +273,27 @@ def test_a_selection_saved_is_a_split(da_b: DeepAccident, tmp_path: Path) -> Non
     "token", ["a b/c", "a/b c", "a/b\n", "a/b\u2028c", "a/\xa0b", "a/", "/b", " a/b", "\ufeffa/b", "a/\udcff", "a/b\0"]
 )
 def test_a_name_that_would_not_be_read_back_is_refused(tmp_path: Path, token: str) -> None:
-    with pytest.raises(TokenError, match=r"mine\.txt: scenario .* cannot stand in a split file.*; leave it out"):
-        save_selection(["type1_subtype1_normal/Town03", token], tmp_path / "mine.txt")
+    assert_refused(
+        (
+            lambda: save_selection(["type1_subtype1_normal/Town03", token], tmp_path / "mine.txt"),
+            TokenError,
+            r"mine\.txt: scenario .* cannot stand in a split file.*; leave it out",
+        ),
+    )
     made = split_records(many_twins(3))
-    with pytest.raises(TokenError, match=r"val\.txt: scenario .* cannot stand in a split file"):
-        replace(made, val=(token,)).save(tmp_path / "splits")
+    assert_refused(
+        (
+            lambda: replace(made, val=(token,)).save(tmp_path / "splits"),
+            TokenError,
+            r"val\.txt: scenario .* cannot stand in a split file",
+        ),
+    )
     assert list(tmp_path.iterdir()) == []
 
 
 @given(st.text(), st.text())
 def test_what_is_saved_is_read_back(tmp_path_factory: pytest.TempPathFactory, scenario_type: str, name: str) -> None:
-    path = tmp_path_factory.getbasetemp() / "any.txt"
-    token = f"{scenario_type}/{name}"
+    path, token = tmp_path_factory.getbasetemp() / "any.txt", f"{scenario_type}/{name}"
     try:
         save_selection([token], path, overwrite=True)
     except TokenError:
@@ -344,13 +308,14 @@ def test_split_files_of_ones_own(da_b: DeepAccident, tmp_path: Path) -> None:
     path.write_bytes(f"\ufeff{lines[0]}  \r\n\r\n \t{lines[1]}\r\n".encode())
     assert da_b.split_scenarios(path) == set(tokens[:2])
     path.write_text(f"{lines[0]}\n\n{lines[1]}\n{lines[0]}\n")
-    with pytest.raises(SplitFileError, match=rf"mine\.txt:4: '{lines[0]}' stands in line 1 already"):
-        da_b.split_scenarios(path)
-    absent = [f"type1_subtype1_normal TownX{number}" for number in range(4)]
-    path.write_text("\n".join([lines[2], *absent]))
+    assert_refused(
+        (lambda: da_b.split_scenarios(path), SplitFileError, rf"mine\.txt:4: '{lines[0]}' stands in line 1 already"),
+    )
+    path.write_text("\n".join([lines[2], *[f"type1_subtype1_normal TownX{number}" for number in range(4)]]))
     message = r"mine\.txt: 4 of its 5 scenarios are not in .*: type1_subtype1_normal/TownX0, .*TownX2, …; pass missing"
-    with pytest.raises(NotAvailableError, match=message):
-        da_b.split_scenarios(path)
+    assert_refused(
+        (lambda: da_b.split_scenarios(path), NotAvailableError, message),
+    )
     assert da_b.split_scenarios(path, missing="skip") == {tokens[2]}
     assert_refused(
         (lambda: da_b.split_scenarios(tmp_path / "absent.txt"), MissingFileError, "no such file"),

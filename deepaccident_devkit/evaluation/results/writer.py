@@ -45,7 +45,7 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 
 _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 _MOST_SAMPLES: Final = 64
-_MOST_BYTES: Final = 32 * 2**20
+MOST_BYTES: Final = 32 * 2**20
 
 
 class ResultsWriter:
@@ -325,7 +325,7 @@ class ShardWriter:
             put_array(self._archive, MEMBER.format(token, name), array)
         self._in_shard.append(token)
         written = sum(entry.compress_size for entry in self._archive.infolist())
-        if len(self._in_shard) >= _MOST_SAMPLES or written >= _MOST_BYTES:
+        if len(self._in_shard) >= _MOST_SAMPLES or written >= MOST_BYTES:
             self._end_shard()
 
     def finish(self) -> None:

@@ -135,7 +135,7 @@ class Comparison(Report):
         shown = [each for each in self.numbers if each.headline]
         percent = f"{self.resampling.confidence:.0%}"
         rows: list[Sequence[str]] = [("number", "a", "b", "b − a", f"{percent} interval", "p", "decision")]
-        rows += [_text_row(each) for each in shown]
+        rows += [text_row(each) for each in shown]
         few = [each.decision for each in shown if each.decision.startswith(_IMPOSSIBLE)]
         told = [f"{_TOO_FEW}: {few[-1]}"] if few else []  # the first headline, tested alone, needs fewer
         return "\n".join([*head, "", columns_text(rows), "", *told, *self.notes()])
@@ -168,7 +168,8 @@ class Comparison(Report):
         return {"numbers": record_rows(ComparedNumber, self.numbers)}
 
 
-def _text_row(each: ComparedNumber) -> tuple[str, ...]:
+def text_row(each: ComparedNumber) -> tuple[str, ...]:
+    """The cells of a number's row."""
     unit = f" ({each.unit})" if each.unit and each.unit != "share" else ""
     interval = "–" if each.low is None or each.high is None else f"[{each.low:+.3f}, {each.high:+.3f}]"
     return (

@@ -374,7 +374,7 @@ def evaluate_results(
         selection=chosen,
         evaluator=evaluator,
         result=evaluator.compute(),
-        partial=_partial(covered),
+        partial=partial_of(covered),
         left_out=len(covered.extra) + len(covered.unknown),
         attributes=_AttributesWhenAsked(dataset, tokens),
         times_to_impact={token: dataset.get("sample", token)["time_to_impact"] for token in tokens},
@@ -426,7 +426,7 @@ def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:
         )
 
 
-def _partial(covered: Coverage) -> Partial | None:
+def partial_of(covered: Coverage) -> Partial | None:
     """The mark of a run; predictions of other samples alone change no number."""
     missing = len(covered.missing)
     if not missing:

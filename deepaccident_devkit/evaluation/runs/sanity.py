@@ -49,8 +49,8 @@ _AXES: Final = {
     "turned right": (-2, 1),
 }
 """Name → what x and y are once it is undone: 1 is the given x, 2 the given y, −2 its negative."""
-_SAMPLES: Final = 20
-_LISTS: Final = 60
+SAMPLES: Final = 20
+LISTS: Final = 60
 """Samples that are looked at, of maps and boxes, and of accident lists, which are short."""
 _MARGIN: Final = 2.0
 """How many times as large the share has to be once a mistake is undone."""
@@ -62,15 +62,15 @@ _NEAR: Final = 2.0
 """Metres: as near on the ground, a box is found, and both places of an accident are hit on average."""
 _NEAR_IN_HEIGHT: Final = 0.7
 """Metres: nearer, since LiDAR and ego frame differ by the LiDAR's height alone, some 2 m."""
-_NEAR_IN_TIME: Final = 0.15
+NEAR_IN_TIME: Final = 0.15
 """Seconds, of accidents."""
 _ALIKE: Final = 0.25
 """A size is right that differs from the true one by at most this share."""
 _FEWEST: Final = 5
 """Boxes of a class from which on its name tells."""
-_MOVING: Final = 4.0
+MOVING: Final = 4.0
 """m/s: within a step, slower actors do not move enough."""
-_STRAIGHT: Final = np.deg2rad(15)
+STRAIGHT: Final = np.deg2rad(15)
 """A heading that is nearer to one of the true box's four directions is right; at random, a third of them are."""
 _RANDOM: Final = 0.5
 """Share of right headings below which they look random."""
@@ -80,7 +80,7 @@ _ORDERS: Final = {
     if order != (0, 1, 2)
 }
 _CLASSES: Final = "classes swapped"
-_FEWEST_FRAMES: Final = 3
+FEWEST_FRAMES: Final = 3
 """In so few frames, slow predictions look late."""
 _SAYS: Final[Mapping[Group, Mapping[str, str]]] = {
     "place": {
@@ -149,17 +149,17 @@ def check_sanity(
         raise EvaluationError("tokens: there is no sample to look at")
     alarmed = [token for token in tokens if lists and results.prediction(token)]  # few may be
     listed = sorted(alarmed or tokens)
-    drawn = np.random.default_rng(0).permutation(len(listed))[: _LISTS if lists else _SAMPLES]
+    drawn = np.random.default_rng(0).permutation(len(listed))[: LISTS if lists else SAMPLES]
     loader = SampleLoader(dataset, results, setup)
     how = {"workers": 1, **how}
     seen = run_batch(partial(_seen, loader), [listed[each] for each in drawn], places=loader.places, **how)
     ranked = not lists or setup.task == "warning" or isinstance(setup.rules, BoxAccidents)
-    warnings = (*_mistakes(seen, results.task), *_facts(seen, ranked=ranked))
+    warnings = (*mistakes_of(seen, results.task), *facts_of(seen, ranked=ranked))
     return SanityReport(samples=len(seen), warnings=warnings)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Seen:
+class Seen:
     """What one sample says.
 
     Attributes:
@@ -179,7 +179,7 @@ class _Seen:
     headings: tuple[int, int] = (0, 0)
 
 
-def _seen(loader: SampleLoader, token: str) -> _Seen:
+def _seen(loader: SampleLoader, token: str) -> Seen:
     """Look at a sample."""
     prediction, truth, *more = loader(token)
     if isinstance(prediction, MotionOutput):
@@ -192,13 +192,13 @@ def _seen(loader: SampleLoader, token: str) -> _Seen:
     return _accidents_seen(loader, token, prediction, more[0])
 
 
-def _mistakes(seen: Sequence[_Seen], task: str) -> Iterator[str]:
+def mistakes_of(seen: Sequence[Seen], task: str) -> Iterator[str]:
     """What undoing a mistake shows: of a group at most the best one, and nothing beside a wrong place."""
     sums: dict[str, FloatArray] = {}
     for name, tally in (each for one in seen for each in one.tallies.items()):
         sums[name] = sums.get(name, 0.0) + tally
     if _CLASSES in sums:
-        sums[_CLASSES] = _class_tally(sums[_CLASSES])
+        sums[_CLASSES] = class_tally(sums[_CLASSES])
     for group, says in _SAYS.items():
         suspected = []
         for name in (each for each in says if each in sums):
@@ -223,7 +223,7 @@ def _worst(part: FloatArray, whole: FloatArray) -> float:
     return float((part[tells] / whole[tells]).min(initial=1.0))
 
 
-def _facts(seen: Sequence[_Seen], *, ranked: bool) -> Iterator[str]:
+def facts_of(seen: Sequence[Seen], *, ranked: bool) -> Iterator[str]:
     """What shows without the labels."""
     if all(each.empty for each in seen):
         yield f"all {len(seen)} predictions looked at are empty: nothing is predicted in them"
@@ -240,12 +240,12 @@ def _facts(seen: Sequence[_Seen], *, ranked: bool) -> Iterator[str]:
         )
 
 
-def _tally(undone: ArrayLike, given: ArrayLike, whole: float) -> FloatArray:
+def tally_of(undone: ArrayLike, given: ArrayLike, whole: float) -> FloatArray:
     """(4, 1) of which of some things are hit."""
     return np.array([[np.sum(undone)], [whole], [np.sum(given)], [whole]], dtype=np.float64)
 
 
-def _motion_seen(prediction: MotionOutput, label: MotionLabels) -> _Seen:
+def _motion_seen(prediction: MotionOutput, label: MotionLabels) -> Seen:
     """Compare the cells of actors: for places in the present frame, for times where the frames differ."""
     frames, grid = frames_there(label), label.config.grid
     true = grid.reorient(labels_at_present(label).segmentation[:frames] == 1, "devkit")
@@ -258,13 +258,13 @@ def _motion_seen(prediction: MotionOutput, label: MotionLabels) -> _Seen:
     changing = np.asarray(true.any(axis=0) & ~true.all(axis=0))
     true, given, backwards = true & changing, given & changing, every[::-1][:frames] & changing
     times = {"frames reversed": _overlap(backwards, true, given, true)}
-    if frames > _FEWEST_FRAMES:
+    if frames > FEWEST_FRAMES:
         times["one step late"] = _overlap(given[1:], true[:-1], given[1:], true[1:])
     tallies |= {name: np.pad(each, ((0, 0), (0, len(every) - each.shape[1]))) for name, each in times.items()}
     values = (prediction.heads or ())[-1].segmentation if prediction.instances is None else None
     empty = not every.any()
     probabilities = values is not None and not empty and bool(values.min() >= 0 and values.max() <= 1)
-    return _Seen(tallies=tallies, empty=empty, probabilities=probabilities)
+    return Seen(tallies=tallies, empty=empty, probabilities=probabilities)
 
 
 def _actor_cells(prediction: MotionOutput) -> BoolArray:
@@ -294,50 +294,52 @@ def _overlap(undone: AnyArray, true: AnyArray, given: AnyArray, given_true: AnyA
     return np.array([each.sum(axis=(1, 2)) for each in cells], dtype=np.float64)
 
 
-def _detection_seen(dataset: Dataset, token: str, found: DetectedBoxes, truth: Boxes) -> _Seen:
+def _detection_seen(dataset: Dataset, token: str, found: DetectedBoxes, truth: Boxes) -> Seen:
     """Compare detections with the boxes of others, both in the world frame: first their places."""
     scores: list[float] = found.scores.tolist()
     if not len(found) or not len(truth):
-        return _Seen(tallies={}, empty=not len(found), scores=scores)
+        return Seen(tallies={}, empty=not len(found), scores=scores)
     boxes = found.boxes.select(columns_of(found.boxes, found.scores).surest_first[: 2 * len(truth)])
-    near = _near(boxes.center, truth.center)
+    near = are_near(boxes.center, truth.center)
     hits = near.any(axis=1)
     tallies = {
-        name: _tally(_near(center, truth.center).any(axis=1), hits, len(truth))
+        name: tally_of(are_near(center, truth.center).any(axis=1), hits, len(truth))
         for name, center in _moved_back(dataset, token, boxes.center).items()
     }
     world = dataset.boxes(token, "world")  # the velocities of some protocols are in another frame
     moving = world.select(
-        np.isin(world.actor_id, truth.actor_id) & (np.linalg.norm(world.velocity[:, :2], axis=1) >= _MOVING)
+        np.isin(world.actor_id, truth.actor_id) & (np.linalg.norm(world.velocity[:, :2], axis=1) >= MOVING)
     )
     way = LABEL_STEP * moving.velocity[:, :2]
-    late, there = (_follows(boxes.center, moving.center[:, :2] - off, way) for off in (way, 0))
-    tallies["one step late"] = _tally(late, there, len(moving))
+    late, there = (are_followed(boxes.center, moving.center[:, :2] - off, way) for off in (way, 0))
+    tallies["one step late"] = tally_of(late, there, len(moving))
     nearest = np.linalg.norm(truth.center[:, None] - boxes.center, axis=-1).argmin(axis=1)
-    return _pairs_seen(boxes.select(nearest[hits]), truth.select(hits), _Seen(tallies=tallies, scores=scores))
+    return _pairs_seen(boxes.select(nearest[hits]), truth.select(hits), Seen(tallies=tallies, scores=scores))
 
 
-def _pairs_seen(found: Boxes, true: Boxes, seen: _Seen) -> _Seen:
+def _pairs_seen(found: Boxes, true: Boxes, seen: Seen) -> Seen:
     """Compare the sizes, headings and classes of true boxes with those of the boxes found there."""
     sizes = {}
     for name, order in _ORDERS.items():
-        tells = ~_same_size(true.size[:, order], true.size)
-        given, undone = (_same_size(size, true.size)[tells] for size in (found.size, found.size[:, np.argsort(order)]))
-        sizes[name] = _tally(undone, given, int(tells.sum()))
+        tells = ~are_of_one_size(true.size[:, order], true.size)
+        given, undone = (
+            are_of_one_size(size, true.size)[tells] for size in (found.size, found.size[:, np.argsort(order)])
+        )
+        sizes[name] = tally_of(undone, given, int(tells.sum()))
     turn = np.abs((found.yaw - true.yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4)
     names = np.zeros((len(CATEGORIES), len(CATEGORIES)))
     np.add.at(names, (true.category, found.category), 1)
-    right = int(np.count_nonzero(turn <= _STRAIGHT))
+    right = int(np.count_nonzero(turn <= STRAIGHT))
     return replace(seen, tallies={**seen.tallies, **sizes, _CLASSES: names}, headings=(right, len(true)))
 
 
-def _near(found: FloatArray, true: FloatArray) -> BoolArray:
+def are_near(found: FloatArray, true: FloatArray) -> BoolArray:
     """(M, N) whether true centres and found ones are near each other."""
     apart = true[:, None] - found
     return np.asarray(np.hypot(apart[..., 0], apart[..., 1]) < _NEAR) & (np.abs(apart[..., 2]) < _NEAR_IN_HEIGHT)
 
 
-def _follows(found: FloatArray, places: FloatArray, way: FloatArray) -> BoolArray:
+def are_followed(found: FloatArray, places: FloatArray, way: FloatArray) -> BoolArray:
     """(M,) whether anything found is at places (M, 2), as near as a quarter of the way from there."""
     apart = np.linalg.norm(places[:, None] - found[:, :2], axis=-1)
     return np.asarray(apart.min(axis=1) < np.linalg.norm(way, axis=-1) / 4)
@@ -356,11 +358,12 @@ def _moved_back(dataset: Dataset, token: str, center: FloatArray) -> dict[str, F
     }
 
 
-def _same_size(found: FloatArray, true: FloatArray) -> BoolArray:
+def are_of_one_size(found: FloatArray, true: FloatArray) -> BoolArray:
+    """(N,) whether sizes (N, 3) are alike."""
     return np.asarray((np.abs(found - true) <= _ALIKE * true).all(axis=1))
 
 
-def _class_tally(names: FloatArray) -> FloatArray:
+def class_tally(names: FloatArray) -> FloatArray:
     """(4, N) of the N classes that are mostly found under the name of another one, each of a different one."""
     number = names.sum(axis=1)
     other = names.argmax(axis=1)
@@ -372,20 +375,20 @@ def _class_tally(names: FloatArray) -> FloatArray:
     return np.array([names[changed, other[changed]], whole, names[changed, changed], whole])
 
 
-def _accidents_seen(loader: SampleLoader, token: str, alarms: Sequence[Accident], context: AccidentContext) -> _Seen:
+def _accidents_seen(loader: SampleLoader, token: str, alarms: Sequence[Accident], context: AccidentContext) -> Seen:
     """Compare the surest accident with the true one: its places, and its time."""
     scores = [each.score for each in alarms]
     if not alarms:
-        return _Seen(tallies={}, empty=True)
+        return Seen(tallies={}, empty=True)
     surest = min(alarms, key=by_sureness)
     if context.truth is None or context.truth.accident is None:
-        return _Seen(tallies={}, scores=scores)
+        return Seen(tallies={}, scores=scores)
     true, given = context.truth.accident, surest.positions
     world = np.column_stack([given, np.zeros(2)])
     places = {name: _turned(given, axes) for name, axes in _AXES.items()}
     places["world frame for ego frame"] = loader.dataset.world_from(token, "ego").inverse().apply(world)[:, :2]
     tallies = {
-        name: _told(
+        name: accident_tally(
             position_difference(undone, true.positions),
             position_difference(given, true.positions),
             position_difference(undone, given),
@@ -395,13 +398,15 @@ def _accidents_seen(loader: SampleLoader, token: str, alarms: Sequence[Accident]
     }
     times = {"one step late": surest.time - LABEL_STEP, "frames reversed": loader.setup.horizon - surest.time}
     tallies |= {
-        name: _told(abs(undone - true.time), abs(surest.time - true.time), abs(undone - surest.time), _NEAR_IN_TIME)
+        name: accident_tally(
+            abs(undone - true.time), abs(surest.time - true.time), abs(undone - surest.time), NEAR_IN_TIME
+        )
         for name, undone in times.items()
     }
-    return _Seen(tallies=tallies, scores=scores)
+    return Seen(tallies=tallies, scores=scores)
 
 
-def _told(undone: float, given: float, change: float, near: float) -> FloatArray:
+def accident_tally(undone: float, given: float, change: float, near: float) -> FloatArray:
     """Whether the truth is as near, where both cannot be."""
     tells = change > 2 * near
-    return _tally(tells and undone <= near, tells and given <= near, tells)
+    return tally_of(tells and undone <= near, tells and given <= near, tells)

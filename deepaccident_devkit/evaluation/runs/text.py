@@ -70,7 +70,7 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
         ("counts", "\n".join(_counts(summary["metrics"]))),
         *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
     ]
-    notes = "\n".join([*_notes(summary["metrics"]), *reading_notes(summary)])
+    notes = "\n".join([*notes_of(summary["metrics"]), *reading_notes(summary)])
     blocks += [("notes", notes)] if notes else []
     return "\n\n".join(f"{title}{mark}\n{_indented(text)}" for title, text in blocks)
 
@@ -140,7 +140,8 @@ def _breakdown(summary: Json, name: str) -> str:
     return columns_text(rows)
 
 
-def _notes(metrics: Json) -> Iterator[str]:
+def notes_of(metrics: Json) -> Iterator[str]:
+    """What a result says beside its numbers, each sentence once."""
     yield from dict.fromkeys(metrics.get("notes") or ())
     for name, part in (metrics.get("beside") or {}).items():
         yield from (f"if {name}: {note}" for note in part.get("notes") or () if note not in metrics["notes"])

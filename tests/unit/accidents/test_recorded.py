@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.accidents.recorded import CLASS_MASSES, accident_of, accidents_of, masses_of
@@ -15,15 +16,13 @@ def test_the_pair_of_an_accident(da_motion: DeepAccident) -> None:
     accident = accident_of(da_motion, scenario)
     assert accident is not None
     contact = da_motion.collision(scenario)
-    assert accident.actor_ids == contact.actor_ids
-    assert accident.agents == tuple(scenario["collision"]["agents"])
+    assert (accident.actor_ids, accident.agents) == (contact.actor_ids, tuple(scenario["collision"]["agents"]))
     assert accident.categories == tuple(scenario["collision"]["classes"])
     assert accident.last_frame == accident.num_frames == scenario["num_frames"]
     assert accident.paths.shape == (2, accident.num_frames, 3)
     assert accident.duration == pytest.approx((accident.num_frames - 1) / 10)
     for which, token in enumerate(contact.instances):
-        track = da_motion.trajectory(token)
-        np.testing.assert_allclose(accident.paths[which, :, :2], track.center[:, :2])
+        np.testing.assert_allclose(accident.paths[which, :, :2], da_motion.trajectory(token).center[:, :2])
     assert (accident.masses > 0).all()
 
 
@@ -53,20 +52,17 @@ def test_scenarios_that_lack_something_are_named_and_the_others_stay(own_release
     (
         own_release / without_meta["folder"] / without_meta["scenario_type"] / "meta" / f"{without_meta['name']}.txt"
     ).unlink()
-    first = str(seen_once["collision"]["ids"][0])
-    agent = seen_once["collision"]["agents"][0]
+    first, agent = str(seen_once["collision"]["ids"][0]), seen_once["collision"]["agents"][0]
     for label in (own_release / seen_once["folder"] / seen_once["scenario_type"]).glob(
         f"*/label/{seen_once['name']}/*.txt"
     ):
         if not label.stem.endswith("_002"):
-            own = f"/{agent}/" in str(label)
-            rows = label.read_text().splitlines(keepends=True)
+            own, rows = f"/{agent}/" in str(label), label.read_text().splitlines(keepends=True)
             label.write_text(
                 "".join(row for row in rows if row.split()[-3:-2] not in ([first], ["-100"] if own else [first]))
             )
     shutil.rmtree(own_release / ".deepaccident")
-    da = DeepAccident("v1", own_release, verbose=False)
-    found, skipped = accidents_of(da)
+    found, skipped = accidents_of(DeepAccident("v1", own_release, verbose=False))
     assert {each.scenario for each in found} == {each["token"] for each in accidents[2:]}
     reasons = {each.scenario: each.reason for each in skipped}
     assert reasons.keys() == {without_meta["token"], seen_once["token"]}
@@ -82,12 +78,18 @@ def test_a_scenario_without_labels_is_named(tmp_path: Path) -> None:
         for folder in (*label.iterdir(), label):
             folder.rmdir()
     da = DeepAccident("v1", root, verbose=False)
-    with pytest.raises(NotAvailableError, match="has no labels"):
-        accident_of(da, da.find(collision=True, signalized=True)[0])
+    assert_refused(
+        (lambda: accident_of(da, da.find(collision=True, signalized=True)[0]), NotAvailableError, "has no labels"),
+    )
 
 
 def test_masses_follow_class_and_size() -> None:
     sizes = np.array([[4.6, 1.93, 1.52], [9.2, 3.86, 3.04], [0.1, 0.1, 0.1]])
     np.testing.assert_allclose(masses_of([0, 0, 5], sizes), [1500, 3000, 37.5])
-    with pytest.raises(ConfigError, match="car, truck has none"):
-        masses_of([0], sizes[:1], {**CLASS_MASSES, "car": 0, "truck": -1})
+    assert_refused(
+        (
+            lambda: masses_of([0], sizes[:1], {**CLASS_MASSES, "car": 0, "truck": -1}),
+            ConfigError,
+            "car, truck has none",
+        ),
+    )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import assert_refused
 from replayed_accidents import straight, wild_paths
 
 from deepaccident_devkit.accidents.replay import HORIZON, Motion, ReplayStates, braking_plans, motion_of, replay
@@ -39,8 +40,7 @@ def test_without_braking_it_is_the_recording_and_goes_straight_on() -> None:
 
 @pytest.mark.parametrize(("step", "moves"), [(0.0009, False), (0.0011, True)])
 def test_who_hardly_moved_at_the_end_stands_afterwards(step: float, moves: bool) -> None:
-    motion = motion_of([[0, 0, 0], [1, 0, 0], [1 + step, 0, 0]])
-    assert (at(motion, np.array([3.0])).poses[0, 0] > 1 + step) == moves
+    assert (at(motion_of([[0, 0, 0], [1, 0, 0], [1 + step, 0, 0]]), np.array([3.0])).poses[0, 0] > 1 + step) == moves
 
 
 def test_braking_from_constant_speed() -> None:
@@ -66,24 +66,23 @@ def test_a_recording_that_brakes_harder_stays() -> None:
 
 
 def test_who_stands_when_braking_begins_keeps_the_heading_from_which_the_recording_drives_on() -> None:
-    path = np.column_stack([[0, 1, 1, 1, 2, 3], np.zeros(6), [0, 0, 0.1, 0.2, 0.2, 0.2]])
-    motion = motion_of(path)
+    motion = motion_of(np.column_stack([[0, 1, 1, 1, 2, 3], np.zeros(6), [0, 0, 0.1, 0.2, 0.2, 0.2]]))
     standing = at(motion, np.array([0.25, 0.35, 0.6]), start=0.15)  # 0 m/s there: it never leaves
     np.testing.assert_allclose(standing.poses, [[1, 0, 0.15], [1, 0, 0.2], [1, 0, 0.2]], atol=1e-12)
     np.testing.assert_allclose(standing.speeds, 0)
 
 
 def test_when_braking_has_no_effect_or_begins_at_once() -> None:
-    motion = motion_of(straight((0, 0), 0, 10, 11))
-    plans = braking_plans(motion, [1.0, 5.0, np.inf, np.nan, -3.0, 0.99], 4.0)
+    plans = braking_plans(motion_of(straight((0, 0), 0, 10, 11)), [1.0, 5.0, np.inf, np.nan, -3.0, 0.99], 4.0)
     np.testing.assert_array_equal(plans.starts, [np.inf, np.inf, np.inf, np.inf, 0.0, 0.99])
     np.testing.assert_allclose(plans.speeds, [0, 0, 0, 0, 10, 10])
 
 
 @pytest.mark.parametrize("path", [[[0, 0, 0]], [[0, 0], [1, 1]], [[0, 0, 0], [np.nan, 0, 0]]])
 def test_paths_that_are_none(path: list[list[float]]) -> None:
-    with pytest.raises(GeometryError, match="path: expected"):
-        motion_of(path)
+    assert_refused(
+        (lambda: motion_of(path), GeometryError, "path: expected"),
+    )
 
 
 @given(wild_paths(), st.floats(0, 2), st.floats(1, 10))
@@ -103,8 +102,8 @@ def test_nobody_is_sped_up(path: np.ndarray, start: float, deceleration: float) 
 @given(wild_paths(), st.floats(0, 1.9), st.floats(1, 10))
 def test_a_replay_stays_on_its_path(path: np.ndarray, start: float, deceleration: float) -> None:
     motion = motion_of(path)
-    times = np.linspace(0, motion.duration + HORIZON, 300)
-    braked = at(motion, times, start, deceleration)
+    braked = at(motion, np.linspace(0, motion.duration + HORIZON, 300), start, deceleration)
     for axis in (0, 1):
-        on_path = np.interp(braked.arcs, motion.arcs, motion.poses[:, axis])
-        np.testing.assert_allclose(braked.poses[:, axis], on_path, atol=1e-6)
+        np.testing.assert_allclose(
+            braked.poses[:, axis], np.interp(braked.arcs, motion.arcs, motion.poses[:, axis]), atol=1e-6
+        )

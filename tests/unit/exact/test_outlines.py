@@ -44,8 +44,10 @@ def test_simplified_outlines_are_scikit_images_but_for_ties(oracle, expected) ->
     """A point exactly half a cell off stays or goes in scikit-image by the last bit of a sine, here it goes."""
     kept = np.split(oracle["kept"], np.cumsum(oracle["outline_length"])[:-1])
     found = simplified(expected)
-    equal = [np.array_equal(ours, points[keep]) for ours, points, keep in zip(found, expected, kept, strict=True)]
-    assert np.mean(equal) > 0.95
+    assert (
+        np.mean([np.array_equal(ours, points[keep]) for ours, points, keep in zip(found, expected, kept, strict=True)])
+        > 0.95
+    )
     for ours, points in zip(found, expected, strict=True):
         assert_array_equal(ours[[0, -1]], points[[0, -1]])
         assert largest_distance(points, ours) <= TOLERANCE + 1e-9
@@ -54,10 +56,8 @@ def test_simplified_outlines_are_scikit_images_but_for_ties(oracle, expected) ->
 def largest_distance(points: np.ndarray, chain: np.ndarray) -> float:
     """How far points are from a chain of lines at most."""
     start, along = chain[:-1], np.diff(chain, axis=0)
-    length = np.maximum((along**2).sum(axis=1), 1e-30)
-    place = np.clip(((points[:, None] - start) * along).sum(axis=-1) / length, 0, 1)
-    apart = points[:, None] - start - place[..., None] * along
-    return float(np.sqrt((apart**2).sum(axis=-1)).min(axis=1).max())
+    place = np.clip(((points[:, None] - start) * along).sum(axis=-1) / np.maximum((along**2).sum(axis=1), 1e-30), 0, 1)
+    return float(np.sqrt(((points[:, None] - start - place[..., None] * along) ** 2).sum(axis=-1)).min(axis=1).max())
 
 
 def test_the_first_of_ties_is_kept_whatever_the_machine() -> None:
@@ -71,8 +71,7 @@ def test_the_first_of_ties_is_kept_whatever_the_machine() -> None:
 
 def test_no_outlines_are_simplified() -> None:
     nothing = np.zeros((0, 2))
-    assert simplified([]) == []
-    assert [len(each) for each in simplified([nothing, np.eye(2), nothing])] == [0, 2, 0]
+    assert (simplified([]), [len(each) for each in simplified([nothing, np.eye(2), nothing])]) == ([], [0, 2, 0])
 
 
 def test_an_outline_is_found_wherever_it_is() -> None:
@@ -113,11 +112,8 @@ def boxes() -> np.ndarray:
 def test_instances_are_nearer_than_they_are_drawn(boxes) -> None:
     """By 0.9 and 0.95 cells: each outline runs where the interpolated id is 0.1."""
     gaps = gaps_of(boxes, 1, 2, 3)
-    assert list(gaps) == [(1, 2), (1, 3), (2, 3)]
-    assert gaps[1, 2] == pytest.approx(8 - 0.9 - 0.95)
-    assert gaps[2, 3] == 0
-    outline = first_outline(boxes, 2, find_objects(boxes)[1])
-    assert outline[:, 1].min() == 20 - 0.95
+    assert (list(gaps), gaps[1, 2], gaps[2, 3]) == ([(1, 2), (1, 3), (2, 3)], pytest.approx(8 - 0.9 - 0.95), 0)
+    assert first_outline(boxes, 2, find_objects(boxes)[1])[:, 1].min() == 20 - 0.95
 
 
 def test_pairs_that_cannot_be_near_are_left_out(boxes) -> None:
@@ -137,9 +133,7 @@ def test_who_is_not_there_or_too_small_is_far_away(boxes) -> None:
 
 
 def test_nobody_has_no_distances(boxes) -> None:
-    assert gaps_of(boxes) == {}
-    assert gaps_of(boxes, 2) == {}
-    assert gaps_of(np.zeros_like(boxes), 1, 2) == {(1, 2): NO_OUTLINE}
+    assert (gaps_of(boxes), gaps_of(boxes, 2), gaps_of(np.zeros_like(boxes), 1, 2)) == ({}, {}, {(1, 2): NO_OUTLINE})
 
 
 def test_ids_keep_their_order(boxes) -> None:

@@ -7,8 +7,7 @@ PEAKS = np.array([[0, 0], [0, 2]], dtype=np.float32)
 
 
 def test_the_first_of_equally_near_peaks() -> None:
-    points = np.array([[0, 0, 0, 5], [0.5, 1, 1.5, 1]], dtype=np.float32)
-    assert_array_equal(nearest_peaks(points, PEAKS), [0, 0, 1, 0])
+    assert_array_equal(nearest_peaks(np.array([[0, 0, 0, 5], [0.5, 1, 1.5, 1]], dtype=np.float32), PEAKS), [0, 0, 1, 0])
 
 
 def test_distances_are_equal_where_their_float32_roots_are() -> None:
@@ -17,8 +16,7 @@ def test_distances_are_equal_where_their_float32_roots_are() -> None:
     squares = ((PEAKS - point.T) ** 2).sum(axis=1)
     assert squares[1] < squares[0]
     assert_array_equal(nearest_peaks(point, PEAKS), [0])
-    many = np.repeat(point, 200_000, axis=1)
-    assert_array_equal(nearest_peaks(many, PEAKS), np.zeros(200_000))
+    assert_array_equal(nearest_peaks(np.repeat(point, 200_000, axis=1), PEAKS), np.zeros(200_000))
 
 
 def test_nothing_to_decide() -> None:

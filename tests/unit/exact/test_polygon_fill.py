@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.exact.polygon_fill import filled_cells
@@ -56,8 +57,7 @@ def test_triangles_and_stars_go_through_the_whole_rule() -> None:
     assert_array_equal(drawing([[[0, 0], [4, 0], [0, 4]]], (5, 5)), np.tri(5, dtype=int)[::-1])
     star = [[5, 0], [2, 9], [10, 3], [0, 3], [8, 9]]  # turns one way, but twice around: empty in the middle
     filled = drawing([star], (10, 11))
-    assert filled[5, 5] == 0
-    assert filled[2, 5] == 1
+    assert (filled[5, 5], filled[2, 5]) == (0, 1)
 
 
 def test_nothing_to_draw() -> None:
@@ -83,5 +83,6 @@ def test_nothing_to_draw() -> None:
     ],
 )
 def test_what_is_no_polygon_is_refused(make: Callable[[], object], sentence: str) -> None:
-    with pytest.raises(GeometryError, match=sentence):
-        make()
+    assert_refused(
+        (make, GeometryError, sentence),
+    )

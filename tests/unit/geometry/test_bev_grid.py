@@ -1,8 +1,10 @@
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
@@ -31,15 +33,19 @@ def test_rows_and_columns_of_each_orientation() -> None:
 
 
 def test_the_devkits_raster_is_the_released_upside_down_and_fierys_transposed() -> None:
-    devkit = BevGrid((0, 3, 1), (0, 2, 1))
-    raster = np.arange(12).reshape(2, 2, 3)
+    devkit, raster = BevGrid((0, 3, 1), (0, 2, 1)), np.arange(12).reshape(2, 2, 3)
     assert_array_equal(devkit.reorient(raster, "released"), raster[..., ::-1, :])
     assert_array_equal(devkit.reorient(raster, "fiery"), raster.swapaxes(1, 2))
     assert_array_equal(devkit.with_orientation("released").reorient(raster[..., ::-1, :], "devkit"), raster)
     fiery = devkit.with_orientation("fiery")
     assert_array_equal(fiery.reorient(raster.swapaxes(1, 2), "released"), raster[..., ::-1, :])
-    with pytest.raises(GeometryError, match=r"raster: expected shape \(…, 3, 2\), found \(2, 2, 3\)"):
-        fiery.reorient(raster, "devkit")
+    assert_refused(
+        (
+            lambda: fiery.reorient(raster, "devkit"),
+            GeometryError,
+            r"raster: expected shape \(…, 3, 2\), found \(2, 2, 3\)",
+        ),
+    )
 
 
 def test_a_cell_owns_its_lower_edges_and_nothing_beside_the_grid_has_one() -> None:
@@ -52,9 +58,12 @@ def test_a_cell_owns_its_lower_edges_and_nothing_beside_the_grid_has_one() -> No
     assert_array_equal(BevGrid().index_of([[last, last]])[0], [[199, 199]])
     assert_array_equal(BevGrid(orientation="released").index_of([[last, last]])[0], [[0, 199]])
     assert grid.index_of(np.zeros((0, 2)))[0].shape == (0, 2)
-    for wrong in ([1, 2], np.zeros((2, 4)), 3):
-        with pytest.raises(GeometryError, match=r"points: expected shape \(N, 2\) or \(N, 3\)"):
-            grid.index_of(wrong)
+    assert_refused(
+        *[
+            (partial(grid.index_of, wrong), GeometryError, r"points: expected shape \(N, 2\) or \(N, 3\)")
+            for wrong in ([1, 2], np.zeros((2, 4)), 3)
+        ],
+    )
 
 
 def test_equal_grids_are_one_key() -> None:
@@ -90,16 +99,14 @@ def test_decimal_resolutions_are_whole() -> None:
     ],
 )
 def test_ranges_that_are_no_cells_are_refused(x: object, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        BevGrid(x=x)  # type: ignore[arg-type]
+    assert_refused((lambda: BevGrid(x=x), ConfigError, message))  # type: ignore[arg-type]
 
 
-def test_an_unknown_orientation_is_refused() -> None:
-    with pytest.raises(ChoiceError, match="expected one of devkit, released, fiery, found 'up'"):
-        BevGrid(orientation="up")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("points", ["a", None, [["1", "2"]], [[1, 2], [1, 2, 3]]])
-def test_what_is_no_points_is_refused(points: object) -> None:
-    with pytest.raises(GeometryError, match=r"points: expected points of shape \(N, 2\) or \(N, 3\), found"):
-        BevGrid().index_of(points)
+def test_an_unknown_orientation_and_what_is_no_points_are_refused() -> None:
+    assert_refused(
+        (lambda: BevGrid(orientation="up"), ChoiceError, ("one of devkit, released, fiery", "'up'")),  # type: ignore[arg-type]
+        *[
+            (partial(BevGrid().index_of, points), GeometryError, ("points: expected points of shape (N, 2) or (N, 3)",))
+            for points in ("a", None, [["1", "2"]], [[1, 2], [1, 2, 3]])
+        ],
+    )

@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -46,15 +48,6 @@ def test_a_box_of_nuscenes_arguments() -> None:
     assert_allclose(made.rotation_matrix, turn.rotation_matrix, atol=1e-12)
     plain = Box.from_wlh((10, 0, 1), (2, 4, 1.5), [1, 0, 0, 0], frame="world")
     assert (plain.yaw, plain.category, np.isnan(plain.velocity).all()) == (0, "car", True)
-    with pytest.raises(GeometryError, match=r"wlh: expected shape \(3\), found \(2,\)"):
-        Box.from_wlh((0, 0, 0), (1, 2), turn, frame="ego")
-
-
-def test_nuscenes_call_names_ours() -> None:
-    turn = Quaternion()
-    for arguments, names in ((((0, 0, 0), (1, 2, 3), turn), {}), (((0, 0, 0), (1, 2, 3), turn), {"name": "car"})):
-        with pytest.raises(GeometryError, match=r"found tuple; .* is Box\.from_wlh\(center, wlh, orientation, frame="):
-            Box(*arguments, **names)
 
 
 def test_corners_stand_in_columns(box: Box) -> None:
@@ -86,13 +79,17 @@ def test_editing_what_it_returns_changes_nothing(box: Box) -> None:
     box.corners()[0] = 9
     assert_array_equal(box.wlh, [2, 4, 1.5])
     assert box.yaw == pytest.approx(0.5)
-    with pytest.raises(ValueError, match="read-only"):
-        box.center[0] = 1
+    assert not box.center.flags.writeable
 
 
 def test_refuses_other_than_one_row_and_other_than_three_numbers(box: Box) -> None:
     none = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
     assert_refused(
-        (lambda: Box(none), GeometryError, r"one row of Boxes, found 0; pick one with boxes\[i\]"),
-        (lambda: box.translate((1, 2)), GeometryError, r"translation: expected shape \(3\)"),
+        (lambda: Box(none), GeometryError, ("one row of Boxes", "found 0", "boxes[i]")),
+        (lambda: box.translate((1, 2)), GeometryError, ("translation", "(3)")),
+        (lambda: Box.from_wlh((0, 0, 0), (1, 2), Quaternion(), frame="ego"), GeometryError, ("wlh", "(3)", "(2,)")),
+        *[
+            (partial(Box, (0, 0, 0), (1, 2, 3), Quaternion(), **names), GeometryError, ("Box.from_wlh(center, wlh",))
+            for names in ({}, {"name": "car"})  # nuScenes' way to call it
+        ],
     )

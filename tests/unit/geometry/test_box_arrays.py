@@ -42,8 +42,9 @@ def test_boxes_that_touch_now_have_no_time() -> None:
 
 
 def test_as_brute_force_has_it(pytestconfig: pytest.Config) -> None:
-    path = Path(pytestconfig.getoption("golden")) / "safety" / "surrogates.json"
-    golden = json.loads(path.read_text(encoding="utf-8"))
+    golden = json.loads(
+        (Path(pytestconfig.getoption("golden")) / "safety" / "surrogates.json").read_text(encoding="utf-8")
+    )
     given = {name: np.array(values) for name, values in golden["inputs"].items() if name != "kind"}
     sides = [
         (

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,28 +24,16 @@ def test_points_move_and_intensity_stays() -> None:
 def test_arrays_are_read_only_and_the_callers_are_not() -> None:
     xyz, intensity = np.zeros((2, 3)), np.zeros(2, dtype=np.float32)
     cloud = LidarPointCloud(xyz, intensity)
-    for array in (cloud.xyz, cloud.intensity):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1
+    assert (cloud.xyz.flags.writeable, cloud.intensity.flags.writeable) == (False, False)
     xyz[0] = intensity[0] = 1  # must not raise
-
-
-def test_an_empty_cloud_moves_too() -> None:
     assert len(LidarPointCloud(np.zeros((0, 3)), np.zeros(0)).transform(SE3.identity(), "world")) == 0
-
-
-@pytest.mark.parametrize(
-    ("xyz", "intensity", "name"), [(np.zeros((2, 4)), np.zeros(2), "xyz"), (np.zeros((2, 3)), np.zeros(3), "intensity")]
-)
-def test_wrong_shapes_are_refused(xyz: np.ndarray, intensity: np.ndarray, name: str) -> None:
-    with pytest.raises(GeometryError, match=f"LidarPointCloud.{name}: expected shape"):
-        LidarPointCloud(xyz, intensity)
 
 
 @pytest.fixture
 def cloud() -> LidarPointCloud:
-    xyz = [[0.0, 0, 0], [1, 1, 0], [1.4, 1.4, 0.4], [-3, 4, 1], [10, -2, 2]]
-    return LidarPointCloud(np.array(xyz), np.arange(5) / 10)
+    return LidarPointCloud(
+        np.array([[0.0, 0, 0], [1, 1, 0], [1.4, 1.4, 0.4], [-3, 4, 1], [10, -2, 2]]), np.arange(5) / 10
+    )
 
 
 def rows(part: LidarPointCloud) -> list[int]:
@@ -69,45 +58,23 @@ def test_crop_by_ranges_and_by_grid(
     assert rows(cloud.crop(grid, **ranges)) == expected
 
 
-def test_ranges_that_are_none(cloud: LidarPointCloud) -> None:
-    assert_refused(
-        (lambda: cloud.crop(y=(1, 0)), GeometryError, r"y: expected a start and an end not before it, found \(1, 0\)"),
-        (lambda: cloud.crop(z=(1, 2, 3)), GeometryError, r"z: expected shape \(2\)"),
-    )
-
-
 def test_remove_close_cuts_a_circle_around_the_sensor(cloud: LidarPointCloud) -> None:
     assert rows(cloud.remove_close(1.5)) == [2, 3, 4]  # (1, 1) is 1.41 m away
-    assert rows(cloud.remove_close(5)) == [3, 4]
-    assert rows(cloud.remove_close(0)) == [0, 1, 2, 3, 4]
+    assert (rows(cloud.remove_close(5)), rows(cloud.remove_close(0))) == ([3, 4], [0, 1, 2, 3, 4])
     assert rows(cloud.remove_close(1, sensor=(10, -2, -7))) == [0, 1, 2, 3]
     in_world = cloud.transform(SE3.from_yaw(0, (100, 0, 0)), "world")
     assert rows(in_world.remove_close(1.5, sensor=(100, 0, 2))) == [2, 3, 4]
-    assert_refused(
-        (
-            lambda: in_world.remove_close(1.5),
-            GeometryError,
-            r"does not know its sensor; give sensor=\(x, y, z\), or .* frame='lidar'",
-        ),
-        (lambda: cloud.remove_close(-1), GeometryError, "radius: expected metres from 0 on, found -1"),
-    )
+    assert_refused((lambda: in_world.remove_close(1.5), GeometryError, ("sensor=(x, y, z)", "frame='lidar'")))
 
 
 def test_select_picks_points(cloud: LidarPointCloud) -> None:
-    assert rows(cloud.select([4, 0])) == [4, 0]
-    assert rows(cloud.select([])) == []
+    assert (rows(cloud.select([4, 0])), rows(cloud.select([]))) == ([4, 0], [])
     assert rows(cloud.select(cloud.xyz[:, 2] > 0.5)) == [3, 4]
-    with pytest.raises(GeometryError, match="does not pick from 5 points"):
-        cloud.select([5])
 
 
 def test_clouds_of_one_frame_join(cloud: LidarPointCloud) -> None:
     joined = concatenate([cloud, cloud.crop(z=(1, 5))], "lidar")
-    assert rows(joined) == [0, 1, 2, 3, 4, 3, 4]
-    assert joined.intensity.dtype == np.float32
-    assert len(concatenate([], "ego")) == 0
-    with pytest.raises(GeometryError, match="'lidar' cannot join those of 'ego'; transform them first"):
-        concatenate([cloud], "ego")
+    assert (rows(joined), joined.intensity.dtype, len(concatenate([], "ego"))) == ([0, 1, 2, 3, 4, 3, 4], np.float32, 0)
 
 
 def test_points_keep_their_sources(cloud: LidarPointCloud) -> None:
@@ -118,23 +85,36 @@ def test_points_keep_their_sources(cloud: LidarPointCloud) -> None:
     for each in (part, concatenate([part], "ego")):
         assert_array_equal(each.agent, [0, 4])
         assert_array_equal(each.time_lag, np.float32([0, 0.2]))
-    with pytest.raises(ValueError, match="read-only"):
-        part.time_lag[0] = 1
+    assert not part.time_lag.flags.writeable
     joined = concatenate([of_two, replace(of_two, agent=None)], "lidar")
-    assert joined.agent is None
-    assert len(joined.time_lag) == 10
-    with pytest.raises(GeometryError, match=r"LidarPointCloud.time_lag: expected shape \(5\), found \(2,\)"):
-        replace(cloud, time_lag=[0, 0])
+    assert (joined.agent, len(joined.time_lag)) == (None, 10)
 
 
 def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
-    for wrong in (7, None, ""):
-        with pytest.raises(GeometryError, match=r"LidarPointCloud.frame: expected the name of a frame, .* found"):
-            LidarPointCloud(np.zeros((1, 3)), [0], wrong)
-    for wrong in ("near", None, [1.0]):
-        with pytest.raises(GeometryError, match="radius: expected metres from 0 on, found"):
-            cloud.remove_close(wrong)
     assert_refused(
+        (
+            lambda: LidarPointCloud(np.zeros((2, 4)), np.zeros(2)),
+            GeometryError,
+            ("LidarPointCloud.xyz: expected shape",),
+        ),
+        (lambda: LidarPointCloud(cloud.xyz, np.zeros(3)), GeometryError, ("LidarPointCloud.intensity", "(5)", "(3,)")),
+        (lambda: replace(cloud, time_lag=[0, 0]), GeometryError, ("LidarPointCloud.time_lag", "(5)", "(2,)")),
+        (lambda: cloud.crop(y=(1, 0)), GeometryError, ("y: expected a start and an end not before it", "(1, 0)")),
+        (lambda: cloud.crop(z=(1, 2, 3)), GeometryError, ("z: expected shape (2)",)),
+        (lambda: cloud.select([5]), GeometryError, ("does not pick from 5 points",)),
+        (lambda: concatenate([cloud], "ego"), GeometryError, ("'lidar'", "'ego'", "transform them first")),
+        *[
+            (
+                partial(LidarPointCloud, np.zeros((1, 3)), [0], wrong),
+                GeometryError,
+                r"LidarPointCloud.frame: expected the name of a frame, .* found",
+            )
+            for wrong in (7, None, "")
+        ],
+        *[
+            (partial(cloud.remove_close, wrong), GeometryError, "radius: expected metres from 0 on, found")
+            for wrong in ("near", None, [1.0], -1)
+        ],
         (
             lambda: cloud.crop((-50, 50)),
             GeometryError,
@@ -148,6 +128,5 @@ def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
 
 def test_points_at_infinity_warn_of_nothing() -> None:
     cloud = LidarPointCloud([[np.inf, 0, 0], [1, -np.inf, 2], [np.nan, 0, 0], [5, 0, 0]], [0, 0.1, 0.2, 0.3])
-    assert rows(cloud.crop(BevGrid())) == [3]
-    assert rows(cloud.remove_close(2)) == [0, 1, 3]
+    assert (rows(cloud.crop(BevGrid())), rows(cloud.remove_close(2))) == ([3], [0, 1, 3])
     assert len(cloud.transform(SE3.from_yaw(0.3), "ego")) == 4

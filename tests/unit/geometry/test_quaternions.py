@@ -16,8 +16,7 @@ def test_half_turns_have_one_part(part: int, rotation: np.ndarray) -> None:
 
 
 def test_against_pyquaternion() -> None:
-    rng = np.random.default_rng(0)
-    oracles = [Quaternion(part).unit for part in rng.normal(size=(200, 4))]
+    oracles = [Quaternion(part).unit for part in np.random.default_rng(0).normal(size=(200, 4))]
     elements = np.array([q.elements if q.w >= 0 else -q.elements for q in oracles])
     matrices = np.array([q.rotation_matrix for q in oracles])
     assert_allclose(quaternions.to_matrix(elements), matrices, atol=1e-12)
@@ -26,18 +25,17 @@ def test_against_pyquaternion() -> None:
     assert_allclose(quaternions.yaw_of(elements), np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]), atol=1e-9)
     products = [(one * two).elements for one, two in zip(oracles[:100], oracles[100:], strict=True)]
     left = quaternions.left_multiplier(np.array([q.elements for q in oracles[:100]]))
-    right = np.array([q.elements for q in oracles[100:]])
-    assert_allclose((left @ right[:, :, None])[..., 0], products, atol=1e-12)
-    single = quaternions.single_left_multiplier(matrices[0])
-    assert_allclose(single, quaternions.left_multiplier(elements[0]), atol=1e-9)
+    assert_allclose((left @ np.array([q.elements for q in oracles[100:]])[:, :, None])[..., 0], products, atol=1e-12)
+    assert_allclose(
+        quaternions.single_left_multiplier(matrices[0]), quaternions.left_multiplier(elements[0]), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (3,), (2, 3)])
 def test_leading_axes_are_kept(shape: tuple[int, ...]) -> None:
     yaw = np.full(shape, 0.7)
     quaternion = quaternions.from_yaw(yaw)
-    assert quaternion.shape == (*shape, 4)
-    assert quaternions.to_matrix(quaternion).shape == (*shape, 3, 3)
+    assert (quaternion.shape, quaternions.to_matrix(quaternion).shape) == ((*shape, 4), (*shape, 3, 3))
     assert quaternions.left_multiplier(quaternion).shape == (*shape, 4, 4)
     assert_allclose(quaternions.from_matrix(quaternions.to_matrix(quaternion)), quaternion, atol=1e-12)
     assert_allclose(quaternions.yaw_of(quaternion), yaw)

@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -35,8 +37,7 @@ def test_constructors_agree() -> None:
 def test_stored_transforms_have_the_last_row_of_every_transform() -> None:
     pose = SE3.from_yaw(0.3, (1, 2, 3)).matrix
     for kept in (12, 16):
-        numbers = np.tile(pose.ravel()[:kept], (2, 5, 1))
-        assert_array_equal(stored_transforms(numbers), np.tile(pose, (2, 5, 1, 1)))
+        assert_array_equal(stored_transforms(np.tile(pose.ravel()[:kept], (2, 5, 1))), np.tile(pose, (2, 5, 1, 1)))
 
 
 def test_the_matrix_is_a_read_only_copy_and_the_callers_stays_writable() -> None:
@@ -45,8 +46,7 @@ def test_the_matrix_is_a_read_only_copy_and_the_callers_stays_writable() -> None
     mine[0, 3] = 5
     assert pose.translation[0] == 0
     for array in (pose.matrix, pose.rotation, pose.translation, pose.inverse().matrix, (pose @ pose).matrix):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1
+        assert not array.flags.writeable
 
 
 def test_no_points_and_integer_points() -> None:
@@ -69,29 +69,14 @@ def test_no_points_and_integer_points() -> None:
     ],
 )
 def test_what_is_no_rigid_transform_is_refused(fault: object, message: str) -> None:
-    with pytest.raises(GeometryError, match=message):
-        SE3(fault)
+    assert_refused(
+        (lambda: SE3(fault), GeometryError, message),
+    )
 
 
 def test_single_precision_rotations_are_taken() -> None:
     turn = SE3.from_quaternion(Quaternion(1, 2, 3, 4)).matrix.astype(np.float32)
     assert_allclose(SE3(turn).matrix, turn, rtol=0)
-
-
-@pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (np.nan, 0, 0, 1), (1, 0, 0)])
-def test_a_quaternion_without_direction_is_refused(quaternion: tuple[float, ...]) -> None:
-    with pytest.raises(GeometryError, match="quaternion: "):
-        SE3.from_quaternion(quaternion)
-
-
-@pytest.mark.parametrize("points", [3.0, [1, 2], np.zeros((2, 4)), np.zeros((1, 2, 3))])
-def test_points_of_another_shape_are_refused(points: object) -> None:
-    with pytest.raises(GeometryError, match=r"points: expected shape \(N, 3\) or \(3,\)"):
-        SE3.identity().apply(points)
-
-
-def test_repr_shows_translation_and_yaw() -> None:
-    assert repr(SE3.from_yaw(0.5, (1, -2, 3))) == "SE3(translation=[1.000, -2.000, 3.000], yaw=0.5000)"
 
 
 @pytest.fixture
@@ -123,44 +108,39 @@ def test_boxes_a_box_and_a_cloud_are_carried_along(boxes: Boxes) -> None:
     assert_array_equal((pose @ LidarPointCloud(boxes.center, [1, 2])).xyz, want.center)
 
 
-@pytest.mark.parametrize("points", [None, "abc", object(), ["1", "2", "3"], [[1, 2], [1, 2, 3]], {}])
-def test_what_cannot_be_moved_is_refused(points: object) -> None:
+def test_misuse_says_what_to_give(boxes: Boxes) -> None:
     pose = SE3.identity()
-    for move in (pose.apply, pose.__matmul__):
-        with pytest.raises(
-            GeometryError, match=r"points: expected points of shape \(N, 3\) or \(3,\), boxes or a point"
-        ):
-            move(points)
-    with pytest.raises(GeometryError, match=r"vectors: expected vectors of shape \(…, 3\), found"):
-        pose.rotate(points)
-
-
-def test_other_misuse_says_what_to_give(boxes: Boxes) -> None:
-    pose = SE3.identity()
+    assert repr(SE3.from_yaw(np.float32(0.5), (1, -2, 3))) == "SE3(translation=[1.000, -2.000, 3.000], yaw=0.5000)"
+    wrong_points = (None, "abc", object(), ["1", "2", "3"], [[1, 2], [1, 2, 3]], {})
     assert_refused(
-        (
-            lambda: SE3.identity().apply(np.zeros((3, 8))),
-            GeometryError,
-            r"points: .*, found \(3, 8\); transpose it \(\.T\)$",
-        ),
-        (lambda: pose @ np.eye(4), GeometryError, r"found \(4, 4\); of a matrix \(4, 4\) make SE3"),
-        (lambda: pose.rotate(np.zeros((3, 2))), GeometryError, r"vectors: expected shape \(…, 3\), found \(3, 2\)"),
-        (
-            lambda: pose.apply([1, 2, 3], frame="ego"),
-            GeometryError,
-            "frame: points of an array carry no name of a frame, found 'ego'",
-        ),
-        (lambda: pose.apply(boxes, frame=5), GeometryError, r"frame: expected the name of a frame, .* found 5"),
+        *[
+            (
+                partial(move, points),
+                GeometryError,
+                ("points of shape (N, 3) or (3,), boxes or a point",),
+            )
+            for move in (pose.apply, pose.__matmul__)
+            for points in wrong_points
+        ],
+        *[(partial(pose.rotate, points), GeometryError, ("vectors of shape (…, 3)",)) for points in wrong_points],
+        *[
+            (partial(pose.apply, points), GeometryError, ("points: expected shape (N, 3) or (3,)",))
+            for points in (3.0, [1, 2], np.zeros((2, 4)), np.zeros((1, 2, 3)))
+        ],
+        (lambda: pose.apply(np.zeros((3, 8))), GeometryError, ("points: ", "found (3, 8); transpose it (.T)")),
+        (lambda: pose @ np.eye(4), GeometryError, ("found (4, 4); of a matrix (4, 4) make SE3",)),
+        (lambda: pose.rotate(np.zeros((3, 2))), GeometryError, ("vectors: expected shape (…, 3), found (3, 2)",)),
+        (lambda: pose.apply([1, 2, 3], frame="ego"), GeometryError, ("frame: ", "carry no name", "'ego'")),
+        (lambda: pose.apply(boxes, frame=5), GeometryError, ("frame: expected the name of a frame", "5")),
+        *[
+            (partial(SE3.from_yaw, wrong), GeometryError, ("yaw: ", "angle in radians, found"))
+            for wrong in ("left", None, [0.1], np.nan)
+        ],
+        *[
+            (partial(SE3.from_quaternion, wrong), GeometryError, ("quaternion: ",))
+            for wrong in (None, 7, "abcd", [None] * 4, (0, 0, 0, 0), (np.nan, 0, 0, 1), (1, 0, 0))
+        ],
     )
-    for wrong in ("left", None, [0.1]):
-        with pytest.raises(GeometryError, match="yaw: expected an angle in radians, found"):
-            SE3.from_yaw(wrong)
-    with pytest.raises(GeometryError, match="yaw: expected a finite angle in radians, found nan"):
-        SE3.from_yaw(np.nan)
-    assert SE3.from_yaw(np.float32(0.5)).yaw == pytest.approx(0.5)
-    for wrong in (None, 7, "abcd", [None] * 4):
-        with pytest.raises(GeometryError, match="quaternion: expected"):
-            SE3.from_quaternion(wrong)
 
 
 def test_points_at_infinity_warn_of_nothing() -> None:
@@ -189,11 +169,9 @@ def test_ways_there_and_back_end_where_they_began_though_poses_are_rounded(how: 
         assert_allclose((a @ a.inverse()).matrix, np.eye(4), atol=1e-9)
         points = source.uniform(-600, 600, (9, 3))
         assert_allclose(b_from_a.apply(a_from_b.apply(points)), points, atol=1e-9)
-        around = (a.inverse() @ b) @ (b.inverse() @ c) @ (c.inverse() @ a)
-        assert_allclose(around.apply(points), points, atol=1e-9)
+        assert_allclose(((a.inverse() @ b) @ (b.inverse() @ c) @ (c.inverse() @ a)).apply(points), points, atol=1e-9)
         boxes = Boxes.from_arrays(points, np.full((9, 3), 8.0), source.uniform(-3, 3, 9), frame="a")
-        back = boxes.transform(b_from_a, "b").transform(a_from_b, "a")
-        assert_allclose(back.corners(), boxes.corners(), atol=1e-5)
+        assert_allclose(boxes.transform(b_from_a, "b").transform(a_from_b, "a").corners(), boxes.corners(), atol=1e-5)
 
 
 def test_a_rounded_pose_keeps_its_numbers_and_has_the_nearest_rotations_quaternion() -> None:

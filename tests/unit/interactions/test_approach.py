@@ -56,8 +56,7 @@ def test_one_that_brakes_stops_and_stays(
 def test_many_pairs_are_as_each_alone_and_dimensions_stay() -> None:
     speeds = np.linspace(1, 20, 5000).reshape(2, 2500)
     zeros = np.zeros_like(speeds)
-    found = modified_ttc(CAR, AHEAD, speeds, zeros, zeros, zeros)
-    np.testing.assert_allclose(found, 20 / speeds)
+    np.testing.assert_allclose(modified_ttc(CAR, AHEAD, speeds, zeros, zeros, zeros), 20 / speeds)
     assert modified_ttc(*(np.zeros((0, 5)),) * 2, *(np.zeros(0),) * 4).shape == (0,)
 
 
@@ -70,8 +69,7 @@ rates = st.floats(-6, 3).map(lambda value: round(value, 3))
 def at(box: np.ndarray, speed: float, rate: float, times: np.ndarray) -> np.ndarray:
     """Where a box is at times, by the definition."""
     until = np.minimum(times, -speed / rate) if rate < 0 else times
-    way = speed * until + rate * until**2 / 2
-    moved = np.tile(box, (len(times), 1))
+    way, moved = speed * until + rate * until**2 / 2, np.tile(box, (len(times), 1))
     moved[:, :2] += way[:, None] * [math.cos(box[4]), math.sin(box[4])]
     return moved
 

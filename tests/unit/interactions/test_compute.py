@@ -2,11 +2,13 @@
 
 import math
 import pickle
+from functools import partial
 from itertools import combinations
 
 import numpy as np
 import pytest
 from interaction_scenes import BIKE, PEDESTRIAN, straight, tracks_of
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
@@ -18,8 +20,9 @@ DEFAULT = InteractionConfig()
 
 
 def of_scene(paths, sizes=None, unknown=(), config=DEFAULT) -> tuple[ActorMotion, Measured, dict[str, np.ndarray]]:
-    frames = max((len(path) for path in paths.values()), default=0)
-    motion = actor_motion(tracks_of(paths, sizes or {}, unknown), frames, config)
+    motion = actor_motion(
+        tracks_of(paths, sizes or {}, unknown), max((len(path) for path in paths.values()), default=0), config
+    )
     measured = measured_pairs(motion, config)
     return motion, measured, pair_summaries(motion, measured, config)
 
@@ -30,8 +33,7 @@ def pairs_in(paths, **options) -> list[tuple[int, int]]:
 
 
 def test_one_that_drives_up_to_another() -> None:
-    paths = {7: straight(11, 0, 0, 10), 3: straight(11, 30, 0, 0)}
-    motion, measured, found = of_scene(paths)
+    motion, measured, found = of_scene({7: straight(11, 0, 0, 10), 3: straight(11, 30, 0, 0)})
     assert motion.ids.tolist() == [3, 7]
     gaps = 26 - np.arange(11.0)
     np.testing.assert_allclose(measured.values["gap"][0], gaps)
@@ -39,12 +41,10 @@ def test_one_that_drives_up_to_another() -> None:
         np.testing.assert_allclose(measured.values[name][0], gaps / 10, err_msg=name)
     np.testing.assert_allclose(measured.values["drac"][0], 100 / (2 * gaps))
     np.testing.assert_allclose(measured.values["closing_speed"][0], 10)
-    assert found["num_frames"].tolist() == [11]
-    assert found["moving"].tolist() == [False]
+    assert (found["num_frames"].tolist(), found["moving"].tolist()) == ([11], [False])
     assert (found["min_ttc"].item(), found["min_gap"].item()) == (pytest.approx(1.6), pytest.approx(16))
     assert found["min_ttc_frame"].item() == found["min_gap_frame"].item() == 10
-    assert found["max_drac"].item() == pytest.approx(100 / 32)
-    assert found["tet"].tolist() == [[0, pytest.approx(1.1)]]
+    assert (found["max_drac"].item(), found["tet"].tolist()) == (pytest.approx(100 / 32), [[0, pytest.approx(1.1)]])
     assert found["tit"].item(1) == pytest.approx(0.1 * sum(3 - gap / 10 for gap in gaps))
 
 
@@ -60,8 +60,10 @@ def test_one_that_drives_up_to_another() -> None:
     ],
 )
 def test_thresholds_decide_and_so_does_the_radius(config: InteractionConfig, expected: list[tuple[int, int]]) -> None:
-    paths = {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0), 3: straight(5, 0, 5.5, 10)}
-    assert pairs_in(paths, config=config) == expected
+    assert (
+        pairs_in({1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0), 3: straight(5, 0, 5.5, 10)}, config=config)
+        == expected
+    )
 
 
 def test_one_dimension_is_that_of_the_one_who_drives_up() -> None:
@@ -81,28 +83,22 @@ def test_side_by_side_there_is_a_gap_and_no_time() -> None:
 
 def test_two_that_stand_are_none_and_frames_at_which_both_stand_do_not_count() -> None:
     assert pairs_in({1: straight(4, 0, 0, 0), 2: straight(4, 3, 0, 0.4)}) == []  # one in the other
-    stops = [*straight(4, 0, 0, 10), *[(3.0, 0.0, 0.0)] * 4]
-    _, measured, found = of_scene({1: stops, 2: straight(8, 9, 0, 0)})
-    assert measured.counts[0].tolist() == [True] * 4 + [False] * 4
-    assert found["num_frames"].tolist() == [4]
+    _, measured, found = of_scene({1: [*straight(4, 0, 0, 10), *[(3.0, 0.0, 0.0)] * 4], 2: straight(8, 9, 0, 0)})
+    assert (measured.counts[0].tolist(), found["num_frames"].tolist()) == ([True] * 4 + [False] * 4, [4])
 
 
 def test_what_rides_on_another_is_no_pair_and_one_that_is_hit_is() -> None:
     sizes = {2: BIKE, 3: PEDESTRIAN}
     ride = {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 6)}
     assert pairs_in(ride, sizes=sizes) == []
-    jumps_off = {**ride, 3: [*straight(3, 0.2, 0, 6), *straight(3, 1.9, 3, 0)]}
-    assert pairs_in(jumps_off, sizes=sizes) == [(2, 3)]
-    hit = {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 0)}
-    assert pairs_in(hit, sizes=sizes) == [(2, 3)]
+    assert pairs_in({**ride, 3: [*straight(3, 0.2, 0, 6), *straight(3, 1.9, 3, 0)]}, sizes=sizes) == [(2, 3)]
+    assert pairs_in({2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 0)}, sizes=sizes) == [(2, 3)]
 
 
 def test_who_is_not_there_and_nobody_at_all() -> None:
-    seen_once = {1: straight(6, 0, 0, 10), 2: [None, None, (15.0, 0.0, 0.0), None, None, None]}
-    motion, measured, found = of_scene(seen_once)
+    motion, measured, found = of_scene({1: straight(6, 0, 0, 10), 2: [None, None, (15.0, 0.0, 0.0), None, None, None]})
     assert measured.counts.sum() == found["num_frames"].item() == 1
-    assert found["min_ttc"].item() == pytest.approx(0.9)
-    assert found["min_ttc_frame"].item() == 2
+    assert (found["min_ttc"].item(), found["min_ttc_frame"].item()) == (pytest.approx(0.9), 2)
     assert motion.acceleration[1].tolist() == [0] * 6
     for paths in ({}, {5: straight(3, 0, 0, 5)}, {1: [None, (0, 0, 0)], 2: [(0, 0, 0), None]}):
         _, measured, found = of_scene(paths)
@@ -110,12 +106,10 @@ def test_who_is_not_there_and_nobody_at_all() -> None:
 
 
 def test_an_unknown_velocity_is_the_displacement_or_makes_no_numbers() -> None:
-    paths = {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0)}
-    motion, measured, _ = of_scene(paths, unknown=(1,))
+    motion, measured, _ = of_scene({1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0)}, unknown=(1,))
     np.testing.assert_allclose(motion.velocity[0], np.tile([10, 0], (5, 1)))
     np.testing.assert_allclose(measured.values["ttc"][0], (26 - np.arange(5)) / 10)
-    once = {1: [(6.0, 0.0, 0.0), *[None] * 4], 2: straight(5, 0, 0, 5)}
-    _, measured, found = of_scene(once, unknown=(1,))
+    _, measured, found = of_scene({1: [(6.0, 0.0, 0.0), *[None] * 4], 2: straight(5, 0, 0, 5)}, unknown=(1,))
     for name in ("ttc", "ttc_1d", "drac", "mttc", "closing_speed", "delta_v"):
         assert np.isnan(measured.values[name][0, 0]).all(), name
     assert measured.values["gap"][0, 0] == pytest.approx(2)
@@ -171,12 +165,15 @@ def test_a_config_is_checked_and_travels() -> None:
     assert InteractionConfig(max_ttc=10) == DEFAULT
     with pytest.raises(TypeError, match="does not support item assignment"):
         config.class_masses["car"] = 1.0  # type: ignore[index]
-    for wrong, told in (
-        ({"radius": -1}, "radius: expected a number from 0, found -1"),
-        ({"max_ttc": math.nan}, "max_ttc: expected a number from 0, found nan"),
-        ({"max_gap": "far"}, "max_gap: expected a number, found 'far'"),
-        ({"taus": (1.5,)}, "taus: expected two thresholds in seconds, found 1"),
-        ({"horizon": 2}, "horizon: expected at least max_ttc, 10.0 s, found 2.0 s"),
-    ):
-        with pytest.raises(ConfigError, match=told):
-            InteractionConfig(**wrong)
+    assert_refused(
+        *[
+            (partial(InteractionConfig, **wrong), ConfigError, told)
+            for wrong, told in (
+                ({"radius": -1}, "radius: expected a number from 0, found -1"),
+                ({"max_ttc": math.nan}, "max_ttc: expected a number from 0, found nan"),
+                ({"max_gap": "far"}, "max_gap: expected a number, found 'far'"),
+                ({"taus": (1.5,)}, "taus: expected two thresholds in seconds, found 1"),
+                ({"horizon": 2}, "horizon: expected at least max_ttc, 10.0 s, found 2.0 s"),
+            )
+        ],
+    )

@@ -40,8 +40,7 @@ def test_who_stands_is_always_there() -> None:
 
 
 def test_one_behind_the_other_follows_at_its_headway() -> None:
-    behind = np.array([-40.0, 0.0, 4.0, 2.0, 0.0])
-    assert post_encroachment_time(EAST, behind, TEN_EAST, TEN_EAST) == pytest.approx(1.6)
+    assert post_encroachment_time(EAST, np.array([-40.0, 0.0, 4.0, 2.0, 0.0]), TEN_EAST, TEN_EAST) == pytest.approx(1.6)
 
 
 places = st.floats(-25, 25)
@@ -59,13 +58,11 @@ def test_as_a_grid_of_times_has_it(first, second, one, other) -> None:
     found = post_encroachment_time(first, second, one, other, WINDOW)
     times = np.linspace(0, WINDOW, 121)
     gaps = gaps_of_pairs(moved(first, one, times)[:, None], moved(second, other, times)[None])
-    delays = np.abs(times[None, :] - times[:, None])
-    touching = gaps <= 0
+    delays, touching = np.abs(times[None, :] - times[:, None]), gaps <= 0
     if touching.any():
         assert abs(found) <= delays[touching].min() + 1e-9
     slack = gaps <= 0.05 * (np.hypot(*one) + np.hypot(*other)) + 1e-9  # what may touch between the grid's times
-    expected = delays[slack].min() - 0.1 if slack.any() else np.inf
-    assert abs(found) >= expected - 1e-9
+    assert abs(found) >= (delays[slack].min() - 0.1 if slack.any() else np.inf) - 1e-9
 
 
 @given(boxes, boxes, velocities, velocities)

@@ -56,8 +56,7 @@ def test_one_dimension_sees_no_crossing_and_nobody_beside() -> None:
 
 def test_at_contact_there_is_no_time_and_no_brake_is_enough() -> None:
     touching = np.array([3.0, 0.5, 4.0, 2.0, 0.2])
-    assert time_to_collision_1d(CAR, touching, TEN, STILL) == 0
-    assert time_to_collision_1d(CAR, touching, STILL, TEN) == 0
+    assert (time_to_collision_1d(CAR, touching, TEN, STILL), time_to_collision_1d(CAR, touching, STILL, TEN)) == (0, 0)
     assert drac_1d(CAR, touching, TEN, STILL) == drac(CAR, touching, STILL, STILL) == math.inf
     assert modified_ttc_1d(CAR, touching, TEN, STILL, np.float64(0), np.float64(0)) == 0
     assert math.isnan(closing_speed_of_boxes(CAR, touching, TEN, STILL))

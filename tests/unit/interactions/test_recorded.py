@@ -22,10 +22,8 @@ def pet(first, second) -> float:
 
 def test_one_crosses_after_the_other() -> None:
     east, north = straight(60, -20, 0, 10), straight(60, 0, -40, 10, 90)
-    assert pet(east, north) == pytest.approx(1.4)
-    assert pet(north, east) == pytest.approx(-1.4)
-    assert pet(east[:30], north[:35]) == math.inf
-    assert pet(east, straight(60, 0, -20, 10, 90)) == 0
+    assert (pet(east, north), pet(north, east)) == (pytest.approx(1.4), pytest.approx(-1.4))
+    assert (pet(east[:30], north[:35]), pet(east, straight(60, 0, -20, 10, 90))) == (math.inf, 0)
 
 
 def test_who_waits_is_there_until_it_goes() -> None:
@@ -48,17 +46,16 @@ def test_a_stop_on_the_way_is_a_piece_of_its_own() -> None:
 
 def test_gaps_are_bridged_and_one_frame_is_enough() -> None:
     east, north = straight(60, -20, 0, 10), straight(60, 0, -40, 10, 90)
-    holes = [place if frame % 5 == 0 else None for frame, place in enumerate(east)]
-    assert pet(holes, north) == pytest.approx(1.4)
+    assert pet([place if frame % 5 == 0 else None for frame, place in enumerate(east)], north) == pytest.approx(1.4)
     once = [None] * 20 + [(0.0, 0.0, 0.0)] + [None] * 39
-    assert pet(once, north) == pytest.approx(3.7 - 2.0)
-    assert pet(once, once) == 0
+    assert (pet(once, north), pet(once, once)) == (pytest.approx(3.7 - 2.0), 0)
     assert pet(once, straight(60, 0, 9, 10)) == math.inf
 
 
 def test_yaw_turns_the_shorter_way() -> None:
-    turns = [(0.0, 0.0, math.pi - 0.01), (0.0, 0.0, -math.pi + 0.01)]
-    assert pieces_of(track(turns)).boxes[0, 4] == pytest.approx(math.pi)
+    assert pieces_of(track([(0.0, 0.0, math.pi - 0.01), (0.0, 0.0, -math.pi + 0.01)])).boxes[0, 4] == pytest.approx(
+        math.pi
+    )
 
 
 speeds, places = st.floats(0, 12), st.floats(-12, 12)

@@ -25,8 +25,7 @@ def own(own_release: Path) -> DeepAccident:
 
 
 def assert_same(one: Interactions, other: Interactions) -> None:
-    assert repr(one) == repr(other)
-    assert one.config == other.config
+    assert (repr(one), one.config) == (repr(other), other.config)
     for found, expected in ((one, other), (one.pairs, other.pairs)):
         for name in type(found).__slots__:
             value = getattr(expected, name)
@@ -40,13 +39,13 @@ def assert_same(one: Interactions, other: Interactions) -> None:
 def computed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The scenarios that are computed while a test runs."""
     tokens: list[str] = []
-    compute = scenario._computed
+    compute = scenario.computed_interactions
 
     def noted(dataset: DeepAccident, token: str, config: InteractionConfig) -> Interactions:
         tokens.append(token)
         return compute(dataset, token, config)
 
-    monkeypatch.setattr(scenario, "_computed", noted)
+    monkeypatch.setattr(scenario, "computed_interactions", noted)
     return tokens
 
 
@@ -71,8 +70,7 @@ def test_a_file_that_is_no_good_is_made_again(
     path = scenario.kept_path(own, token)
     if fault == "older":
         monkeypatch.setattr(scenario, "VERSION", "0")
-    first = own.interactions(token)
-    content = path.read_bytes()
+    first, content = own.interactions(token), path.read_bytes()
     match fault:
         case "cut":
             path.write_bytes(content[:-20])
@@ -104,8 +102,7 @@ def test_where_nothing_can_be_written_it_is_computed_each_time(own: DeepAccident
 def test_it_goes_with_the_tables_and_with_the_index(own_release: Path, own: DeepAccident) -> None:
     token = own.scenario[0]["token"]
     own.interactions(token)
-    kept = scenario.kept_path(own, token)
-    meta = next(own_release.glob("*/*/meta/*.txt"))
+    kept, meta = scenario.kept_path(own, token), next(own_release.glob("*/*/meta/*.txt"))
     meta.write_text(meta.read_text().replace("four-way", "three-way"))
     again = DeepAccident("v1", own_release, verbose=False)
     assert again.tables_folder != own.tables_folder
@@ -122,11 +119,12 @@ def test_many_at_once_are_as_one_by_one(own: DeepAccident, computed: list[str]) 
         (lambda: next(iter(interactions_of(own, workers=0))), ChoiceError, "workers: expected a number of at least 1"),
         (lambda: interactions_of(own, ["x/y"]), TokenError, "has no token 'x/y'"),
     )
-    found = list(interactions_of(own))
-    assert [each.scenario for each in found] == tokens == computed
+    assert [each.scenario for each in list(interactions_of(own))] == tokens == computed
     shutil.rmtree(own.tables_folder / scenario.FOLDER)
-    narrow = list(interactions_of(own, tokens[:2], InteractionConfig(max_ttc=1)))
-    assert [each.config.max_ttc for each in narrow] == [1, 1]
+    assert [each.config.max_ttc for each in list(interactions_of(own, tokens[:2], InteractionConfig(max_ttc=1)))] == [
+        1,
+        1,
+    ]
     assert not (own.tables_folder / scenario.FOLDER).exists()
 
 
@@ -136,26 +134,22 @@ def test_processes_may_make_the_same_files_at_once(own: DeepAccident) -> None:
     found = list(interactions_of(own, tokens, workers=2))
     for token, each in zip(tokens, found, strict=True):
         assert_same(each, own.interactions(token))
-    kept = [path.name for path in (own.tables_folder / scenario.FOLDER).rglob("*") if path.is_file()]
-    assert len(kept) == 2
+    assert len([path.name for path in (own.tables_folder / scenario.FOLDER).rglob("*") if path.is_file()]) == 2
 
 
 def test_tables_are_as_their_schema_says(da_motion: DeepAccident) -> None:
-    accident = da_motion.find(collision=True)[0]
-    found = da_motion.interactions(accident)
+    found = da_motion.interactions(da_motion.find(collision=True)[0])
     for name, table in (("interaction", found.to_arrow()), ("interaction_pair", found.pairs.to_arrow())):
         schema = json.loads((SCHEMA / f"{name}.json").read_text(encoding="utf-8"))
         jsonschema.Draft202012Validator.check_schema(schema)
-        validator = jsonschema.Draft202012Validator(schema)
-        records = table.to_pylist()
+        validator, records = jsonschema.Draft202012Validator(schema), table.to_pylist()
         assert len(records) > 5
         for record in records[:: max(1, len(records) // 20)]:
             validator.validate(record)
             assert (
                 list(record) == list(schema["properties"]) == [each.field for each in interaction_specs()[name].columns]
             )
-    tokens = found.to_arrow()["frame_token"].to_pylist()
-    frames = [da_motion.get("frame", token)["index"] for token in tokens]
+    frames = [da_motion.get("frame", token)["index"] for token in found.to_arrow()["frame_token"].to_pylist()]
     assert frames == found.frame.tolist()
     ids = [da_motion.get("instance", token)["actor_id"] for token in found.pairs.to_arrow()["first_token"].to_pylist()]
     assert ids == found.pairs.actor_ids[:, 0].tolist()
@@ -168,8 +162,7 @@ def test_the_colliding_pair_is_the_most_critical(da_motion: DeepAccident) -> Non
     first, second = accident["collision"]["ids"]
     row = found.pairs.position(second, first)
     assert row is not None
-    assert found.pairs.position(first, first) is None
-    assert row == found.pairs.min_ttc.argmin()
+    assert (found.pairs.position(first, first), row) == (None, found.pairs.min_ttc.argmin())
     assert found.pairs.min_ttc_frame[row] == accident["num_frames"]
     rows = found.of_pair(first, second)
     assert found.ttc[rows].min() == found.pairs.min_ttc[row]

@@ -27,8 +27,9 @@ def made(**changes) -> MotionLabels:
         )
         for t in range(config.future_frames)
     ]
-    motion = np.random.default_rng(0).normal(0, 0.02, (config.frames, 6))
-    return motion_labels_from_boxes([*frames, None], motion, config)
+    return motion_labels_from_boxes(
+        [*frames, None], np.random.default_rng(0).normal(0, 0.02, (config.frames, 6)), config
+    )
 
 
 @pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])

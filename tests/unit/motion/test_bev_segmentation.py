@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -37,8 +38,7 @@ def test_what_lies_ahead_on_the_left_is_there_in_every_orientation(orientation: 
     mask = targets.mask("vehicle")
     assert mask[tuple(cell)]
     assert 1 <= mask.sum() <= 9
-    centers = grid.centers()[mask]
-    np.testing.assert_allclose(centers.mean(axis=0), [20.25, 10.25], atol=0.3)
+    np.testing.assert_allclose(grid.centers()[mask].mean(axis=0), [20.25, 10.25], atol=0.3)
 
 
 def test_wide_classes_need_half_a_cell_and_thin_ones_a_pixel() -> None:
@@ -51,13 +51,11 @@ def test_wide_classes_need_half_a_cell_and_thin_ones_a_pixel() -> None:
     assert not targets.mask("road")[tuple(cell)]
     assert targets.mask("lane_line")[tuple(cell)]
     assert targets.mask("lane_line").sum() == 1
-    more = segmentation_of(_image(columns, (ROAD, slice(595, 598), slice(597, 598))), grid)
-    assert more.mask("road")[tuple(cell)]
+    assert segmentation_of(_image(columns, (ROAD, slice(595, 598), slice(597, 598))), grid).mask("road")[tuple(cell)]
 
 
 def test_cells_beyond_the_camera_are_unknown_and_empty() -> None:
-    everywhere = _image((ROAD, slice(None), slice(None)))
-    targets = segmentation_of(everywhere, BevGrid((-80, 80, 0.5), (-70, 70, 0.5)))
+    targets = segmentation_of(_image((ROAD, slice(None), slice(None))), BevGrid((-80, 80, 0.5), (-70, 70, 0.5)))
     assert targets.known.sum() == 240 * 240
     np.testing.assert_array_equal(targets.mask("road"), targets.known)
 
@@ -69,19 +67,15 @@ def test_cells_finer_than_pixels_take_the_nearest() -> None:
 
 def test_an_augmentation_moves_the_ground_as_it_moves_points() -> None:
     augmentation = Augmentation(rotation=math.radians(90), scale=1.1, flip=True)
-    place = np.array([20.25, 10.25, 0.0, 1.0])
-    moved = augmentation.matrix @ place
+    moved = augmentation.matrix @ np.array([20.25, 10.25, 0.0, 1.0])
     targets = segmentation_of(_image((VEHICLE, *_pixel(20.25, 10.25))), BevGrid(), augmentation=augmentation)
-    centers = BevGrid().centers()[targets.mask("vehicle")]
-    np.testing.assert_allclose(centers.mean(axis=0), moved[:2], atol=0.3)
+    np.testing.assert_allclose(BevGrid().centers()[targets.mask("vehicle")].mean(axis=0), moved[:2], atol=0.3)
 
 
 def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
     sample = da.sample[3]
-    targets = bev_segmentation(da, sample)
-    boxes = da.boxes(sample, "ego")
-    large = boxes.select(np.flatnonzero(boxes.category < 3))
-    index, inside = targets.grid.index_of(large.center)
+    targets, boxes = bev_segmentation(da, sample), da.boxes(sample, "ego")
+    index, inside = targets.grid.index_of(boxes.select(np.flatnonzero(boxes.category < 3)).center)
     painted = targets.mask("vehicle")[index[inside, 0], index[inside, 1]]
     assert len(painted) >= 3
     assert painted.mean() > 0.6  # the rest are hidden under others or parked beyond the drawn ground
@@ -89,8 +83,9 @@ def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
 
 
 def test_unknown_classes_are_refused() -> None:
-    with pytest.raises(ChoiceError, match="expected one of"):
-        segmentation_of(_image(), BevGrid()).mask("tram")
+    assert_refused(
+        (lambda: segmentation_of(_image(), BevGrid()).mask("tram"), ChoiceError, "expected one of"),
+    )
 
 
 def test_results_are_read_only() -> None:
@@ -113,8 +108,7 @@ def test_oblong_cells_count_their_own_pixels() -> None:
     """Cells of 5 × 4 pixels, each looked at by itself; where half of a cell is enough, 10 of 20 are."""
     tags = {"road": 7, "lane_line": 6, "sidewalk": 8, "vehicle": 10, "pedestrian": 4}
     assert (dict(COVERAGE), BEV_CLASSES) == ({name: 0.5 * (name[0] in "rsv") for name in tags}, tuple(tags))
-    generator = np.random.default_rng(3)
-    image = _image()
+    generator, image = np.random.default_rng(3), _image()
     semantic = generator.choice([0, *tags.values()], BEV_SHAPE, p=[0.02, 0.48, 0.04, 0.42, 0.02, 0.02]).astype(np.uint8)
     targets = segmentation_of(BevImage(semantic, image.instance), BevGrid((-3, 3, 0.5), (-2, 2, 0.4)))
     halves = 0
@@ -126,6 +120,7 @@ def test_oblong_cells_count_their_own_pixels() -> None:
         cell = semantic[first_row : first_row + 5, first_column : first_column + 4]
         counts = {name: np.count_nonzero(cell == tag) for name, tag in tags.items()}
         halves += counts["road"] == 10
-        expected = [counts[name] >= (10 if COVERAGE[name] else 1) for name in BEV_CLASSES]
-        assert targets.masks[:, row, column].tolist() == expected
+        assert targets.masks[:, row, column].tolist() == [
+            counts[name] >= (10 if COVERAGE[name] else 1) for name in BEV_CLASSES
+        ]
     assert halves > 3

@@ -1,6 +1,7 @@
 import json
 import pickle
 from dataclasses import astuple, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,8 +17,7 @@ from deepaccident_devkit.v2x import AgentConfig
 def test_the_default_is_the_released_labels_in_the_devkits_orientation() -> None:
     config = MotionLabelConfig()
     assert (config.label_frames, config.frames, config.grid.orientation) == (5, 7, "devkit")
-    assert list(config.offsets) == [-10, -5, 0, 5, 10, 15, 20]
-    assert config.rules == LABEL_PROTOCOLS["released"]
+    assert (list(config.offsets), config.rules) == ([-10, -5, 0, 5, 10, 15, 20], LABEL_PROTOCOLS["released"])
     assert config == MotionLabelConfig.preset("deepaccident")
 
 
@@ -34,10 +34,8 @@ def test_the_orientation_is_the_grids_and_a_new_grid_brings_its_own() -> None:
     fiery, released = BevGrid(orientation="fiery"), BevGrid(orientation="released")
     assert MotionLabelConfig(grid=fiery).grid is fiery
     config = MotionLabelConfig(grid=fiery, orientation="released")
-    assert (config.grid, config.orientation) == (released, None)
-    assert replace(config, grid=fiery).grid == fiery
-    assert replace(config, grid=BevGrid()).grid == BevGrid()
-    assert replace(config, orientation="fiery").grid == fiery
+    assert (config.grid, config.orientation, replace(config, grid=fiery).grid) == (released, None, fiery)
+    assert (replace(config, grid=BevGrid()).grid, replace(config, orientation="fiery").grid) == (BevGrid(), fiery)
     assert replace(config, future_frames=2).grid == released
 
 
@@ -78,8 +76,9 @@ def test_a_presets_orientation_is_kept_unless_the_grid_or_the_caller_says_otherw
     ],
 )
 def test_what_cannot_be_is_refused_with_the_remedy(changes, sentence) -> None:
-    with pytest.raises(ConfigError, match=sentence):
-        MotionLabelConfig(**changes)
+    assert_refused(
+        (lambda: MotionLabelConfig(**changes), ConfigError, sentence),
+    )
 
 
 def test_unknown_words_are_refused() -> None:
@@ -104,11 +103,10 @@ def test_unknown_words_are_refused() -> None:
             ChoiceError,
             r"drawn_when: expected one of present, .*, found 'later'",
         ),
-    )
-    for protocol in (3, ["clean"], None):
-        with pytest.raises(ChoiceError, match="protocol: expected one of released"):
-            MotionLabelConfig(protocol=protocol)
-    assert_refused(
+        *[
+            (partial(MotionLabelConfig, protocol=protocol), ChoiceError, "protocol: expected one of released")
+            for protocol in (3, ["clean"], None)
+        ],
         (
             lambda: replace(LABEL_PROTOCOLS["clean"], half_cell_shift=1),
             ConfigError,
@@ -119,12 +117,12 @@ def test_unknown_words_are_refused() -> None:
             ConfigError,
             "warp 'fiery' needs native 'fiery', found 'released'",
         ),
+        *[
+            (partial(MotionLabelConfig, agents=agents), ChoiceError, "agents: expected")
+            for agents in ("nobody", ["pole"], [], 5, "ego_vehicle")
+        ],
+        (lambda: MotionLabelConfig(grid=BevGrid((-50, 50, 0.3))), ConfigError, "is not a whole number of cells"),
     )
-    for agents in ("nobody", ["pole"], [], 5, "ego_vehicle"):
-        with pytest.raises(ChoiceError, match="agents: expected"):
-            MotionLabelConfig(agents=agents)
-    with pytest.raises(ConfigError, match="is not a whole number of cells"):
-        MotionLabelConfig(grid=BevGrid((-50, 50, 0.3)))
 
 
 def test_a_digest_tells_configurations_apart_by_what_they_draw() -> None:
@@ -159,9 +157,7 @@ def test_a_digest_tells_configurations_apart_by_what_they_draw() -> None:
 )
 def test_the_same_said_otherwise_is_equal_and_has_the_same_digest(mine, theirs) -> None:
     one, other = MotionLabelConfig(**mine), MotionLabelConfig(**theirs)
-    assert one == other
-    assert hash(one) == hash(other)
-    assert one.digest == other.digest
+    assert (one, hash(one), one.digest) == (other, hash(other), other.digest)
     assert MotionLabelConfig.from_dict(json.loads(json.dumps(one.as_dict()))) == one
 
 
@@ -179,18 +175,19 @@ def test_presets_and_protocols_cannot_be_changed() -> None:
 
 
 def test_a_configuration_may_be_named() -> None:
-    assert label_config("fiery") == PRESETS["fiery"]
-    assert label_config(None) == MotionLabelConfig()
+    assert (label_config("fiery"), label_config(None)) == (PRESETS["fiery"], MotionLabelConfig())
     assert label_config(PRESETS["beverse"]) is PRESETS["beverse"]
-    with pytest.raises(ConfigError, match="config: expected a MotionLabelConfig or the name of a preset, found 3"):
-        label_config(3)
+    assert_refused(
+        (lambda: label_config(3), ConfigError, "config: expected a MotionLabelConfig or the name of a preset, found 3"),
+    )
 
 
 def test_on_grids_of_more_than_255_cells_the_mark_is_255() -> None:
     grid = BevGrid((-100, 100, 0.5))
     assert MotionLabelConfig(grid=grid).ignore_index == 255
-    with pytest.raises(ConfigError, match="choose 255 to 255"):
-        MotionLabelConfig(grid=grid, ignore_index=254)
+    assert_refused(
+        (lambda: MotionLabelConfig(grid=grid, ignore_index=254), ConfigError, "choose 255 to 255"),
+    )
 
 
 def test_an_augmentation_turns_then_scales_then_mirrors() -> None:
@@ -284,11 +281,13 @@ def test_every_protocol_written_out() -> None:
 def test_no_augmentation_changes_nothing() -> None:
     assert astuple(Augmentation()) == (0.0, 1.0, False)
     np.testing.assert_array_equal(Augmentation().matrix, np.eye(4))
-    with pytest.raises(ConfigError, match="scale: expected a factor above 0, 1 for none, found -1"):
-        Augmentation(scale=-1)
+    assert_refused(
+        (lambda: Augmentation(scale=-1), ConfigError, "scale: expected a factor above 0, 1 for none, found -1"),
+    )
 
 
 @pytest.mark.parametrize("described", [{}, [], None, {**MotionLabelConfig().as_dict(), "colour": "red"}])
 def test_what_describes_no_configuration_is_refused(described: object) -> None:
-    with pytest.raises(ConfigError, match=r"label configuration: cannot be read \(.+\)"):
-        MotionLabelConfig.from_dict(described)
+    assert_refused(
+        (lambda: MotionLabelConfig.from_dict(described), ConfigError, r"label configuration: cannot be read \(.+\)"),
+    )

@@ -17,16 +17,22 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 import tiny
-from processes import wait_for
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, LabelFilesError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    LabelFilesError,
+    NotAvailableError,
+    SomeFailedError,
+    TokenError,
+)
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -43,7 +49,16 @@ from deepaccident_devkit.motion import (
     write_label_files,
 )
 from deepaccident_devkit.motion.batch_names import BatchNames
-from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST, NOBODY, NOWHERE, StoredLabels, write_array
+from deepaccident_devkit.motion.label_folder import (
+    FORMAT_VERSION,
+    MANIFEST,
+    NOBODY,
+    NOWHERE,
+    Manifest,
+    StoredLabels,
+    label_store,
+    write_array,
+)
 from deepaccident_devkit.support.files import replacing, temporary_path
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -115,16 +130,37 @@ def tokens_of(release: DeepAccident, *frames: int, agents: tuple[str, ...] = AGE
     return [record["token"] for record in release.sample if record["token"].endswith(ends)]
 
 
-def write(release: DeepAccident, folder: Path, tokens: list[str], config: MotionLabelConfig | None = None, **more: int):
-    return write_label_files(release, folder, tokens, config, workers=more.get("workers", 1))
+def write(release: DeepAccident, folder: Path, tokens: list[str], config: MotionLabelConfig | None = None, **more: Any):
+    return write_label_files(release, folder, tokens, config, **{"workers": 1, **more})
+
+
+def restate(folder: Path, **changes: object) -> None:
+    """Other values in a folder's manifest."""
+    path = folder / MANIFEST
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def change_label(release: Path, agent: str, name: str = tiny.NAME, frame: int = 6) -> None:
+    """Take a label's last row away."""
+    label = release / tiny.TYPE / agent / "label" / name / f"{name}_{frame:03d}.txt"
+    label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
+    os.utime(label.parent)
+
+
+def lift(release: Path, agent: str, name: str = tiny.NAME, frame: int = 6) -> None:
+    """Put an agent's LiDAR at a height of 1.5 m in a frame."""
+    calib = release / tiny.TYPE / agent / "calib" / name / f"{name}_{frame:03d}.pkl"
+    calib.write_bytes(tiny.old_pickle(tiny.calib(tiny.ego_to_world(agent, frame), height=1.5)))
+    os.utime(calib.parent)
 
 
 class TestRoundTrip:
     @pytest.mark.slow
     def test_every_sample_reads_as_it_is_made(self, da_motion: DeepAccident, tmp_path: Path) -> None:
         tokens = [record["token"] for record in da_motion.sample]
-        done = write(da_motion, tmp_path / "a" / "new folder", tokens, workers=2)
-        assert done == LabelsWritten(samples=350, written=10, kept=0)
+        assert write(da_motion, tmp_path / "a" / "new folder", tokens, workers=2) == LabelsWritten(
+            samples=350, written=10, kept=0
+        )
         files = LabelFiles(tmp_path / "a" / "new folder", MotionLabelConfig())
         assert (list(files), len(files)) == (tokens, len(tokens))
         for token in tokens[::3]:
@@ -225,8 +261,7 @@ class TestPage:
         assert {key: (array.dtype, array.shape[1:]) for key, array in run["batch"].items()} == {
             key: (array.dtype, array.shape) for key, array in expected.items()
         }
-        axes = {5: "T", 7: "R", 200: "H"}
-        page = PAGE.read_text(encoding="utf-8")
+        axes, page = {5: "T", 7: "R", 200: "H"}, PAGE.read_text(encoding="utf-8")
         for key, array in expected.items():
             shape = str(tuple(axes.get(length, length) for length in array.shape)).replace("'", "")
             assert f"`{key}` {shape.replace('H, H', 'H, W')}" in page
@@ -286,35 +321,27 @@ class TestBatches:
             assert contents(tmp_path / f"{stop}") == contents(tmp_path / "fresh")
 
     def test_samples_can_be_added_and_damaged_files_are_made_again(self, small: DeepAccident, out: Path) -> None:
-        some, more = tokens_of(small, 2, agents=("ego_vehicle",)), tokens_of(small, 7, agents=("ego_vehicle",))
-        write_label_files(small, out, some, names="beverse", workers=1)
-        done = write_label_files(small, out, more, names="beverse", workers=1)
-        assert (done.written, done.kept) == (1, 1)
-        before = contents(out)
-        file = out / f"{some[0]}.npz"
+        some, more = (tokens_of(small, frame, agents=("ego_vehicle",)) for frame in (2, 7))
+        done = [write(small, out, tokens, names="beverse") for tokens in (some, more)]
+        assert [(each.written, each.kept) for each in done] == [(1, 0), (1, 1)]
+        before, file = contents(out), out / f"{some[0]}.npz"
         file.write_bytes(file.read_bytes()[:-40])
         temporary_path(file).touch()  # of a killed process
-        assert write_label_files(small, out, more, names="beverse", workers=1).written == 1
-        assert contents(out) == before
-
-    def test_what_the_release_changed_is_made_again(self, root: Path, out: Path) -> None:
-        tokens = tokens_of(opened(root), 1, 7, agents=("ego_vehicle",))
-        write_label_files(opened(root), out, tokens, names="fiery", workers=1)
-        label = root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_006.txt"
-        label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
-        os.utime(label.parent)
-        assert write_label_files(opened(root), out, tokens[:1], names="fiery", workers=1).written == 2
+        assert (write(small, out, more, names="beverse").written, contents(out)) == (1, before)
 
     def test_folders_of_other_names_are_refused_and_left(self, small: DeepAccident, tmp_path: Path) -> None:
         tokens = tokens_of(small, 3)
         for own, other in ((None, "fiery"), ("fiery", "beverse"), ("beverse", None)):
             folder = tmp_path / str(own)
-            write_label_files(small, folder, tokens, names=own, workers=1)
+            write(small, folder, tokens, names=own)
             before = contents(folder)
-            with pytest.raises(
-                ConfigError, match=f"configuration .names: {own!r}, asked for {other!r}.; choose another"
-            ):
-                write_label_files(small, folder, tokens, names=other, workers=1)
+            assert_refused(
+                (
+                    partial(write_label_files, small, folder, tokens, names=other, workers=1),
+                    ConfigError,
+                    f"configuration .names: {own!r}, asked for {other!r}.; choose another",
+                ),
+            )
             assert contents(folder) == before
         assert_refused(
             (
@@ -331,10 +358,8 @@ class TestBatches:
 
     def test_a_manifest_without_names_is_of_label_files(self, small: DeepAccident, out: Path) -> None:
         write(small, out, tokens_of(small, 3))
-        told = json.loads((out / MANIFEST).read_text())
-        assert told.pop("names") is None
-        (out / MANIFEST).write_text(json.dumps(told))
-        assert len(LabelFiles(out)) == 5
+        (out / MANIFEST).write_text((out / MANIFEST).read_text().replace(' "names": null,\n', ""))
+        assert (len(LabelFiles(out)), "names" in (out / MANIFEST).read_text()) == (5, False)
 
 
 class TestAdding:
@@ -344,38 +369,46 @@ class TestAdding:
         assert write(small, out, others) == LabelsWritten(samples=2, written=1, kept=0)
         before = contents(out)
         assert write(small, out, some[:1]) == LabelsWritten(samples=1, written=0, kept=1)
-        assert write(small, out, some) == LabelsWritten(samples=10, written=0, kept=5)
-        assert contents(out) == before
+        assert (write(small, out, some), contents(out)) == (LabelsWritten(samples=10, written=0, kept=5), before)
         files = LabelFiles(out)
         assert set(files) == {*some, *others}
         for token in files:
             assert_same(files[token], motion_labels(small, token))
 
-    def test_what_the_release_changed_is_made_again(self, root: Path, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("names", [None, "fiery"])
+    def test_what_the_release_changed_is_made_again(self, root: Path, out: Path, names: BatchNames | None) -> None:
+        """A label row of an agent that is not asked for, a LiDAR's pose; then nothing."""
         tokens = tokens_of(opened(root), 1, agents=("ego_vehicle", "infrastructure"))
-        write(opened(root), tmp_path / "labels", tokens)
-        label = root / tiny.TYPE / "other_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_006.txt"
-        label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
-        os.utime(label.parent)
-        changed = opened(root)
-        assert write(changed, tmp_path / "labels", tokens) == LabelsWritten(samples=2, written=2, kept=0)
-        assert write(changed, tmp_path / "labels", tokens) == LabelsWritten(samples=2, written=0, kept=2)
-        calib = root / tiny.TYPE / "ego_vehicle" / "calib" / tiny.NAME / f"{tiny.NAME}_006.pkl"
-        pose = tiny.calib(tiny.ego_to_world("ego_vehicle", 6), height=1.5)
-        calib.write_bytes(tiny.old_pickle(pose))
-        os.utime(calib.parent)
-        lifted = opened(root)
-        assert write(lifted, tmp_path / "labels", tokens).written == 2
-        calib.with_name(f"{tiny.NAME}_007.pkl").write_bytes(tiny.old_pickle(pose))
-        os.utime(calib.parent)
-        assert write(opened(root), tmp_path / "labels", tokens).written == 2
+        write(opened(root), out, tokens, names=names)
+        change_label(root, "other_vehicle")
+        assert write(opened(root), out, tokens, names=names) == LabelsWritten(samples=2, written=2, kept=0)
+        lift(root, "ego_vehicle")
+        assert [write(opened(root), out, tokens, names=names).written for _ in range(2)] == [2, 0]
+
+    def test_a_file_depends_on_the_rows_of_its_own_scenario_alone(self, tmp_path: Path, out: Path) -> None:
+        """Of two scenarios of one frame and of two, each change makes its own file again."""
+        names = [tiny.NAME, tiny.NAME.replace("24", "25")]
+        for name, frames in zip(names, (1, 2), strict=True):
+            tiny.write_tiny_release(tmp_path, frames=frames, name=name, agents=("infrastructure",))
+        tokens = [f"{tiny.TYPE}/{name}/infrastructure/001" for name in names]
+        write(opened(tmp_path), out, tokens)
+        for name, change in ((name, change) for name in names for change in (change_label, lift)):
+            before, _ = contents(out), change(tmp_path, "infrastructure", name, 1)
+            assert write(opened(tmp_path), out, tokens) == LabelsWritten(samples=2, written=1, kept=1)
+            changed = {path for path, content in contents(out).items() if content != before[path]}
+            assert changed == {f"{tiny.TYPE}/{name}/infrastructure.npz"}
 
     def test_frames_that_the_release_has_no_more(self, root: Path, tmp_path: Path) -> None:
         write(opened(root), tmp_path / "labels", tokens_of(opened(root), 1, 12))
         shorter = opened(tiny.write_tiny_release(tmp_path / "shorter", frames=6))
         before = contents(tmp_path / "labels")
-        with pytest.raises(LabelFilesError, match=r"ego_vehicle has frames that are not in .*shorter any more"):
-            write(shorter, tmp_path / "labels", tokens_of(shorter, 1))
+        assert_refused(
+            (
+                lambda: write(shorter, tmp_path / "labels", tokens_of(shorter, 1)),
+                LabelFilesError,
+                r"ego_vehicle has frames that are not in .*shorter any more",
+            ),
+        )
         assert contents(tmp_path / "labels") == before
 
 
@@ -392,11 +425,17 @@ class TestRefusing:
             "agents: None, asked for 'single'": MotionLabelConfig(agents="single"),
             "orientation: 'devkit', asked for 'released'": MotionLabelConfig(orientation="released"),
         }
-        for told, config in others.items():
-            with pytest.raises(ConfigError, match=f"another configuration .*{told}.*choose another folder"):
-                write(small, out, tokens, config)
-            with pytest.raises(ConfigError, match=told):
-                LabelFiles(out, config)
+        assert_refused(
+            *[
+                (
+                    partial(write, small, out, tokens, config),
+                    ConfigError,
+                    f"another configuration .*{told}.*choose another folder",
+                )
+                for told, config in others.items()
+            ],
+            *[(partial(LabelFiles, out, config), ConfigError, told) for told, config in others.items()],
+        )
         assert contents(out) == before
 
     def test_numbers_of_another_type_are_the_same_configuration(self, small: DeepAccident, out: Path) -> None:
@@ -411,26 +450,44 @@ class TestRefusing:
         (tmp_path / "photos" / "cat.jpg").write_text("mine")
         (tmp_path / "odd" / MANIFEST).mkdir(parents=True)
         (tmp_path / "empty").mkdir()
-        for folder, told in {
-            "": "found an empty path; give '.' for the current one",
-            tmp_path / "file": "file: is a file; give a folder",
-            tmp_path / "photos": "photos: is not empty and holds no motion labels; choose a new folder",
-            tmp_path / "odd": r"manifest.json: not a regular file \(a folder\)",
-            tmp_path / "file" / "below": "below: cannot be written .*; make room there, or choose another folder",
-            "/proc/nowhere": "nowhere: cannot be written .*; make room there, or choose another folder",
-        }.items():
-            with pytest.raises(LabelFilesError, match=told):
-                write_label_files(small, folder, tokens_of(small, 3))
+        assert_refused(
+            *[
+                (partial(write_label_files, small, folder, tokens_of(small, 3)), LabelFilesError, told)
+                for folder, told in {
+                    "": "found an empty path; give '.' for the current one",
+                    tmp_path / "file": "file: is a file; give a folder",
+                    tmp_path / "photos": "photos: is not empty and holds no motion labels; choose a new folder",
+                    tmp_path / "odd": r"manifest.json: not a regular file \(a folder\)",
+                    tmp_path
+                    / "file"
+                    / "below": "below: cannot be written .*; make room there, or choose another folder",
+                    "/proc/nowhere": "nowhere: cannot be written .*; make room there, or choose another folder",
+                }.items()
+            ],
+        )
         assert contents(tmp_path / "photos") == {"cat.jpg": b"mine"}
-        for folder in ("nowhere", "empty", "photos", "file"):
-            with pytest.raises(LabelFilesError, match=r"holds no motion labels .*make them with `deepaccident labels`"):
-                LabelFiles(tmp_path / folder)
+        assert_refused(
+            *[
+                (
+                    partial(LabelFiles, tmp_path / folder),
+                    LabelFilesError,
+                    r"holds no motion labels .*make them with `deepaccident labels`",
+                )
+                for folder in ("nowhere", "empty", "photos", "file")
+            ],
+        )
         assert write(small, tmp_path / "empty", tokens_of(small, 3)).written == 5
 
     def test_what_cannot_be_drawn_is_said_before_anything_is_written(self, root: Path, tmp_path: Path) -> None:
         small, out = opened(root), tmp_path / "labels"
         unlabelled = opened(tiny.write_tiny_release(tmp_path / "test", labelled=False))
+        two = opened(tiny.write_tiny_release(tmp_path / "two", agents=("ego_vehicle", "infrastructure")))
         assert_refused(
+            (
+                lambda: write(two, out, tokens_of(two, 3), MotionLabelConfig(agents="+other")),
+                NotAvailableError,
+                "other_vehicle is not in this release",
+            ),
             (
                 lambda: write(unlabelled, out, tokens_of(unlabelled, 3)),
                 NotAvailableError,
@@ -438,13 +495,11 @@ class TestRefusing:
             ),
             (lambda: write(small, out, [*tokens_of(small, 3), "nothing"]), TokenError, "no token 'nothing'"),
             (lambda: write(small, out, []), ChoiceError, "expected at least one sample, found none"),
+            *[
+                (partial(write_label_files, small, out, one), ChoiceError, "put it into a list")
+                for one in (tokens_of(small, 3)[0], small.sample[3])
+            ],
         )
-        for one in (tokens_of(small, 3)[0], small.sample[3]):
-            with pytest.raises(ChoiceError, match="put it into a list"):
-                write_label_files(small, out, one)
-        partial = opened(tiny.write_tiny_release(tmp_path / "partial", agents=("ego_vehicle", "infrastructure")))
-        with pytest.raises(NotAvailableError, match="other_vehicle is not in this release"):
-            write(partial, out, tokens_of(partial, 3), MotionLabelConfig(agents="+other"))
         assert not out.exists()
 
 
@@ -483,10 +538,11 @@ class TestReading:
         with pytest.raises(TypeError, match="does not support item assignment"):
             labels.id_map[3] = 4
 
-    def test_few_files_are_open_at_a_time(self, files: LabelFiles) -> None:
+    def test_eight_files_are_open_at_a_time(self, files: LabelFiles) -> None:
         for token in [*files, *files]:
             assert files[token].valid[2]
-        assert len(files._open) == label_files._OPEN_FILES < 10
+        opened = [str(each.resolve()) for each in Path("/proc/self/fd").iterdir()]
+        assert sum(each.startswith(str(files.folder)) for each in opened) == 8
 
     def test_it_outlives_a_change_of_folder(
         self, files: LabelFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -530,8 +586,7 @@ print([os.waitpid(child, 0)[1] for child in children])
     def test_numpy_alone_opens_a_file(self, files: LabelFiles) -> None:
         token = next(iter(files))
         with np.load(files.folder / f"{token.removesuffix('/004')}.npz", allow_pickle=False) as archive:
-            assert archive["004/instance"].dtype == np.uint8
-            assert archive["config"].item() == files.config.digest
+            assert (archive["004/instance"].dtype, archive["config"].item()) == (np.uint8, files.config.digest)
 
 
 class TestDamage:
@@ -584,8 +639,9 @@ class TestDamage:
         token = tokens_of(small, 3)[0]
         write(small, tmp_path / "clean", [token], MotionLabelConfig(protocol="clean"))
         shutil.copy(tmp_path / "clean" / path.relative_to(folder), path)
-        with pytest.raises(LabelFilesError, match="holds labels of another configuration; remove it"):
-            LabelFiles(folder)[token]
+        assert_refused(
+            (lambda: LabelFiles(folder)[token], LabelFilesError, "holds labels of another configuration; remove it"),
+        )
         assert write(small, folder, [token]).written == 1
         assert_same(LabelFiles(folder)[token], motion_labels(small, token))
 
@@ -603,8 +659,13 @@ class TestDamage:
                 archive.writestr(name, content)
             with archive.open(f"003/{member}.npy", "w") as file:
                 np.lib.format.write_array(file, array[:-1])
-        with pytest.raises(LabelFilesError, match=r"ego_vehicle\.npz: .*expected .*found"):
-            LabelFiles(folder)[tokens_of(small, 3)[0]]
+        assert_refused(
+            (
+                lambda: LabelFiles(folder)[tokens_of(small, 3)[0]],
+                LabelFilesError,
+                r"ego_vehicle\.npz: .*expected .*found",
+            ),
+        )
 
     @pytest.mark.slow
     @pytest.mark.parametrize(
@@ -614,11 +675,12 @@ class TestDamage:
     def test_a_manifest_that_is_none(self, small: DeepAccident, folder: Path, text: str) -> None:
         (folder / MANIFEST).write_text(text, encoding="latin-1")
         before = contents(folder)
-        for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3))):
-            with pytest.raises(
-                LabelFilesError, match=r"manifest\.json: cannot be read .*; make the labels again in an"
-            ):
-                use()
+        assert_refused(
+            *[
+                (use, LabelFilesError, r"manifest\.json: cannot be read .*; make the labels again in an")
+                for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3)))
+            ],
+        )
         assert contents(folder) == before
 
     @pytest.mark.slow
@@ -644,36 +706,33 @@ class TestDamage:
         ],
     )
     def test_a_manifest_with_a_wrong_value(self, folder: Path, change: dict[str, object]) -> None:
-        path = folder / MANIFEST
-        path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-        with pytest.raises(LabelFilesError, match=r"manifest\.json: cannot be read"):
-            LabelFiles(folder)
+        restate(folder, **change)
+        assert_refused((lambda: LabelFiles(folder), LabelFilesError, r"manifest\.json: cannot be read"))
 
     def test_a_manifest_that_is_a_pipe_or_a_giant(self, folder: Path) -> None:
         path = folder / MANIFEST
         content = path.read_bytes()
         path.unlink()
         os.mkfifo(path)
-        with pytest.raises(LabelFilesError, match=r"not a regular file \(a named pipe\)"):
-            LabelFiles(folder)
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, r"not a regular file \(a named pipe\)"),
+        )
         path.unlink()
         with path.open("wb") as file:
             file.truncate(3 << 30)
-        with pytest.raises(LabelFilesError, match="has 3,221,225,472 bytes"):
-            LabelFiles(folder)
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, "has 3,221,225,472 bytes"),
+        )
         told = json.loads(content)
         config = MotionLabelConfig(grid=BevGrid((-1000.0, 1000.0, 0.1), (-1000.0, 1000.0, 0.1)))
         path.write_text(json.dumps({**told, "config": config.as_dict(), "config_digest": config.digest}))
-        with pytest.raises(LabelFilesError, match="a sample takes 32,000,000,000 bytes"):
-            LabelFiles(folder)
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, "a sample takes 32,000,000,000 bytes"),
+        )
 
     def test_a_configuration_changed_by_hand(self, folder: Path) -> None:
-        path = folder / MANIFEST
-        told = json.loads(path.read_text())
-        told["config"]["draw_ego"] = False
-        path.write_text(json.dumps(told))
-        with pytest.raises(LabelFilesError, match="its digest is not that of its configuration"):
-            LabelFiles(folder)
+        restate(folder, config={**MotionLabelConfig().as_dict(), "draw_ego": False})
+        assert_refused((lambda: LabelFiles(folder), LabelFilesError, "its digest is not that of its configuration"))
 
     @pytest.mark.parametrize(("version", "kind"), [(FORMAT_VERSION + 1, "newer"), (0, "older")])
     def test_another_devkits_labels_are_refused_and_kept(
@@ -685,9 +744,12 @@ class TestDamage:
         sentence = (
             rf"{kind} devkit's labels \(format version {version}, this devkit's is {FORMAT_VERSION}\); .* or make"
         )
-        for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3))):
-            with pytest.raises(LabelFilesError, match=sentence):
-                use()
+        assert_refused(
+            *[
+                (use, LabelFilesError, sentence)
+                for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3)))
+            ],
+        )
         assert contents(folder) == before
 
 
@@ -756,37 +818,14 @@ class TestStops:
             for after in (False, True):
                 folder = tmp_path / "killed" / f"{step} {after}"
                 if (step, after) != (3, True):
-                    with pytest.raises(LabelFilesError, match=r"not complete; run|holds no motion labels"):
-                        LabelFiles(folder)
+                    assert_refused(
+                        (partial(LabelFiles, folder), LabelFilesError, r"not complete; run|holds no motion labels"),
+                    )
                 done = write(small, folder, tokens)
                 assert done.kept == max(0, min(2, step - (not after))), folder
                 kept += done.kept
                 assert contents(folder) == contents(tmp_path / "fresh")
         assert kept
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("workers", [1, 2])
-    def test_killed_at_any_moment(self, da_motion: DeepAccident, tmp_path: Path, workers: int) -> None:
-        verb = labels_verb(
-            da_motion.dataroot,
-            "--split",
-            "train",
-            "--out",
-            tmp_path / "labels",
-            "--workers",
-            workers,
-            "--samples",
-            "all",
-        )
-        write(da_motion, tmp_path / "fresh", da_motion.samples("train", "all"))
-        for files in (1, 3):
-            with subprocess.Popen(verb, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-                wait_for(lambda least=files: len(list((tmp_path / "labels").glob("*/*/*.npz"))) >= least)
-                process.kill()
-        done = write(da_motion, tmp_path / "labels", da_motion.samples("train", "all"))
-        assert done.samples == 70
-        assert done.kept > 0
-        assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
 
     @pytest.mark.slow
     def test_a_full_disk(self, root: Path, tmp_path: Path) -> None:
@@ -801,8 +840,13 @@ class TestStops:
 
     def test_a_folder_that_cannot_be_locked(self, small: DeepAccident, tmp_path: Path) -> None:
         (tmp_path / "labels" / ".unfinished" / ".lock").mkdir(parents=True)
-        with pytest.raises(LabelFilesError, match=r"cannot be written .*; make room there, or choose another folder"):
-            write(small, tmp_path / "labels", tokens_of(small, 3))
+        assert_refused(
+            (
+                lambda: write(small, tmp_path / "labels", tokens_of(small, 3)),
+                LabelFilesError,
+                r"cannot be written .*; make room there, or choose another folder",
+            ),
+        )
 
     def test_only_its_own_leftovers_are_removed(self, small: DeepAccident, out: Path) -> None:
         write(small, out, tokens_of(small, 3))
@@ -866,13 +910,85 @@ def test_members_are_for_all_to_read_and_have_no_date(tmp_path: Path) -> None:
     assert (entry.date_time, entry.compress_type) == ((1980, 1, 1, 0, 0, 0), zipfile.ZIP_DEFLATED)
 
 
-def test_a_file_depends_on_the_rows_of_its_own_scenario_alone(tmp_path: Path) -> None:
-    """Poses, LiDARs, agents and counts of its samples, and seven columns of its boxes."""
-    for number, frames in ((24, 1), (25, 2)):
-        tiny.write_tiny_release(
-            tmp_path, frames=frames, name=tiny.NAME.replace("24", str(number)), agents=("infrastructure",)
+def two_agents(release: DeepAccident, *frames: int) -> list[str]:
+    return tokens_of(release, *(frames or (2, 4)), agents=("ego_vehicle", "infrastructure"))
+
+
+@pytest.fixture(scope="module")
+def whole(da_b: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What one call writes for the frames 2 and 4 of six scenarios."""
+    folder = tmp_path_factory.mktemp("labels")
+    write(da_b, folder, two_agents(da_b))
+    return contents(folder)
+
+
+class TestSharing:
+    """Labels written on executors and by several processes: the very bytes of one call."""
+
+    def test_an_executor_writes_the_same_bytes(self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
+        with ThreadPoolExecutor(3) as executor:
+            done = write_label_files(da_b, out, two_agents(da_b), executor=executor)
+        assert (done, contents(out)) == (LabelsWritten(samples=24, written=12, kept=0), whole)
+
+    def test_several_calls_share_the_scenarios(self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
+        with ThreadPoolExecutor(3) as threads:
+            done = list(threads.map(lambda _: write(da_b, out, two_agents(da_b)), range(3)))
+        assert sum(each.written for each in done) == 12
+        assert ({(each.samples, each.written + each.kept) for each in done}, contents(out)) == ({(24, 12)}, whole)
+
+    def test_calls_for_other_samples_take_turns(self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
+        with ThreadPoolExecutor(2) as threads:
+            list(threads.map(lambda frame: write(da_b, out, two_agents(da_b, frame)), (4, 2)))
+        assert (len(LabelFiles(out)), contents(out)) == (24, whole)
+
+    def test_nothing_is_listed_before_all_is_there(
+        self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]
+    ) -> None:
+        """And what a killed process has begun is removed, unless others are at work."""
+        store = label_store(out, "")
+        with store.shared():
+            Manifest(MotionLabelConfig(), {}).write(out)
+            assert_refused(
+                (lambda: LabelFiles(out), LabelFilesError, "its labels are not complete"),
+            )
+        begun = temporary_path(out / "manifest.json")
+        begun.touch()
+        assert write(da_b, out, two_agents(da_b)).written == 12
+        assert not begun.exists()
+        assert contents(out) == whole
+
+    def test_files_that_were_cut_off_are_written_again(
+        self, da_b: DeepAccident, out: Path, whole: dict[str, bytes]
+    ) -> None:
+        write(da_b, out, two_agents(da_b))
+        path = next(out.rglob("*.npz"))
+        path.write_bytes(path.read_bytes()[:-1])
+        assert (write(da_b, out, two_agents(da_b)), contents(out)) == (
+            LabelsWritten(samples=24, written=1, kept=11),
+            whole,
         )
-    release = opened(tmp_path)
-    for scenario, frames in zip(release.scenario, (1, 2), strict=True):
-        lengths = [len(array) for array in label_files._scenario_arrays(release, scenario["token"])]
-        assert lengths == [frames] * 4 + [2 * frames] * 7
+
+    def test_what_fails_is_listed_and_the_rest_is_done(
+        self, da_b: DeepAccident, out: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        made, broken = label_files.motion_labels, two_agents(da_b, 4)[3]
+
+        def fail_once(dataset: DeepAccident, token: str, *more: object) -> MotionLabels:
+            if token == broken:
+                raise NotAvailableError("nothing to see")
+            return made(dataset, token, *more)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(label_files, "motion_labels", fail_once)
+            assert_refused(
+                (
+                    lambda: write(da_b, out, two_agents(da_b)),
+                    SomeFailedError,
+                    rf"1 of 12 failed:\n  {broken[:-4]}: nothing to see\n",
+                ),
+            )
+        assert (len(list(out.rglob("*.npz"))), write(da_b, out, two_agents(da_b))) == (
+            11,
+            LabelsWritten(samples=24, written=1, kept=11),
+        )
+        assert contents(out) == whole

@@ -1,15 +1,20 @@
-"""`da.motion_labels`: what the tables of a release give, from its first frame to its last, whole or in part."""
+"""`da.motion_labels` and `samples`: what the tables of a release give, from its first frame to its last, or in part."""
 
+import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import plain_fiery
 import pytest
 import tiny
 from numpy.testing import assert_array_equal
+from pyquaternion import Quaternion
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
     OWN_BOX_ID,
@@ -17,8 +22,12 @@ from deepaccident_devkit.motion import (
     FrameBoxes,
     MotionLabelConfig,
     MotionLabels,
+    evaluation_samples,
     motion_labels_from_boxes,
+    samples,
+    training_samples,
 )
+from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.motion.warping import egomotion
 from deepaccident_devkit.taxonomy import AGENTS, LIDAR
 from deepaccident_devkit.v2x.cooperation import visible_actors
@@ -104,8 +113,7 @@ def by_public_calls(release: DeepAccident, record: dict, config: MotionLabelConf
             )
         )
     there = [token is not None for token in tokens]
-    motion = egomotion(poses, there, config.rules)
-    is_vehicle = record["agent"] != "infrastructure"
+    motion, is_vehicle = egomotion(poses, there, config.rules), record["agent"] != "infrastructure"
     return motion_labels_from_boxes(frames, motion, config, valid=there[:-1], is_vehicle=is_vehicle)
 
 
@@ -129,8 +137,7 @@ class TestTime:
         after = [number + 5 * step <= 31 for step in range(-1, 6)]
         for protocol, mark in (("released", 0), ("clean", 255)):
             labels = small.motion_labels(f"{EGO}/{number:03d}", MotionLabelConfig(protocol=protocol))
-            assert labels.valid.tolist() == there
-            assert labels.future_egomotion.any(axis=1).tolist() == after
+            assert (labels.valid.tolist(), labels.future_egomotion.any(axis=1).tolist()) == (there, after)
             missing = ~labels.label_valid
             for name in ("segmentation", "instance", "centerness"):
                 assert (getattr(labels, name)[missing] == mark).all()
@@ -170,8 +177,7 @@ class TestWhoIsDrawn:
 
     def test_only_vehicle_leaves_out_pedestrians(self, small: DeepAccident) -> None:
         assert min(drawn(small.motion_labels(f"{EGO}/006"), WALKER)) > 0
-        labels = small.motion_labels(f"{EGO}/006", MotionLabelConfig(only_vehicle=True))
-        assert {*labels.id_map} == {OWN_BOX_ID, VAN}
+        assert {*small.motion_labels(f"{EGO}/006", MotionLabelConfig(only_vehicle=True)).id_map} == {OWN_BOX_ID, VAN}
 
     def test_who_appears_later(self, small: DeepAccident) -> None:
         """Present at 6: the car is seen from 11 on. Released: never drawn; clean: from then on."""
@@ -184,8 +190,11 @@ class TestWhoIsDrawn:
 
     def test_untracked_actors_are_seen_by_nobody(self, small: DeepAccident) -> None:
         for protocol in ("released", "clean"):
-            labels = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
-            assert not labels.segmentation[:, 70:130, 50:70].any()
+            assert (
+                not small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
+                .segmentation[:, 70:130, 50:70]
+                .any()
+            )
             everybody = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol, filter_invisible=False))
             left = [len(np.unique(frame[70:130, 50:70])) - 1 for frame in everybody.instance]
             assert left == [1 if protocol == "released" else 2] * 5
@@ -209,15 +218,15 @@ class TestWhoIsDrawn:
             "vehicles": False,
             ("ego_vehicle", "other_vehicle"): False,
         }.items():
-            labels = release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents))
-            assert (VAN in labels.id_map) == there, agents
+            assert (VAN in release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)).id_map) == there, (
+                agents
+            )
 
 
 class TestIds:
     def test_ids_go_on_from_the_sample_before(self, small: DeepAccident) -> None:
         """As a worker of the released code has them; what nobody met before comes behind."""
-        first = small.motion_labels(f"{EGO}/001")
-        assert {*first.id_map} == {OWN_BOX_ID, VAN, WALKER}
+        assert {*small.motion_labels(f"{EGO}/001").id_map} == {OWN_BOX_ID, VAN, WALKER}
         before = {VAN: 1, 4711: 2}
         second = small.motion_labels(f"{EGO}/016", id_map=before)
         assert dict(second.id_map) == {VAN: 1, 4711: 2, OWN_BOX_ID: 3, LATER: 4, WALKER: 5}
@@ -262,45 +271,59 @@ class TestAtPresent:
 def spread(labels: MotionLabels, t: int, actor: int) -> float:
     """How far apart, in cells, the places are that an actor's cells and their offsets lead to: half of the longer."""
     cells = np.argwhere(labels.instance[t] == labels.id_map[actor])
-    ends = cells + labels.offset[t][:, cells[:, 0], cells[:, 1]].T
-    return float(np.ptp(ends, axis=0).max()) / 2
+    return float(np.ptp(cells + labels.offset[t][:, cells[:, 0], cells[:, 1]].T, axis=0).max()) / 2
 
 
 class TestErrors:
     def test_a_sample_without_a_label(self, tmp_path: Path) -> None:
         release = opened(tiny.write_tiny_release(tmp_path, labelled=False))
-        with pytest.raises(NotAvailableError, match=r"ego_vehicle/002 has no label \(the test split has"):
-            release.motion_labels(f"{EGO}/002")
+        assert_refused(
+            (
+                lambda: release.motion_labels(f"{EGO}/002"),
+                NotAvailableError,
+                r"ego_vehicle/002 has no label \(the test split has",
+            ),
+        )
 
     @pytest.mark.parametrize("sample", ["", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3}])
     def test_what_is_no_sample(self, small: DeepAccident, sample: object) -> None:
-        with pytest.raises(TokenError, match=r"no token|expected a token or a record"):
-            small.motion_labels(sample)
+        assert_refused(
+            (lambda: small.motion_labels(sample), TokenError, r"no token|expected a token or a record"),
+        )
 
     def test_agents_of_a_partial_release(self, tmp_path: Path) -> None:
-        partial = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines))
-        assert VAN in partial.motion_labels(f"{EGO}/002").id_map
-        assert VAN in partial.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
-        for agents in ("+other", "all", ("ego_vehicle", "other_vehicle")):
-            with pytest.raises(
-                NotAvailableError, match=r"agents: other_vehicle\w* is not in this release|behind is not"
-            ):
-                partial.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents))
-        unfiltered = MotionLabelConfig(agents="+other", filter_invisible=False)
-        assert VAN in partial.motion_labels(f"{EGO}/002", unfiltered).id_map
+        two = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines))
+        assert VAN in two.motion_labels(f"{EGO}/002").id_map
+        assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
+        assert_refused(
+            *[
+                (
+                    partial(two.motion_labels, f"{EGO}/002", MotionLabelConfig(agents=agents)),
+                    NotAvailableError,
+                    r"agents: other_vehicle\w* is not in this release|behind is not",
+                )
+                for agents in ("+other", "all", ("ego_vehicle", "other_vehicle"))
+            ],
+        )
+        assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+other", filter_invisible=False)).id_map
 
     @pytest.mark.parametrize("agents", ["everybody", "ego_vehicle", ("pole",), ()])
     def test_agents_that_do_not_exist(self, small: DeepAccident, agents: object) -> None:
-        with pytest.raises(ChoiceError, match=r"agents?: expected"):
-            small.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents))
+        assert_refused(
+            (
+                lambda: small.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)),
+                ChoiceError,
+                r"agents?: expected",
+            ),
+        )
 
     def test_an_agent_without_labels_sees_nothing(self, tmp_path: Path) -> None:
         tiny.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)
         release = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle",)))
-        labels = release.motion_labels(f"{EGO}/002")
-        assert {*labels.id_map} == {OWN_BOX_ID, VAN}
-        alone = release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",)))
-        assert {*alone.id_map} == {OWN_BOX_ID}
+        assert {*release.motion_labels(f"{EGO}/002").id_map} == {OWN_BOX_ID, VAN}
+        assert {*release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",))).id_map} == {
+            OWN_BOX_ID
+        }
 
 
 def test_a_label_without_boxes(tmp_path: Path) -> None:
@@ -312,3 +335,194 @@ def test_a_label_without_boxes(tmp_path: Path) -> None:
         assert not labels.id_map
         assert not labels.instance[0].any()
         assert (labels.offset == 255).all()
+
+
+def _frames(tokens: list[str], scenario: str, agent: str) -> list[int]:
+    return [int(one.rsplit("/", 1)[1]) for one in tokens if one.startswith(f"{scenario}/{agent}/")]
+
+
+@pytest.fixture
+def every_scenario(da_motion: DeepAccident, tmp_path: Path) -> Path:
+    split = tmp_path / "mine.txt"
+    split.write_text("".join(f"{record['token'].replace('/', ' ')}\n" for record in da_motion.scenario))
+    return split
+
+
+def test_training_takes_a_sample_a_second_counted_from_the_end(da_motion: DeepAccident, every_scenario: Path) -> None:
+    tokens = samples(da_motion, every_scenario, "train")
+    for scenario in da_motion.scenario:
+        for agent in AGENTS:
+            assert _frames(tokens, scenario["token"], agent) == [5, 15, 25, 35]
+
+
+def test_evaluation_takes_the_last_two_seconds_of_accidents_but_the_end(
+    da_motion: DeepAccident, every_scenario: Path
+) -> None:
+    tokens = samples(da_motion, every_scenario, "evaluate")
+    for scenario in da_motion.scenario:
+        expected = [15, 20, 25, 30] if scenario["designed_accident"] else []
+        for agent in AGENTS:
+            assert _frames(tokens, scenario["token"], agent) == expected
+
+
+def test_the_paper_leaves_horizon_and_scope_open(da_motion: DeepAccident, every_scenario: Path) -> None:
+    tokens = samples(da_motion, every_scenario, "evaluate", "paper", horizon=3.0, scope="all")
+    for scenario in da_motion.scenario:
+        assert _frames(tokens, scenario["token"], "infrastructure") == [5, 10, 15, 20, 25, 30]
+    assert len(samples(da_motion, every_scenario, "all")) == 2 * 5 * 7
+    assert samples(da_motion, every_scenario, "every") == [sample["token"] for sample in da_motion.sample]
+    assert {
+        token[-3:] for token in samples(da_motion, every_scenario, "evaluate", "paper", horizon=0.5, scope="all")
+    } == {"030"}
+
+
+def test_a_split_belongs_to_its_scenarios_alone(da_motion: DeepAccident, tmp_path: Path) -> None:
+    one = da_motion.scenario[1]["token"]
+    (tmp_path / "one.txt").write_text(one.replace("/", " ") + "\n")
+    assert {token.rsplit("/", 2)[0] for token in samples(da_motion, tmp_path / "one.txt", "all")} == {one}
+
+
+def test_evaluation_samples_are_those_of_the_purpose_to_evaluate(da_motion: DeepAccident, every_scenario: Path) -> None:
+    tokens = samples(da_motion, every_scenario, "evaluate")
+    assert tokens
+    assert evaluation_samples(da_motion, every_scenario) == tokens
+    assert da_motion.evaluation_samples(every_scenario, "released") == tokens
+    far = samples(da_motion, every_scenario, "evaluate", "paper", horizon=3.0, scope="all")
+    assert da_motion.evaluation_samples(every_scenario, "paper", horizon=3.0, scope="all") == far
+    assert_refused(
+        (lambda: evaluation_samples(da_motion, every_scenario, horizon=3.0), ConfigError, "protocol='paper'"),
+    )
+
+
+def test_training_samples_are_those_of_the_purpose_to_train(da_motion: DeepAccident, every_scenario: Path) -> None:
+    tokens = samples(da_motion, every_scenario, "train")
+    assert tokens
+    assert training_samples(da_motion, every_scenario) == da_motion.training_samples(every_scenario) == tokens
+
+
+def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:
+    here = {record["split"] for record in da_motion.scenario}
+    [absent] = {"train", "val"} - here
+    with pytest.raises(
+        NotAvailableError, match=rf"{absent}: no scenario of this split is in .*; unpack that part.*"
+    ) as told:
+        training_samples(da_motion, absent)
+    assert str(told.value).endswith(f"or choose another split: it has {here.pop()}: 2 scenarios")
+
+
+@pytest.mark.parametrize("horizon", ["2", None, [2.0]])
+def test_a_horizon_is_a_number(da_motion: DeepAccident, horizon: object) -> None:
+    with pytest.raises(ConfigError, match="horizon: expected a number of seconds"):
+        samples(da_motion, "train", "evaluate", "paper", horizon=horizon)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ({"purpose": "testing"}, "purpose: expected one of train, evaluate, all, every"),
+        ({"protocol": "boxes"}, "protocol: expected one of released, paper"),
+        ({"protocol": "paper", "scope": "some"}, "scope: expected one of accident, all"),
+    ],
+)
+def test_unknown_choices_name_those_there_are(da_motion: DeepAccident, arguments: dict[str, str], told: str) -> None:
+    with pytest.raises(ChoiceError, match=re.escape(told)):
+        samples(da_motion, "train", **{"purpose": "train", **arguments})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("horizon", [0.0, 0.4999, 0.7, -1.0, float("nan"), float("inf")])
+def test_a_horizon_is_a_number_of_half_seconds(da_motion: DeepAccident, horizon: float) -> None:
+    assert_refused(
+        (
+            lambda: samples(da_motion, "train", "evaluate", "paper", horizon=horizon),
+            ConfigError,
+            r"choose 0\.5, 1, 1\.5",
+        ),
+    )
+
+
+def test_the_released_protocol_has_one_horizon(da_motion: DeepAccident) -> None:
+    assert_refused(
+        (lambda: samples(da_motion, "train", "evaluate", horizon=3.0), ConfigError, "protocol='paper'"),
+    )
+
+
+def test_a_split_without_labels_says_so(own_release: Path) -> None:
+    for folder in own_release.glob("**/label"):
+        for path in folder.rglob("*.txt"):
+            path.unlink()
+    unlabelled = DeepAccident("v1", own_release, verbose=False)
+    split = own_release / "mine.txt"
+    split.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
+    assert_refused(
+        (lambda: samples(unlabelled, split, "train"), NotAvailableError, "none of its samples here has labels"),
+    )
+
+
+def test_a_list_without_samples_says_what_to_do(tmp_path: Path) -> None:
+    split = tmp_path / "one.txt"
+    for kind, told in (
+        ("normal", "leaves out all 1 of its scenarios, .* use scope='all'"),
+        ("accident", "^choose others"),
+    ):
+        scenario_type = f"type1_subtype1_{kind}"
+        root = tiny.write_tiny_release(tmp_path / kind, frames=1, scenario_type=scenario_type, agents=("ego_vehicle",))
+        release = DeepAccident(dataroot=root, verbose=False, workers=1)
+        split.write_text(f"{scenario_type} {tiny.NAME}\n")
+        assert re.search(told, no_samples_text(release, split, "accident"))
+        assert no_samples_text(release, split, "all") == "choose others"
+
+
+def leaning(agent: str, frame: int):
+    """Up to 16° of lean; agents turn while they drive."""
+    pose = tiny.pose(0, x=12.0 * tiny.AGENTS.index(agent) + 0.3 * frame, y=-4.0, z=0.5)
+    turn = Quaternion(axis=(0, 0, 1), degrees=35 + 3 * frame) * Quaternion(axis=(0, 1, 0), degrees=13)
+    pose[:3, :3] = (turn * Quaternion(axis=(1, 0, 0), degrees=9 - frame / 3)).rotation_matrix
+    return pose
+
+
+def lines_around(agent: str, frame: int) -> list[str]:
+    """Cars around the agent; it sees some of them always, some at times, some never, and others see those."""
+    own, later = agent != "infrastructure", frame > 12
+    return [
+        *tiny.label_lines(agent, frame)[:-1],
+        *(
+            f"{kind} {x} {y} -1.1 {4.4 + width:.3f} {width} 1.7 {angle} 0.0 0.0 {actor} {points} {seen}"
+            for kind, x, y, width, angle, actor, points, seen in (
+                ("car", 14.03 + frame / 7, 7.1, 1.9, 0.4, 1301, 90, later),
+                ("truck", 31.01, -19.3, 2.6, -1.2, 1302, 90, not own),
+                ("cyclist", -8.2, 3.3, 0.6, 2.2, 1303, 0, True),
+                ("pedestrian", 6.0, -5.0, 0.6, 0.1, 1304, 90, True),
+                ("car", -20.0, 10.0, 1.9, 0.7, -1, 90, True),
+                ("car", -20.0, -10.0, 1.9, 1.7, -1, 90, later),
+                ("van", 40.2, 36.9, 2.1, -2.8, 1305, 0, True),
+            )
+        ),
+    ]
+
+
+@pytest.fixture(scope="module")
+def slope(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tiny, "ego_to_world", leaning)
+        root = tiny.write_tiny_release(tmp_path_factory.mktemp("slope") / "release", frames=28, lines_of=lines_around)
+    return DeepAccident(dataroot=root, verbose=False, workers=1)
+
+
+@pytest.mark.parametrize("filter_invisible", [True, False])
+@pytest.mark.parametrize("agent", ["ego_vehicle", "other_vehicle", "infrastructure"])
+def test_it_draws_as_fierys_class(slope: DeepAccident, agent: str, filter_invisible: bool) -> None:
+    config = MotionLabelConfig.preset("fiery", filter_invisible=filter_invisible)
+    for number in (1, 5, 13, 24):
+        token = f"{tiny.TOKEN}/{agent}/{number:03d}"
+        labels = slope.motion_labels(token, config)
+        expected = plain_fiery.instances(slope, token, filter_invisible=filter_invisible)
+        inner = (labels.label_valid, plain_fiery.INNER, plain_fiery.INNER)
+        assert_array_equal(labels.instance[inner], expected[inner])
+
+
+def test_its_choices_are_fields(slope: DeepAccident) -> None:
+    fiery = PRESETS["fiery"]
+    assert (fiery.agents, fiery.rules.sight, fiery.rules.pose) == ("single", "camera", "yaw")
+    others = {(rules.sight, rules.pose) for name, rules in LABEL_PROTOCOLS.items() if name != "fiery"}
+    assert (others, MotionLabelConfig.from_dict(fiery.as_dict())) == ({("released", "whole")}, fiery)
+    assert {"sight", "pose"}.isdisjoint(MotionLabelConfig().as_dict()["protocol"]), "digests of older files stay"

@@ -45,8 +45,9 @@ def at(x: float, y: float, grid: BevGrid = GRID, value: float = 1) -> np.ndarray
 def test_an_agent_that_stands_ahead_sees_things_further_ahead(protocol: str, orientation: Any) -> None:
     grid = GRID.with_orientation(orientation)
     maps = np.stack([at(0.5, 1.5, grid), at(0.5, 1.5, grid)])
-    found = agents_to_ego(maps, [[0] * 6, ONE_AHEAD], grid=grid, protocol=protocol)
-    assert_array_equal(found, [maps[0], at(1.5, 1.5, grid)])
+    assert_array_equal(
+        agents_to_ego(maps, [[0] * 6, ONE_AHEAD], grid=grid, protocol=protocol), [maps[0], at(1.5, 1.5, grid)]
+    )
 
 
 @ORIENTATIONS
@@ -58,8 +59,7 @@ def test_an_agent_that_looks_left_sees_ahead_what_the_ego_sees_on_its_left(orien
 
 
 def test_fierys_sideways_shift_has_the_wrong_sign() -> None:
-    to_the_left = [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
-    maps = np.stack([at(0.5, 0.5)] * 2)
+    to_the_left, maps = [[0] * 6, [0, 1.0, 0, 0, 0, 0]], np.stack([at(0.5, 0.5)] * 2)
     assert_array_equal(agents_to_ego(maps, to_the_left, grid=GRID, protocol="clean")[1], at(0.5, 1.5))
     assert_array_equal(agents_to_ego(maps, to_the_left, grid=GRID, protocol="fiery")[1], at(0.5, -0.5))
 
@@ -85,8 +85,7 @@ def test_oblong_grids_that_are_not_centred_keep_their_cells_where_nothing_moves(
 def test_released_bilinear_sampling_blurs_without_motion_and_the_exact_one_does_not() -> None:
     raster = np.random.default_rng(0).random(GRID.shape).astype(np.float32)
     assert_array_equal(warp(raster, np.eye(4), GRID, CLEAN, "bilinear"), raster)
-    blurred = warp(raster, np.eye(4), GRID, RELEASED, "bilinear")
-    assert not np.allclose(blurred, raster, atol=0.05)
+    assert not np.allclose(warp(raster, np.eye(4), GRID, RELEASED, "bilinear"), raster, atol=0.05)
     assert warp(raster.astype(np.int16), np.eye(4), GRID, RELEASED).dtype == np.int16
 
 
@@ -142,8 +141,7 @@ def test_one_moment_alone_and_the_ego_alone_stay_as_they_are() -> None:
 
 def test_augmented_maps_move_along_the_augmented_axes() -> None:
     """Mirrored maps of an agent one metre to the left stand one metre to the right."""
-    augmentation = Augmentation(flip=True)
-    pose = [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
+    augmentation, pose = Augmentation(flip=True), [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
     found = agents_to_ego(np.stack([at(0.5, 0.5)] * 2), pose, grid=GRID, protocol="clean", augmentation=augmentation)
     assert_array_equal(found[1], at(0.5, -0.5))
 
@@ -183,8 +181,7 @@ def test_sines_are_torchs_and_not_the_nearest_float32() -> None:
 
 def make_labels(config: MotionLabelConfig, step: list[float]) -> MotionLabels:
     """One cell of an instance, 2.5 m ahead and 0.5 m to the left of each frame's own ego, which moves by `step`."""
-    frames = config.label_frames
-    mask = np.broadcast_to(at(2.5, 0.5, config.grid) > 0, (frames, *config.grid.shape))
+    mask = np.broadcast_to(at(2.5, 0.5, config.grid) > 0, (config.label_frames, *config.grid.shape))
     ahead = {"devkit": (0, 1), "released": (0, 1), "fiery": (1, 0)}[config.grid.orientation]
     vectors = np.where(mask[:, None], np.reshape(ahead, (1, 2, 1, 1)), config.ignore_index).astype(np.float32)
     return MotionLabels(
@@ -222,8 +219,7 @@ def test_what_is_ahead_of_an_ego_that_turned_left_is_on_the_presents_left(orient
 
 @pytest.mark.parametrize(("protocol", "beside"), [("released", 0), ("clean", 255)])
 def test_what_comes_in_from_beside_the_grid(protocol: str, beside: int) -> None:
-    config = MotionLabelConfig(grid=GRID, protocol=protocol, future_frames=1)
-    labels = make_labels(config, [-3.0, 0, 0, 0, 0, 0])
+    labels = make_labels(MotionLabelConfig(grid=GRID, protocol=protocol, future_frames=1), [-3.0, 0, 0, 0, 0, 0])
     present = labels.to_present(centerness="bilinear")
     assert_array_equal(present.flow[1][:, :, :2], beside)
     assert_array_equal(present.offset[1][:, :, 4:7], 255)
@@ -232,8 +228,9 @@ def test_what_comes_in_from_beside_the_grid(protocol: str, beside: int) -> None:
 
 
 def test_released_vectors_keep_their_values_when_the_frame_turns() -> None:
-    config = MotionLabelConfig(grid=GRID, future_frames=1)
-    present = make_labels(config, np.negative(QUARTER_LEFT).tolist()).to_present()
+    present = make_labels(
+        MotionLabelConfig(grid=GRID, future_frames=1), np.negative(QUARTER_LEFT).tolist()
+    ).to_present()
     assert_array_equal(present.offset[1][:, present.instance[1] > 0][:, 0], [0, 1])
 
 
@@ -269,11 +266,21 @@ def test_a_chain_of_frames_starts_at_the_identity() -> None:
 def test_more_cells_than_a_warp_can_number_are_refused() -> None:
     huge = BevGrid((-2100, 2100, 1), (-2100, 2100, 1))
     points = (np.zeros((2, 2)), np.zeros((2, 2)))
-    with pytest.raises(GeometryError, match="cells are more than a warp can number"):
-        rounded_points(points, huge, LABEL_PROTOCOLS["clean"])
+    assert_refused(
+        (
+            lambda: rounded_points(points, huge, LABEL_PROTOCOLS["clean"]),
+            GeometryError,
+            "cells are more than a warp can number",
+        ),
+    )
 
 
 @pytest.mark.parametrize("shape", [(0, 3, 4, 4), (4, 4)])
 def test_no_map_is_no_feature(shape: tuple[int, ...]) -> None:
-    with pytest.raises(GeometryError, match="features: expected at least one map"):
-        agents_to_ego(np.zeros(shape), np.zeros((shape[0], 6)))
+    assert_refused(
+        (
+            lambda: agents_to_ego(np.zeros(shape), np.zeros((shape[0], 6))),
+            GeometryError,
+            "features: expected at least one map",
+        ),
+    )

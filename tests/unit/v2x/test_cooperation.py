@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import tiny
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -23,8 +24,7 @@ def test_the_union_has_each_actor_once_and_nobody_else(da: DeepAccident) -> None
             tokens = [token for token in samples if token.split("/")[-2] in agents]
             view = cooperative_view(da, tokens[0], agents=agents)
             ids = view.boxes.actor_id
-            tracked = ids[ids >= 0].tolist()
-            assert tracked == sorted(set.union(*(label_ids(da, token) for token in tokens)))
+            assert ids[ids >= 0].tolist() == sorted(set.union(*(label_ids(da, token) for token in tokens)))
             assert -100 not in ids
             for agent in AGENTS:
                 seen = (view.seen_by >> AGENTS.index(agent) & 1).astype(bool)
@@ -51,8 +51,9 @@ def test_each_box_is_its_sources_own_in_the_frame_asked_for(da: DeepAccident) ->
 def test_actor_ids_are_those_of_the_instances(da: DeepAccident) -> None:
     for sample in (da.sample[7], da.sample[-1]):
         instances = [box.instance_token for box in da.get_boxes(sample)]
-        expected = [-1 if token is None else int(token.rsplit("/", 1)[1]) for token in instances]
-        assert_array_equal(da.actor_ids(sample), expected)
+        assert_array_equal(
+            da.actor_ids(sample), [-1 if token is None else int(token.rsplit("/", 1)[1]) for token in instances]
+        )
 
 
 def scene(rows: dict[str, Sequence[str]]):
@@ -77,8 +78,9 @@ def row(x: float, actor: int, points: int = 9, category: str = "car", camera: bo
 
 
 def test_own_rows_become_actors_and_give_way_to_what_others_see(stacked) -> None:
-    own = {"ego_vehicle": [row(0.1, -100, 900, camera=False)], "other_vehicle": [row(30.0, -100), row(0.0, 1223, 7)]}
-    da = stacked(own)
+    da = stacked(
+        {"ego_vehicle": [row(0.1, -100, 900, camera=False)], "other_vehicle": [row(30.0, -100), row(0.0, 1223, 7)]}
+    )
     view = cooperative_view(da, f"{tiny.TOKEN}/ego_vehicle/001")
     assert_array_equal(view.boxes.actor_id, [1212, 1223])
     assert_allclose(view.boxes.center[:, 0], [30.0, 0.0])
@@ -127,36 +129,45 @@ def test_visible_only(stacked) -> None:
         "ego_vehicle": [row(0.0, -100), row(20.0, 5, 1), row(40.0, 6, 9, camera=False), row(12.0, -1)],
         "infrastructure": [row(40.0, 6, 2), row(14.0, 7, 1, camera=False)],
     }
-    da = stacked(rows)
-    sample = f"{tiny.TOKEN}/ego_vehicle/001"
+    da, sample = stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001"
     seen = {visible: da.cooperative_boxes(sample, visible=visible) for visible in (None, "camera", "released")}
     assert_array_equal(seen[None].actor_id, [5, 6, 7, 1223, -1])
     assert_array_equal(seen["camera"].actor_id, [5, 6, 1223, -1])
     assert_array_equal(seen["released"].actor_id, [6, 7])
     assert da.visible_instances(sample) == [f"{tiny.TOKEN}/actor/6", f"{tiny.TOKEN}/actor/7"]
     assert da.visible_instances(sample, agents="single") == []
-    with pytest.raises(ChoiceError, match="visible: expected one of camera, released, or None, found 'all'"):
-        da.cooperative_boxes(sample, visible="all")
+    assert_refused(
+        (
+            lambda: da.cooperative_boxes(sample, visible="all"),
+            ChoiceError,
+            "visible: expected one of camera, released, or None, found 'all'",
+        ),
+    )
 
 
 def test_visible_instances_of_all_agents_are_those_of_the_released_labels(da: DeepAccident) -> None:
     for sample in (da.sample[0], da.sample[33]):
         instances = {int(token.rsplit("/", 1)[1]) for token in da.visible_instances(sample)}
-        ids = da.boxes(sample, visible="released").actor_id
-        assert set(ids.tolist()) == instances & set(da.boxes(sample).actor_id.tolist())
+        assert set(da.boxes(sample, visible="released").actor_id.tolist()) == instances & set(
+            da.boxes(sample).actor_id.tolist()
+        )
         assert len(instances) >= len(da.visible_instances(sample, agents="single")) > 0
 
 
 def test_agents_without_labels_see_nothing(tmp_path: Path) -> None:
     da = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path, labelled=False), verbose=False)
     sample = f"{tiny.TOKEN}/ego_vehicle/001"
-    assert len(da.cooperative_boxes(sample, frame="ego")) == 0
-    assert da.visible_instances(sample) == []
+    assert (len(da.cooperative_boxes(sample, frame="ego")), da.visible_instances(sample)) == (0, [])
 
 
 def test_frames_and_samples_that_do_not_exist(da: DeepAccident) -> None:
-    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar"):
-        da.cooperative_boxes(da.sample[0], frame="map")
+    assert_refused(
+        (
+            lambda: da.cooperative_boxes(da.sample[0], frame="map"),
+            ChoiceError,
+            "frame: expected one of world, ego, lidar",
+        ),
+    )
 
 
 def test_the_callers_release_is_not_changed(da: DeepAccident) -> None:
@@ -173,8 +184,7 @@ def test_a_row_that_a_label_repeats_counts_once(stacked) -> None:
         "ego_vehicle": [row(20.0, 5, 3), row(20.4, 5, 8), row(0.0, -100), row(0.1, -100, 70)],
         "infrastructure": [row(20.2, 5, 4), row(20.2, 5, 4), row(0.0, 1223, 6), row(0.0, 1223, 6)],
     }
-    da = stacked(rows)
-    view = cooperative_view(da, f"{tiny.TOKEN}/ego_vehicle/001")
+    view = cooperative_view(stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001")
     assert_array_equal(view.boxes.actor_id, [5, 1223])
     assert_array_equal(view.boxes.num_lidar_pts, [7, 6])
     assert_allclose(view.boxes.center[:, 0], [20.0, 0.0])

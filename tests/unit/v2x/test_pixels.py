@@ -39,15 +39,13 @@ def painted(scene: Scene, camera: Camera, ground_from_camera: SE3) -> np.ndarray
     directions = ray_directions(ground_from_camera, right[None, :], down[:, None])
     _, face = scene.cast(ground_from_camera.translation, directions.reshape(-1, 3))
     owner = scene.face_owner[face]
-    ids = np.where(owner >= 0, scene.actors.actor_id[np.maximum(owner, 0)], -1)
-    return ids.reshape(directions.shape[:2])
+    return np.where(owner >= 0, scene.actors.actor_id[np.maximum(owner, 0)], -1).reshape(directions.shape[:2])
 
 
 def unoccluded(scene: Scene, ground_from_camera: SE3) -> set[int]:
     """The actors (true poses) towards whose middle the first surface is their own."""
     middle = scene.frames[:, :3, 3] + scene.frames[:, :3, 2] * scene.actors.size[:, 2:] / 2
-    rays = (middle - ground_from_camera.translation).astype(np.float32)
-    _, face = scene.cast(ground_from_camera.translation, rays)
+    _, face = scene.cast(ground_from_camera.translation, (middle - ground_from_camera.translation).astype(np.float32))
     return set(scene.actors.actor_id[scene.face_owner[face] == np.arange(len(scene.actors))].tolist())
 
 

@@ -10,12 +10,14 @@ import tracemalloc
 import warnings
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import plain_results as plain
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import MOST_SAID, ResultsError
 from deepaccident_devkit.evaluation.results import MotionForm, read_results, records
@@ -28,8 +30,9 @@ Document = dict[str, Any]
 def refused(path: Path, *words: str) -> None:
     """Reading fails, or else the check of all arrays, with a sentence that has these words in this order."""
     pattern = ".*".join(map(re.escape, words))
-    with pytest.raises(ResultsError, match=f"(?s){pattern}"):
-        read_results(path).check()
+    assert_refused(
+        (lambda: read_results(path).check(), ResultsError, f"(?s){pattern}"),
+    )
 
 
 def with_entry(kind: str, **changes: Any) -> Document:
@@ -335,8 +338,8 @@ def test_manifests(tmp_path: Path, kind: str) -> None:
 
 def test_links_out_of_the_folder(tmp_path: Path) -> None:
     folder = plain.write_motion(tmp_path / "motion")
-    outside = (folder / "shards" / "00001.npz").rename(tmp_path / "outside.npz")
-    (folder / "shards" / "00001.npz").symlink_to(outside)
+    shard = folder / "shards" / "00001.npz"
+    shard.symlink_to(shard.rename(tmp_path / "outside.npz"))
     refused(folder, "shards[1]: file: shards/00001.npz is a link that leads out of the folder")
 
 
@@ -428,8 +431,12 @@ def test_arrays(tmp_path: Path, kind: str) -> None:
     good = plain.instance_arrays() if stored == "instances" else plain.head_arrays()
     plain.write_shard(folder / "shards" / "00000.npz", {FIRST: good, SECOND: arrays})
     plain.relist(folder)
-    where = () if "belongs to no sample" in words[0] else (f"{SECOND}: ",)
-    refused(folder, "results.json: shards/00000.npz: ", *where, *words)
+    refused(
+        folder,
+        "results.json: shards/00000.npz: ",
+        *(() if "belongs to no sample" in words[0] else (f"{SECOND}: ",)),
+        *words,
+    )
 
 
 @pytest.mark.parametrize("missing", ["centerness", "flow"])
@@ -451,8 +458,7 @@ def npy(array: np.ndarray, version: tuple[int, int] = (1, 0)) -> bytes:
 def claiming(shape: tuple[int, ...]) -> bytes:
     """The header of a larger array before the bytes of a good one."""
     good, buffer = plain.instance_arrays()["instance"], io.BytesIO()
-    header = {"descr": "|u1", "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(buffer, header)
+    np.lib.format.write_array_header_1_0(buffer, {"descr": "|u1", "fortran_order": False, "shape": shape})
     return buffer.getvalue() + good.tobytes()
 
 
@@ -488,8 +494,9 @@ def test_members(tmp_path: Path, kind: str) -> None:
     folder = plain.write_motion(tmp_path / "motion")
     rewritten(folder, {MEMBER: content})
     refused(folder, f"shards/00000.npz: {FIRST}: {words}")
-    with pytest.raises(ResultsError, match=re.escape(words)):
-        read_results(folder).prediction(FIRST)
+    assert_refused(
+        (lambda: read_results(folder).prediction(FIRST), ResultsError, re.escape(words)),
+    )
 
 
 def test_links_in_a_loop(tmp_path: Path) -> None:
@@ -578,12 +585,22 @@ def test_shards_that_are_cut_or_changed(tmp_path: Path) -> None:
     path = folder / "shards" / "00000.npz"
     content = path.read_bytes()
     path.write_bytes(content[:-1])
-    with pytest.raises(ResultsError, match=r"bytes: shards/00000\.npz should have \d+, found \d+; copy it again"):
-        read_results(folder)
+    assert_refused(
+        (
+            lambda: read_results(folder),
+            ResultsError,
+            r"bytes: shards/00000\.npz should have \d+, found \d+; copy it again",
+        ),
+    )
     plain.relist(folder)
     refused(folder, "shards/00000.npz: is no npz archive that can be read")
-    with pytest.raises(ResultsError, match=r"shards/00000\.npz: is no npz archive that can be read"):
-        read_results(folder).prediction(FIRST)
+    assert_refused(
+        (
+            lambda: read_results(folder).prediction(FIRST),
+            ResultsError,
+            r"shards/00000\.npz: is no npz archive that can be read",
+        ),
+    )
     path.write_bytes(b"\0" + content[1:])
     told = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     told["shards"][0]["bytes"] = len(content)
@@ -595,8 +612,7 @@ def test_no_bit_of_a_shard_is_read_wrongly(tmp_path: Path) -> None:
     """A shard whose checksum was made after the damage: the archive's own sums say it, or nothing is changed."""
     folder = plain.write_motion(tmp_path / "motion")
     path, expected = folder / "shards" / "00000.npz", plain.instance_arrays()["instance"]
-    content = path.read_bytes()
-    outcomes = set()
+    content, outcomes = path.read_bytes(), set()
     for position in range(0, len(content), 29):
         path.write_bytes(content[:position] + bytes([content[position] ^ 0x5A]) + content[position + 1 :])
         plain.relist(folder)
@@ -659,11 +675,21 @@ def test_the_longest_token_and_the_largest_form(tmp_path: Path) -> None:
     refused(plain.write_json(path, plain.document("accident", results={f"{TOKEN}b": []})), "expected a sample's token")
     form: dict[str, Any] = {"stored": "heads", "grid": BevGrid((0, 512, 0.5), (0, 512, 0.5)), "frames": 8}
     assert MotionForm(predictions=8, **form).predictions == 8  # of 2**20 cells
-    with pytest.raises(ResultsError, match="form: 9 predictions of 8 frames of 1048576 cells are more than memory"):
-        MotionForm(predictions=9, **form)
-    for name in ("predictions", "frames"):
-        with pytest.raises(ResultsError, match=f"{name}: expected a whole number from 1, found 0"):
-            MotionForm(**{"predictions": 1, **form, name: 0})
+    assert_refused(
+        (
+            lambda: MotionForm(predictions=9, **form),
+            ResultsError,
+            "form: 9 predictions of 8 frames of 1048576 cells are more than memory",
+        ),
+        *[
+            (
+                partial(MotionForm, **{"predictions": 1, **form, name: 0}),
+                ResultsError,
+                f"{name}: expected a whole number from 1, found 0",
+            )
+            for name in ("predictions", "frames")
+        ],
+    )
 
 
 @pytest.mark.parametrize(
@@ -675,8 +701,9 @@ def test_steps_are_of_recorded_frames(step: float, *, good: bool) -> None:
     if good:
         assert MotionForm(**made).as_dict()["step"] == step
     else:
-        with pytest.raises(ResultsError, match="step: expected seconds, a whole number of recorded frames of"):
-            MotionForm(**made)
+        assert_refused(
+            (lambda: MotionForm(**made), ResultsError, "step: expected seconds, a whole number of recorded frames of"),
+        )
     assert MotionForm(**{**made, "step": 0.5}) == MotionForm(
         **{name: each for name, each in made.items() if name != "step"}
     )

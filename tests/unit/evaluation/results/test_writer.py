@@ -1,21 +1,27 @@
-"""Files of results: whole or absent when written, and read by copies, threads and other processes."""
+"""Files of results: what is written is what is read, whole or absent; by copies, threads and other processes."""
 
 import multiprocessing
 import pickle
 import re
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import plain_results as plain
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ResultsError, TokenError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, instances_of
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results, reader
+from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.taxonomy import CATEGORIES
 
 FIRST, SECOND, THIRD = plain.TOKENS
 GRID = BevGrid((-2.0, 2.0, 0.5), (-1.5, 1.5, 0.5))
@@ -43,8 +49,7 @@ class TestWriter:
     def test_the_same_predictions_are_the_same_bytes(self, tmp_path: Path, task: Any) -> None:
         one, other = (write(tmp_path / name / "x", task) for name in ("a", "b"))
         assert files_under(tmp_path / "a") == files_under(tmp_path / "b")
-        assert len(files_under(tmp_path / "a")) == (2 if task == "motion" else 1)
-        assert one.fingerprint == other.fingerprint
+        assert (len(files_under(tmp_path / "a")), one.fingerprint) == (2 if task == "motion" else 1, other.fingerprint)
 
     def test_an_exception_leaves_nothing(self, tmp_path: Path, task: Any) -> None:
         with pytest.raises(KeyboardInterrupt), ResultsWriter(tmp_path / "in" / "x", task) as writer:  # noqa: PT012
@@ -63,33 +68,54 @@ class TestWriter:
         with pytest.raises(ResultsError, match="x: a prediction could not be written, so that none is kept"), writer:  # noqa: PT012
             writer.add(FIRST, PREDICTIONS[task]())
             monkeypatch.setattr(f"deepaccident_devkit.evaluation.results.writer.{where}", full)
-            with pytest.raises(ResultsError, match=r"x: results cannot be written \(.*No space left.*make room"):
-                writer.add(SECOND, PREDICTIONS[task]())
-            with pytest.raises(ResultsError, match="x: is not open"):
-                writer.add(SECOND, PREDICTIONS[task]())
+            assert_refused(
+                (
+                    lambda: writer.add(SECOND, PREDICTIONS[task]()),
+                    ResultsError,
+                    r"x: results cannot be written \(.*No space left.*make room",
+                ),
+                (lambda: writer.add(SECOND, PREDICTIONS[task]()), ResultsError, "x: is not open"),
+            )
         assert list(tmp_path.iterdir()) == []
 
     def test_nothing_is_replaced(self, tmp_path: Path, task: Any) -> None:
         (tmp_path / "file").write_text("mine", encoding="utf-8")
         (tmp_path / "folder").mkdir()
         (tmp_path / "folder" / "mine").touch()
-        for name in ("file", "folder"):
-            with pytest.raises(ResultsError, match=f"{name}: is there already; choose another path, or remove it"):
-                ResultsWriter(tmp_path / name, task)
+        assert_refused(
+            *[
+                (
+                    partial(ResultsWriter, tmp_path / name, task),
+                    ResultsError,
+                    f"{name}: is there already; choose another path, or remove it",
+                )
+                for name in ("file", "folder")
+            ],
+        )
         writer = ResultsWriter(tmp_path / "late", task)
         (tmp_path / "late").touch()
         with pytest.raises(ResultsError, match="late: is there already"), writer:
             pass
-        with pytest.raises(ResultsError, match=r"x: results cannot be written \(.*choose another path"):
-            ResultsWriter(tmp_path / "file" / "x", task).__enter__()
+        assert_refused(
+            (
+                lambda: ResultsWriter(tmp_path / "file" / "x", task).__enter__(),
+                ResultsError,
+                r"x: results cannot be written \(.*choose another path",
+            ),
+        )
         assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
         assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder", "late"]
 
     def test_a_sample_is_written_once(self, tmp_path: Path, task: Any) -> None:
         with ResultsWriter(tmp_path / "x", task) as writer:
             writer.add(FIRST, PREDICTIONS[task]())
-            with pytest.raises(ResultsError, match=f"x: {FIRST}: was added before; give each sample one prediction"):
-                writer.add(FIRST, PREDICTIONS[task]())
+            assert_refused(
+                (
+                    lambda: writer.add(FIRST, PREDICTIONS[task]()),
+                    ResultsError,
+                    f"x: {FIRST}: was added before; give each sample one prediction",
+                ),
+            )
             for token in ("", "a/../b", "/a", "a\\b", "a\nb", "a/\ud800", 3, b"a"):
                 with pytest.raises(ResultsError, match="expected a sample's token"):
                     writer.add(token, PREDICTIONS[task]())  # type: ignore[arg-type]
@@ -99,8 +125,13 @@ class TestWriter:
         with pytest.raises(ResultsError, match="x: no prediction was added"), ResultsWriter(tmp_path / "x", task):
             pass
         assert list(tmp_path.iterdir()) == []
-        with pytest.raises(ResultsError, match=r"is not open; add predictions inside `with ResultsWriter\("):
-            ResultsWriter(tmp_path / "x", task).add(FIRST, PREDICTIONS[task]())
+        assert_refused(
+            (
+                lambda: ResultsWriter(tmp_path / "x", task).add(FIRST, PREDICTIONS[task]()),
+                ResultsError,
+                r"is not open; add predictions inside `with ResultsWriter\(",
+            ),
+        )
 
     def test_predictions_of_another_kind(self, tmp_path: Path, task: Any) -> None:
         lidar = DetectedBoxes.from_arrays(np.zeros((1, 3)), np.ones((1, 3)), [0.0], [0.5], frame="lidar")
@@ -117,9 +148,12 @@ class TestWriter:
             ],
         }
         with ResultsWriter(tmp_path / "x", task) as writer:
-            for prediction, words in wrong[task]:
-                with pytest.raises(ResultsError, match=f"x: {FIRST}: .*{re.escape(words)}"):
-                    writer.add(FIRST, prediction)
+            assert_refused(
+                *[
+                    (partial(writer.add, FIRST, prediction), ResultsError, f"x: {FIRST}: .*{re.escape(words)}")
+                    for prediction, words in wrong[task]
+                ],
+            )
             writer.add(FIRST, PREDICTIONS[task]())
         assert len(read_results(tmp_path / "x")) == 1
 
@@ -128,8 +162,9 @@ class TestWriter:
         if task == "motion":
             assert len(write(tmp_path / "x", task)) == 3
         else:
-            with pytest.raises(ResultsError, match="x: is there already"):
-                ResultsWriter(tmp_path / "x", task)
+            assert_refused(
+                (lambda: ResultsWriter(tmp_path / "x", task), ResultsError, "x: is there already"),
+            )
 
 
 @pytest.mark.parametrize(
@@ -146,8 +181,9 @@ class TestWriter:
     ],
 )
 def test_what_a_writer_refuses_at_once(tmp_path: Path, options: dict[str, Any], words: str) -> None:
-    with pytest.raises(ResultsError, match=words):
-        ResultsWriter(tmp_path / "x", "motion", **options)
+    assert_refused(
+        (lambda: ResultsWriter(tmp_path / "x", "motion", **options), ResultsError, words),
+    )
 
 
 def test_tasks_without_results(tmp_path: Path) -> None:
@@ -173,14 +209,14 @@ def results(request: pytest.FixtureRequest, tmp_path: Path) -> Results:
 
 class TestResults:
     def test_samples(self, results: Results) -> None:
-        assert len(results) == 3
-        assert results.tokens == plain.TOKENS
+        assert (len(results), results.tokens) == (3, plain.TOKENS)
         assert FIRST in results
         assert OTHER not in results
         assert 3 not in results
         assert repr(results) == f"<{results.task} results: 3 samples in {results.path}>"
-        with pytest.raises(TokenError, match=f"has no prediction of '{OTHER}'"):
-            results.prediction(OTHER)
+        assert_refused(
+            (lambda: results.prediction(OTHER), TokenError, f"has no prediction of '{OTHER}'"),
+        )
 
     def test_ways_to_name_them(self, results: Results) -> None:
         folder = results.path if results.task == "motion" else results.path.parent
@@ -218,15 +254,22 @@ class TestResults:
         copy = pickle.dumps(results)
         results.check()
         file.write_bytes(file.read_bytes().replace(b'"meta": {}', b'"meta": {"a": 1}'))
-        with pytest.raises(ResultsError, match="was changed after it was opened; open it again"):
-            results.check()
+        assert_refused(
+            (results.check, ResultsError, "was changed after it was opened; open it again"),
+        )
         reader.kept.clear()
-        with pytest.raises(ResultsError, match="was changed after it was opened; open it again"):
-            pickle.loads(copy).prediction(FIRST)
+        assert_refused(
+            (
+                lambda: pickle.loads(copy).prediction(FIRST),
+                ResultsError,
+                "was changed after it was opened; open it again",
+            ),
+        )
         assert read_results(results.path).fingerprint != results.fingerprint
         file.unlink()
-        with pytest.raises(ResultsError, match=r"results\.json: cannot be read \("):
-            results.check()
+        assert_refused(
+            (results.check, ResultsError, r"results\.json: cannot be read \("),
+        )
 
 
 def length(results: Results, token: str) -> int:
@@ -250,5 +293,112 @@ def test_a_check_with_progress_and_workers(tmp_path: Path, capsys: pytest.Captur
     assert "shards: 100%" in capsys.readouterr().err
     path = tmp_path / "m" / "shards" / "00001.npz"
     path.write_bytes(path.read_bytes()[::-1])
-    with pytest.raises(ResultsError, match=r"shards/00001\.npz: its bytes are not those that the checksum is of"):
-        results.check(workers=2)
+    assert_refused(
+        (
+            lambda: results.check(workers=2),
+            ResultsError,
+            r"shards/00001\.npz: its bytes are not those that the checksum is of",
+        ),
+    )
+
+
+FINITE = {"allow_nan": False, "allow_infinity": False}
+numbers = st.floats(-1e6, 1e6, **FINITE)
+accidents = st.builds(
+    lambda points, time, score, ids: Accident(positions=np.reshape(points, (2, 2)), time=time, score=score, ids=ids),
+    st.lists(numbers, min_size=4, max_size=4),
+    st.floats(0, 1e3, **FINITE),
+    st.floats(**FINITE),
+    st.none() | st.tuples(st.integers(-(2**63), 2**63 - 1), st.integers(-100, 10**6)),
+)
+
+
+@st.composite
+def boxes(draw: Callable[[Any], Any]) -> DetectedBoxes:
+    count = draw(st.integers(0, 5))
+    source = np.random.default_rng(draw(st.integers(0, 2**32)))
+    velocity = source.normal(0, 10, (count, 3)) * [1, 1, 0]
+    velocity[source.random(count) < 0.3] = np.nan
+    return DetectedBoxes.from_arrays(
+        source.normal(0, 1e3, (count, 3)),
+        source.exponential(3, (count, 3)),
+        source.uniform(-9, 9, count),
+        source.normal(0, 1, count),
+        category=source.integers(0, len(CATEGORIES), count),
+        velocity=velocity,
+        frame="world",
+    )
+
+
+def as_plain(accident: Accident) -> tuple[Any, ...]:
+    return tuple(map(tuple, accident.positions.tolist())), accident.time, accident.score, accident.ids
+
+
+def written(path: Path, task: Any, predictions: dict[str, Any], **options: Any) -> Results:
+    with ResultsWriter(path, task, **options) as writer:
+        for token, prediction in predictions.items():
+            writer.add(token, prediction)
+    return read_results(path)
+
+
+class TestEntries:
+    @settings(max_examples=25)
+    @given(st.lists(st.lists(accidents, max_size=4), min_size=1, max_size=4))
+    def test_accidents_come_back(self, tmp_path_factory: pytest.TempPathFactory, lists: list[list[Accident]]) -> None:
+        predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
+        results = written(tmp_path_factory.mktemp("accidents") / "accident.json", "accident", predictions)
+        assert results.tokens == tuple(predictions)
+        for token, given_ones in predictions.items():
+            read = results.prediction(token)
+            assert isinstance(read, list)
+            assert list(map(as_plain, read)) == list(map(as_plain, given_ones))
+
+    @settings(max_examples=25)
+    @given(st.lists(boxes(), min_size=1, max_size=4))
+    def test_boxes_come_back(self, tmp_path_factory: pytest.TempPathFactory, lists: list[DetectedBoxes]) -> None:
+        predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
+        results = written(tmp_path_factory.mktemp("boxes") / "detection.json", "detection", predictions)
+        for token, given_ones in predictions.items():
+            read = results.prediction(token)
+            assert isinstance(read, DetectedBoxes)
+            np.testing.assert_array_equal(read.scores, given_ones.scores)
+            assert read.boxes.frame == "world"
+            for name in ("center", "size", "rotation", "velocity", "category", "actor_id", "row"):
+                np.testing.assert_array_equal(getattr(read.boxes, name), getattr(given_ones.boxes, name))
+
+    def test_the_plain_accidents(self, tmp_path: Path) -> None:
+        results = read_results(plain.write_json(tmp_path / "accident.json", plain.accidents()))
+        assert (results.task, results.meta, results.form) == ("accident", {"method": "plain"}, None)
+        read = results.prediction(FIRST)
+        assert isinstance(read, list)
+        positions = ((12.5, 0.5), (13.0, -2.0))
+        assert list(map(as_plain, read)) == [(positions, 1.5, 0.75, (1236, 1240)), (positions, 0.0, 0.75, None)]
+        assert results.prediction(THIRD) == []
+
+    def test_the_plain_boxes(self, tmp_path: Path) -> None:
+        results = read_results(plain.write_json(tmp_path / "detection.json", plain.detections()))
+        read = results.prediction(FIRST)
+        assert isinstance(read, DetectedBoxes)
+        assert read.boxes.frame == "world"
+        np.testing.assert_array_equal(read.boxes.size, [[4.5, 1.9, 1.6]] * 2)  # length, width, height
+        np.testing.assert_array_equal(read.boxes.center, [[105.25, -33.0, 0.75]] * 2)
+        np.testing.assert_allclose(read.boxes.yaw, 2 * np.arctan2(0.8, 0.6), atol=1e-12)
+        np.testing.assert_array_equal(read.boxes.velocity, [[0, 8.25, 0], [np.nan] * 3])
+        np.testing.assert_array_equal(read.scores, [0.9, 0.9])
+        assert (CATEGORIES[read.boxes.category[0]], len(results.prediction(THIRD))) == ("van", 0)
+
+    def test_a_sample_a_line(self, tmp_path: Path) -> None:
+        predictions = {FIRST: [Accident(positions=np.zeros((2, 2)), time=1.0)], SECOND: []}
+        written(tmp_path / "accident.json", "accident", predictions, meta={"b": 1, "a": [None]})
+        lines = (tmp_path / "accident.json").read_text(encoding="utf-8").splitlines()
+        header = ['"format": "DeepAccident results",', '"version": 1,', '"task": "accident",']
+        assert lines[:6] == ["{", *header, '"meta": {"b": 1, "a": [null]},', '"results": {']
+        assert lines[7:] == [f'"{SECOND}": []', "}", "}"]
+
+
+def test_a_velocity_that_is_known_in_part_is_unknown() -> None:
+    columns = {"center": np.zeros((2, 3)), "size": np.ones((2, 3)), "yaw": np.zeros(2), "frame": "world"}
+    detected = DetectedBoxes.from_arrays(
+        scores=np.ones(2), velocity=np.array([[1.0, np.nan, 0.0], [1.0, 2.0, 0.0]]), **columns
+    )
+    assert [each["velocity"] for each in detection_entries("s", detected)] == [None, [1.0, 2.0]]

@@ -33,8 +33,9 @@ def da_b(release_root_b: Path) -> DeepAccident:
 @pytest.fixture(scope="session")
 def selection() -> SampleSelection:
     """Two scenarios, an accident and its normal twin, of three agents: six samples."""
-    agents = ("ego_vehicle", "other_vehicle", "infrastructure")
-    return SampleSelection(split="val", samples="evaluate", scope="all", agents=agents)
+    return SampleSelection(
+        split="val", samples="evaluate", scope="all", agents=("ego_vehicle", "other_vehicle", "infrastructure")
+    )
 
 
 @pytest.fixture(scope="session")
@@ -66,8 +67,10 @@ def _write_accidents(dataset: DeepAccident, path: Path, tokens: Iterable[str], m
         for token in tokens:
             truth = accident_context(dataset, token, 2.0).truth
             true = None if truth is None else truth.accident
-            alarms = [] if true is None else [Accident(positions=true.positions + moved, time=true.time, ids=true.ids)]
-            writer.add(token, alarms)
+            writer.add(
+                token,
+                [] if true is None else [Accident(positions=true.positions + moved, time=true.time, ids=true.ids)],
+            )
     return read_results(path)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pyarrow.parquet
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
@@ -72,8 +73,7 @@ def test_holds_all_and_reads_back(run: EvaluationRun, results: Results, tmp_path
 
 
 def test_every_file_says_version_protocol_and_partial(run: EvaluationRun, tmp_path: Path) -> None:
-    mark = Partial(missing=1, extra=0, expected=7, evaluated=6)
-    folder = save_run(replace(run, partial=mark), tmp_path / "bundle")
+    folder = save_run(replace(run, partial=Partial(missing=1, extra=0, expected=7, evaluated=6)), tmp_path / "bundle")
     stamps = [read(folder / name) for name in JSON_FILES] + [read_rows(folder / "samples.parquet")[1]]
     for stamp in stamps:
         assert (stamp["devkit_version"], stamp["task"], stamp["protocol"]) == (__version__, "accident", "boxes")
@@ -81,12 +81,10 @@ def test_every_file_says_version_protocol_and_partial(run: EvaluationRun, tmp_pa
 
 
 def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
-    switched = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
-    summary = switched.summary()
+    summary = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5})).summary()
     assert summary["switches"] == {"reading.danger_distance": 0.5}
     assert summary["settings"]["choices"]["reading"]["danger_distance"] == 0.5
-    assert summary["counts"] == {"samples": 6, "scenarios": 2, "left_out": 0}
-    assert summary["metrics"]["positives"] == 3
+    assert (summary["counts"], summary["metrics"]["positives"]) == ({"samples": 6, "scenarios": 2, "left_out": 0}, 3)
     assert {"python", "numpy"} <= summary["environment"].keys()
     assert summary["headlines"][0]["name"] == "apa"
 
@@ -94,8 +92,7 @@ def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
 def test_a_copy_of_the_results_goes_along(run: EvaluationRun, results: Results, tmp_path: Path) -> None:
     folder = save_run(run, tmp_path / "bundle", include_results=True)
     inside = read_bundle(folder).results_path
-    assert inside == folder / "results" / results.path.name
-    assert read_results(inside).fingerprint == results.fingerprint
+    assert (inside, read_results(inside).fingerprint) == (folder / "results" / results.path.name, results.fingerprint)
 
 
 def test_a_folder_of_results_is_copied_whole(
@@ -113,8 +110,7 @@ def test_a_folder_of_results_is_copied_whole(
 
 
 def test_rows_are_plain_columns(run: EvaluationRun, tmp_path: Path) -> None:
-    folder = save_run(run, tmp_path / "bundle")
-    schema = pyarrow.parquet.read_schema(folder / "samples.parquet")
+    schema = pyarrow.parquet.read_schema(save_run(run, tmp_path / "bundle") / "samples.parquet")
     kinds = {name: str(schema.field(name).type) for name in ("token", "frame", "time_to_impact", "positive", "tp_10m")}
     assert list(kinds.values()) == ["string", "int64", "double", "bool", "int64"]
 
@@ -125,8 +121,9 @@ class TestPlaces:
             assert FILES - {"files.json"} <= {path.name for path in folder.iterdir()}
             raise KeyError("plot")
 
-        with pytest.raises(KeyError, match="plot"):
-            save_run(run, tmp_path / "bundle", extras=[fails])
+        assert_refused(
+            (lambda: save_run(run, tmp_path / "bundle", extras=[fails]), KeyError, "plot"),
+        )
         assert not list(tmp_path.glob("*bundle*"))
 
     def test_what_extras_write_belongs_to_it(self, run: EvaluationRun, tmp_path: Path) -> None:
@@ -135,13 +132,14 @@ class TestPlaces:
         save_run(run, folder, overwrite=True)
         assert {path.name for path in folder.iterdir()} == FILES
 
-    def test_replaced_only_when_told(self, run: EvaluationRun, tmp_path: Path) -> None:
+    def test_replaced_only_when_told_and_with_files_of_its_own_alone(self, run: EvaluationRun, tmp_path: Path) -> None:
         folder = save_run(run, tmp_path / "bundle")
-        with pytest.raises(ResultsError, match=r"bundle: holds an evaluation; pass overwrite=True \(--overwrite\)"):
-            save_run(run, folder)
+        assert_refused((lambda: save_run(run, folder), ResultsError, ("bundle: holds an evaluation", "--overwrite")))
         save_run(replace(run, sanity={"warnings": []}), folder, overwrite=True)
         assert read_bundle(folder).summary["sanity"] == {"warnings": []}
         assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["bundle"]
+        (folder / "thoughts.txt").write_text("mine")
+        assert_refused((lambda: save_run(run, folder, overwrite=True), ResultsError, ("thoughts.txt", "move it")))
 
     def test_a_link_to_one_is_replaced_itself(self, run: EvaluationRun, tmp_path: Path) -> None:
         folder = save_run(run, tmp_path / "bundle")
@@ -165,33 +163,35 @@ class TestPlaces:
             replace_file(source, target)
 
         monkeypatch.setattr("deepaccident_devkit.support.files.os.replace", full)
-        with pytest.raises(ResultsError, match=r"bundle: cannot be written \(.*No space left"):
-            save_run(replace(run, sanity={}), folder, overwrite=True)
+        assert_refused(
+            (
+                lambda: save_run(replace(run, sanity={}), folder, overwrite=True),
+                ResultsError,
+                r"bundle: cannot be written \(.*No space left",
+            ),
+        )
         assert {name: file_checksum(folder / name) for name in FILES} == before
 
-    def test_foreign_files_are_never_removed(self, run: EvaluationRun, tmp_path: Path) -> None:
-        folder = save_run(run, tmp_path / "bundle")
-        (folder / "thoughts.txt").write_text("mine")
-        with pytest.raises(ResultsError, match=r"bundle: holds thoughts.txt, which is not of its evaluation; move it"):
-            save_run(run, folder, overwrite=True)
-
     @pytest.mark.parametrize("overwrite", [False, True])
-    def test_another_folder_is_never_replaced(self, run: EvaluationRun, tmp_path: Path, overwrite: bool) -> None:
+    def test_another_folder_is_never_replaced(self, run: EvaluationRun, tmp_path: Path, *, overwrite: bool) -> None:
         (tmp_path / "work" / "deep").mkdir(parents=True)
         (tmp_path / "work" / "deep" / "thesis.tex").touch()
-        for words, refused in (
-            (
-                r"work: is not empty and holds no evaluation",
-                lambda: save_run(run, tmp_path / "work", overwrite=overwrite),
-            ),
-            (
-                r"thesis.tex: is a file; choose a folder that is new",
-                lambda: save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite),
-            ),
-            (r"out: expected a folder, found an empty path", lambda: save_run(run, "", overwrite=overwrite)),
-        ):
-            with pytest.raises(ResultsError, match=words):
-                refused()
+        assert_refused(
+            *[
+                (refused, ResultsError, words)
+                for words, refused in (
+                    (
+                        r"work: is not empty and holds no evaluation",
+                        lambda: save_run(run, tmp_path / "work", overwrite=overwrite),
+                    ),
+                    (
+                        r"thesis.tex: is a file; choose a folder that is new",
+                        lambda: save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite),
+                    ),
+                    (r"out: expected a folder, found an empty path", lambda: save_run(run, "", overwrite=overwrite)),
+                )
+            ],
+        )
 
     def test_an_empty_folder_is_fine_and_checkpoints_go(
         self, da_b: DeepAccident, results: Results, selection: SampleSelection, run: EvaluationRun, tmp_path: Path
@@ -224,8 +224,9 @@ class TestDamaged:
             path.unlink()
         else:
             path.write_text(content)
-        with pytest.raises(ResultsError, match=sentence):
-            read_bundle(path.parent)
+        assert_refused(
+            (lambda: read_bundle(path.parent), ResultsError, sentence),
+        )
 
     @pytest.mark.parametrize("fault", MISFITS)
     def test_a_summary_against_its_schema(self, run: EvaluationRun, tmp_path: Path, fault: str) -> None:
@@ -238,15 +239,11 @@ class TestDamaged:
             read_bundle(path.parent)
         assert len(str(e.value)) < 1000
 
-    def test_no_folder(self, tmp_path: Path) -> None:
-        with pytest.raises(ResultsError, match=r"nowhere: no such folder"):
-            read_bundle(tmp_path / "nowhere")
-
 
 def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: Path) -> None:
     bundle = read_bundle(save_run(run, tmp_path / "run"))
     path = bundle.folder / "scenarios.json"
-    stated = read(path)
-    path.write_text(json.dumps({**stated, "scenarios": ["s"]}), encoding="utf-8")
-    with pytest.raises(ResultsError, match=r"scenarios.json: expected `object`, got `array` - at `\$.scenarios`"):
-        bundle.scenarios()
+    path.write_text(json.dumps({**read(path), "scenarios": ["s"]}), encoding="utf-8")
+    assert_refused(
+        (bundle.scenarios, ResultsError, r"scenarios.json: expected `object`, got `array` - at `\$.scenarios`"),
+    )

@@ -4,27 +4,22 @@ import os
 import subprocess
 import sys
 import textwrap
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import evaluating
 import pytest
-from evaluating import BROKEN, Sums, number, number_and_trace
+from evaluating import BROKEN, Sums, number
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import evaluate_samples
-from deepaccident_devkit.evaluation import evaluator as evaluators
 
 VALUES = {f"{index:02d}": float(10 ** (index % 17)) + index / 10 for index in range(40)}
-
-
-def done(folder: Path) -> int:
-    """How many tasks were done."""
-    return len(list(folder.iterdir()))
 
 
 class TestWorkers:
@@ -39,14 +34,15 @@ class TestWorkers:
         assert evaluator.compute() == 6.0
         assert not evaluator.repeated
 
-    def test_a_number_of_workers_that_cannot_be(self) -> None:
-        with pytest.raises(ChoiceError, match="at least 1"):
-            evaluate_samples(Sums(), VALUES, number, workers=0)
-
     @pytest.mark.parametrize("load", [lambda task: (task,), partial(lambda task: (task,))])
     def test_a_function_that_workers_cannot_import(self, load: Callable[[float], tuple[float]]) -> None:
-        with pytest.raises(EvaluationError, match=r"load: 2 workers cannot import it .*a module of its own, or .*=1"):
-            evaluate_samples(Sums(), VALUES, load, workers=2)
+        assert_refused(
+            (
+                lambda: evaluate_samples(Sums(), VALUES, load, workers=2),
+                EvaluationError,
+                r"load: 2 workers cannot import it .*a module of its own, or .*=1",
+            ),
+        )
         assert evaluate_samples(Sums(), VALUES, load).compute() == sum_of_all()
 
     def test_a_function_of_the_script(self, tmp_path: Path) -> None:
@@ -71,16 +67,34 @@ class TestWorkers:
 
 
 class TestFaults:
-    @pytest.mark.slow
-    @pytest.mark.parametrize("workers", [1, 2])
-    def test_the_sample_is_named(self, workers: int) -> None:
-        with pytest.raises(EvaluationError, match=r"^x: cannot be evaluated: FileNotFoundError: predictions/7\.npz$"):
-            evaluate_samples(Sums(), {**VALUES, "x": BROKEN}, number, workers=workers)
+    def test_what_cannot_be_is_named(self, tmp_path: Path) -> None:
+        (tmp_path / "file").touch()
+        broken = {**VALUES, "x": BROKEN}
 
-    def test_arguments_that_do_not_fit(self) -> None:
-        with pytest.raises(EvaluationError, match=r"^00: cannot be evaluated: TypeError: ") as caught:
-            evaluate_samples(Sums(), {"00": 1.0}, lambda task: (task, task, task), workers=1)
-        assert isinstance(caught.value.__cause__, TypeError)
+        def evaluate(*arguments: Any, **how: Any) -> None:
+            evaluate_samples(Sums(), *arguments, **how)
+
+        assert_refused(
+            (partial(evaluate, VALUES, number, workers=0), ChoiceError, "at least 1"),
+            *[
+                (
+                    partial(evaluate, broken, number, workers=workers),
+                    EvaluationError,
+                    r"^x: .*Error: predictions/7\.npz$",
+                )
+                for workers in (1, 2)
+            ],
+            (
+                lambda: evaluate({"00": 1.0}, lambda task: [task] * 3, workers=1),
+                EvaluationError,
+                "^00: .*: TypeError: ",
+            ),
+            (
+                partial(evaluate, broken, number, workers=1, checkpoint=tmp_path / "file" / "counts"),
+                EvaluationError,
+                "file/counts: cannot be written",
+            ),
+        )
 
     @pytest.mark.parametrize("threads", [0, 3])
     def test_several_are_all_listed_in_order_and_the_others_are_counted(self, threads: int) -> None:
@@ -96,40 +110,6 @@ class TestFaults:
 
 
 class TestCheckpoints:
-    @pytest.mark.slow
-    @pytest.mark.parametrize("workers", [1, 2])
-    def test_a_killed_run_goes_on(self, tmp_path: Path, workers: int) -> None:
-        path, folder = tmp_path / "counts", tmp_path / "trace"
-        folder.mkdir()
-        values = {f"{index:03d}": 0.1 * index for index in range(160)}
-        script = f"""
-            from functools import partial
-            from pathlib import Path
-            from evaluating import Sums, number_and_trace
-            from deepaccident_devkit.evaluation import evaluate_samples
-
-            values = {{f"{{index:03d}}": 0.1 * index for index in range(160)}}
-            load = partial(number_and_trace, Path({str(folder)!r}))
-            evaluate_samples(Sums(), values, load, workers={workers}, checkpoint={str(path)!r})
-        """
-        process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(script)], env=environment())
-        try:
-            end = time.monotonic() + 60
-            while done(folder) < 40:
-                assert process.poll() is None
-                assert time.monotonic() < end
-                time.sleep(0.005)
-        finally:
-            process.kill()
-            process.wait()
-        kept = evaluators._BATCH * len(list(path.glob("kept/*")))
-        assert 0 < kept < 160
-        before = done(folder)
-        evaluator = evaluate_samples(Sums(), values, partial(number_and_trace, folder), workers=1, checkpoint=path)
-        assert evaluator.compute() == evaluate_samples(Sums(), values, number, workers=1).compute()
-        late = 2 * evaluators._BATCH  # workers of the killed run end a moment later
-        assert done(folder) <= before + 160 - kept + late
-
     def test_of_other_settings_or_damaged(self, tmp_path: Path) -> None:
         path = tmp_path / "counts"
         evaluate_samples(Sums(scale=2.0), {**VALUES, "00": 1000.0}, number, workers=1, checkpoint=path)
@@ -139,11 +119,6 @@ class TestCheckpoints:
         for kept in path.glob("kept/*"):
             kept.write_bytes(kept.read_bytes()[1:])
         assert evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=path).compute() == sum_of_all()
-
-    def test_where_none_can_be_written_is_told_at_once(self, tmp_path: Path) -> None:
-        (tmp_path / "file").touch()
-        with pytest.raises(EvaluationError, match="file/counts: cannot be written"):
-            evaluate_samples(Sums(), {"x": BROKEN}, number, workers=1, checkpoint=tmp_path / "file" / "counts")
 
 
 def sum_of_all() -> float:

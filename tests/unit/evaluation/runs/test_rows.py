@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError
@@ -61,8 +62,11 @@ def test_accidents(run: EvaluationRun) -> None:
     rows = sample_rows(run)
     assert sum(column(rows, "positive")) == run.result.positives == 3
     for distance, within in run.result.within.items():
-        sums = [sum(column(rows, f"{case}_{distance:g}m")) for case in ("tp", "fp", "fn")]
-        assert sums == [within.tp, within.fp, within.fn]
+        assert [sum(column(rows, f"{case}_{distance:g}m")) for case in ("tp", "fp", "fn")] == [
+            within.tp,
+            within.fp,
+            within.fn,
+        ]
     errors = [each for each in column(rows, "position_error") if each is not None]
     assert math.fsum(errors) / len(errors) == pytest.approx(run.result.position_error)
     assert len(errors) == run.result.within[15.0].tp
@@ -99,8 +103,9 @@ def test_detection(da_b: DeepAccident, selection: SampleSelection, tmp_path: Pat
 
 
 def test_warning(da_b: DeepAccident, results: Results, selection: SampleSelection) -> None:
-    run = evaluate_results(da_b, results, EvaluationSetup(task="warning", protocol="clean"), selection, workers=1)
-    rows = sample_rows(run)
+    rows = sample_rows(
+        evaluate_results(da_b, results, EvaluationSetup(task="warning", protocol="clean"), selection, workers=1)
+    )
     assert column(rows, "alarms_count") == [len(results.prediction(token)) for token in sorted(selection.tokens(da_b))]
     assert len(rows) == 6
 
@@ -111,8 +116,7 @@ class TestParquet:
         write_rows(tmp_path / "rows.parquet", rows, {"partial": None})
         names = ("a", "b", "c", "d", "e")
         read, stamp = read_rows(tmp_path / "rows.parquet")
-        assert read == [{name: row.get(name) for name in names} for row in rows]
-        assert stamp == {"partial": None}
+        assert (read, stamp) == ([{name: row.get(name) for name in names} for row in rows], {"partial": None})
 
     def test_no_rows(self, tmp_path: Path) -> None:
         write_rows(tmp_path / "rows.parquet", [], {})
@@ -121,16 +125,22 @@ class TestParquet:
     @pytest.mark.parametrize("content", [b"", b"PAR1 and no more"])
     def test_what_is_no_table(self, tmp_path: Path, content: bytes) -> None:
         (tmp_path / "rows.parquet").write_bytes(content)
-        with pytest.raises(ResultsError, match=r"rows.parquet: is no table of samples"):
-            read_rows(tmp_path / "rows.parquet")
+        assert_refused(
+            (lambda: read_rows(tmp_path / "rows.parquet"), ResultsError, r"rows.parquet: is no table of samples"),
+        )
 
     def test_a_table_of_somebody_else(self, tmp_path: Path) -> None:
         import pyarrow as pa
         from pyarrow import parquet
 
         parquet.write_table(pa.table({"token": ["a"]}), tmp_path / "rows.parquet")
-        with pytest.raises(ResultsError, match=r"rows.parquet: is no table of samples \(b'deepaccident'\)"):
-            read_rows(tmp_path / "rows.parquet")
+        assert_refused(
+            (
+                lambda: read_rows(tmp_path / "rows.parquet"),
+                ResultsError,
+                r"rows.parquet: is no table of samples \(b'deepaccident'\)",
+            ),
+        )
 
     @pytest.mark.parametrize("kind", BOMBS)
     def test_what_would_not_fit_into_memory(self, tmp_path: Path, kind: str) -> None:
@@ -152,14 +162,17 @@ class TestParquet:
         path = tmp_path / "rows.parquet"
         write_rows(path, [{"token": "é" * 20}], {})
         path.write_bytes(path.read_bytes().replace("é".encode(), b"\xff\xff"))
-        with pytest.raises(ResultsError, match="is no table of samples"):
-            read_rows(path)
+        assert_refused(
+            (lambda: read_rows(path), ResultsError, "is no table of samples"),
+        )
 
     def test_a_pipe_and_a_giant(self, tmp_path: Path) -> None:
         os.mkfifo(tmp_path / "pipe")
-        with pytest.raises(ResultsError, match=r"not a regular file \(a named pipe\)"):
-            read_rows(tmp_path / "pipe")
+        assert_refused(
+            (lambda: read_rows(tmp_path / "pipe"), ResultsError, r"not a regular file \(a named pipe\)"),
+        )
         with (tmp_path / "giant").open("wb") as file:
             file.truncate(3 << 30)
-        with pytest.raises(ResultsError, match="has 3,221,225,472 bytes"):
-            read_rows(tmp_path / "giant")
+        assert_refused(
+            (lambda: read_rows(tmp_path / "giant"), ResultsError, "has 3,221,225,472 bytes"),
+        )

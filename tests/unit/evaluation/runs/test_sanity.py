@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from memory_results import MemoryResults
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
@@ -19,16 +20,16 @@ from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, i
 from deepaccident_devkit.evaluation.runs import sanity as sanity_module
 from deepaccident_devkit.evaluation.runs.sanity import (
     SanityReport,
-    _class_tally,
-    _facts,
-    _follows,
-    _mistakes,
-    _near,
-    _same_size,
-    _Seen,
-    _tally,
-    _told,
+    Seen,
+    accident_tally,
+    are_followed,
+    are_near,
+    are_of_one_size,
     check_sanity,
+    class_tally,
+    facts_of,
+    mistakes_of,
+    tally_of,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.geometry import BevGrid
@@ -282,8 +283,9 @@ def test_a_few_samples_are_looked_at_always_the_same(da_motion: DeepAccident, ri
 
 def test_nothing_to_look_at(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
     results, setup = MemoryResults("motion", right["maps"]), EvaluationSetup(task="motion")
-    with pytest.raises(EvaluationError, match="there is no sample to look at"):
-        check_sanity(da_motion, results, setup, [])
+    assert_refused(
+        (lambda: check_sanity(da_motion, results, setup, []), EvaluationError, "there is no sample to look at"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -307,8 +309,8 @@ def test_nothing_to_look_at(da_motion: DeepAccident, right: dict[str, dict[str, 
 def test_from_which_shares_on_a_mistake_is_suspected(
     name: str, task: str, undone: int, given: int, whole: int, *, suspected: bool
 ) -> None:
-    half = _Seen(tallies={name: _tally(undone / 2, given / 2, whole / 2)})
-    warnings = list(_mistakes([half, half], task))
+    half = Seen(tallies={name: tally_of(undone / 2, given / 2, whole / 2)})
+    warnings = list(mistakes_of([half, half], task))
     assert len(warnings) == suspected
     told = f"({undone / whole:.0%} of the truth is hit once that is undone, {given / whole:.0%} as it is)"
     assert all(each.startswith(f"{name}: ") and each.endswith(told) for each in warnings)
@@ -317,19 +319,20 @@ def test_from_which_shares_on_a_mistake_is_suspected(
 def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
     two = np.array([[80.0, 20.0], [100.0, 100.0], [0.0, 0.0], [100.0, 100.0]])
     one = np.where([[0, 1], [0, 0], [0, 0], [0, 0]], 30.0, two)
-    (warning,) = _mistakes(
-        [_Seen(tallies={"x mirrored": two, "y mirrored": one, "one step late": _tally(90, 0, 100)})], "motion"
+    (warning,) = mistakes_of(
+        [Seen(tallies={"x mirrored": two, "y mirrored": one, "one step late": tally_of(90, 0, 100)})], "motion"
     )
     assert warning.startswith("y mirrored: ")  # and nothing of time beside it
     assert "(30% of the truth" in warning
     one_missed = np.array([[100.0, 0.0], [100.0, 1.0], [0.0, 0.0], [100.0, 1.0]])
-    assert list(_mistakes([_Seen(tallies={"x mirrored": one_missed})], "motion")) == []
+    assert list(mistakes_of([Seen(tallies={"x mirrored": one_missed})], "motion")) == []
 
 
 @pytest.mark.parametrize(("right", "every", "told"), [(4, 10, True), (5, 10, False), (0, 9, False)])
 def test_when_headings_look_random(right: int, every: int, *, told: bool) -> None:
-    seen = [_Seen(tallies={}, headings=(right, every - 3)), _Seen(tallies={}, headings=(0, 3))]
-    warnings = list(_mistakes(seen, "detection"))
+    warnings = list(
+        mistakes_of([Seen(tallies={}, headings=(right, every - 3)), Seen(tallies={}, headings=(0, 3))], "detection")
+    )
     assert [each.split(",")[0] for each in warnings] == [f"headings look random: {right} of {every} are right"] * told
 
 
@@ -348,7 +351,7 @@ def test_when_headings_look_random(right: int, every: int, *, told: bool) -> Non
     ],
 )
 def test_what_shows_without_labels(seen: list[dict[str, Any]], *, ranked: bool, told: list[str]) -> None:
-    found = list(_facts([_Seen(tallies={}, **each) for each in seen], ranked=ranked))
+    found = list(facts_of([Seen(tallies={}, **each) for each in seen], ranked=ranked))
     assert [each[: len(start)] for each, start in zip(found, told, strict=True)] == told
 
 
@@ -367,7 +370,7 @@ def test_classes_that_are_swapped(numbers: dict[tuple[int, int], int], swapped: 
     names = np.zeros((6, 6))
     for place, number in numbers.items():
         names[place] = number
-    found = _class_tally(names)
+    found = class_tally(names)
     assert found[0].tolist() == swapped
     changed = [row for row, column in numbers if row != column][: len(swapped)]
     assert found[1].tolist() == found[3].tolist() == [names[row].sum() for row in changed]
@@ -377,13 +380,13 @@ def test_classes_that_are_swapped(numbers: dict[tuple[int, int], int], swapped: 
 def test_what_is_near() -> None:
     true = np.array([[0.0, 0.0, 0.0]])
     found = np.array([[2.0, 0, 0], [1.99, 0, 0.69], [0, 0, 0.7], [0, 0, -0.71], [1.5, 1.5, 0], [-1.4, 1.4, -0.6]])
-    assert _near(found, true).tolist() == [[False, True, False, False, False, True]]
+    assert are_near(found, true).tolist() == [[False, True, False, False, False, True]]
     way = np.array([[4.0, 0.0]])
     for off, follows in (([0.99, 0.0], True), ([1.0, 0.0], False), ([0.0, -0.9], True), ([0.8, 0.8], False)):
-        assert _follows(np.array([[9.0, 9, 0], [*off, 5]]), np.zeros((1, 2)), way).tolist() == [follows]
+        assert are_followed(np.array([[9.0, 9, 0], [*off, 5]]), np.zeros((1, 2)), way).tolist() == [follows]
     size = np.array([[4.0, 2.0, 1.0]])
     sizes = np.array([[5.0, 1.5, 1.25], [5.1, 2, 1], [4, 1.4, 1], [4, 2, 1.3]])
-    assert _same_size(sizes, size).tolist() == [True, False, False, False]
+    assert are_of_one_size(sizes, size).tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize(
@@ -393,11 +396,11 @@ def test_what_is_near() -> None:
 def test_accidents_tell_only_where_both_cannot_be_near(
     undone: float, given: float, change: float, tally: list[int]
 ) -> None:
-    assert _told(undone, given, change, 1.0)[:, 0].tolist() == tally
+    assert accident_tally(undone, given, change, 1.0)[:, 0].tolist() == tally
 
 
 def test_what_is_looked_at_and_asked_for() -> None:
     """More would take longer; less would raise suspicion of right predictions."""
-    assert (sanity_module._SAMPLES, sanity_module._LISTS, sanity_module._FEWEST_FRAMES) == (20, 60, 3)
-    assert (sanity_module._MOVING, sanity_module._NEAR_IN_TIME) == (4.0, 0.15)
-    assert np.rad2deg(sanity_module._STRAIGHT) == pytest.approx(15)
+    assert (sanity_module.SAMPLES, sanity_module.LISTS, sanity_module.FEWEST_FRAMES) == (20, 60, 3)
+    assert (sanity_module.MOVING, sanity_module.NEAR_IN_TIME) == (4.0, 0.15)
+    assert np.rad2deg(sanity_module.STRAIGHT) == pytest.approx(15)

@@ -1,6 +1,7 @@
-"""What is evaluated and by which rules, the choices by their names, and what an evaluator is given of a sample."""
+"""What is evaluated and by which rules: choices by their names, the samples, and what an evaluator is given."""
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation import (
     Accident,
     AccidentContext,
@@ -22,10 +23,18 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.predictions import label_config
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.runs import Coverage, SampleSelection, coverage, default_selection
+from deepaccident_devkit.evaluation.runs.setups import (
+    TASK_PROTOCOLS,
+    EvaluationSetup,
+    SampleLoader,
+    agent_of,
+    scenario_of,
+)
 from deepaccident_devkit.evaluation.warning import WarningEvaluator
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.synth import SynthConfig, make_release
 
 ALL = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
 
@@ -42,8 +51,7 @@ class TestSetup:
         setup = EvaluationSetup(task=task, protocol=protocol)
         evaluator = setup.evaluator()
         assert type(evaluator) is kinds[task]
-        assert setup.rules == TASK_PROTOCOLS[task][protocol]
-        assert setup.as_dict()["settings"] == evaluator.settings
+        assert (setup.rules, setup.as_dict()["settings"]) == (TASK_PROTOCOLS[task][protocol], evaluator.settings)
         assert pickle.loads(pickle.dumps(setup)) == setup
 
     def test_switches_come_to_the_evaluator_and_cannot_be_changed(self) -> None:
@@ -75,8 +83,9 @@ class TestSetup:
         ],
     )
     def test_refused(self, named: dict[str, Any], error: type[Exception], sentence: str) -> None:
-        with pytest.raises(error, match=sentence):
-            EvaluationSetup(**named)
+        assert_refused(
+            (lambda: EvaluationSetup(**named), error, sentence),
+        )
 
 
 class TestLoader:
@@ -102,8 +111,10 @@ class TestLoader:
 
     def test_the_protocol_says_which_labels_and_else_the_results(self, motion: Results) -> None:
         for task, protocol, expected in (("accident", "paper", "released"), ("accident", "boxes", "clean")):
-            rules = EvaluationSetup(task=task, protocol=protocol).rules
-            assert label_config(rules, motion.form, horizon=2.0).protocol == expected
+            assert (
+                label_config(EvaluationSetup(task=task, protocol=protocol).rules, motion.form, horizon=2.0).protocol
+                == expected
+            )
 
     def test_accidents_have_their_context(self, da_motion: DeepAccident, token: str, tmp_path: Path) -> None:
         alarm = Accident(positions=np.zeros((2, 2)), time=1.0)
@@ -131,18 +142,15 @@ class TestLoader:
         np.testing.assert_allclose(found.boxes.center, da_motion.boxes(token, "lidar").center, atol=1e-6)
         assert truth.center.tolist() == detection_truth(da_motion, token, setup.rules).center.tolist()
 
-    def test_explicit_accidents_are_refused_before_any_sample_is_loaded(
-        self, da_motion: DeepAccident, token: str, tmp_path: Path
-    ) -> None:
+    def test_refused(self, da_motion: DeepAccident, motion: Results, token: str, tmp_path: Path) -> None:
         with ResultsWriter(tmp_path / "a.json", "accident") as writer:
             writer.add(token, [])
-        with pytest.raises(
-            EvaluationError, match=r"a.json: holds explicit accidents; the protocol 'released' compares"
-        ):
-            SampleLoader(da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident"))
-
-    def test_refused(self, da_motion: DeepAccident, motion: Results) -> None:
         assert_refused(
+            (
+                lambda: SampleLoader(da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident")),
+                EvaluationError,
+                ("a.json: holds explicit accidents", "protocol 'released'"),
+            ),
             (
                 lambda: SampleLoader(da_motion, motion, EvaluationSetup(task="detection")),
                 EvaluationError,
@@ -154,3 +162,145 @@ class TestLoader:
                 r"look 2 s ahead \(3 frames, 1 s apart, .*, less than the horizon of 2.5 s; add",
             ),
         )
+
+
+def test_the_released_list(da_motion: DeepAccident) -> None:
+    assert SampleSelection(split="train").tokens(da_motion) == da_motion.evaluation_samples("train")
+
+
+def test_scope_agents_and_horizon_choose(da_motion: DeepAccident) -> None:
+    one = SampleSelection(split="train", scope="all", agents=("infrastructure",), horizon=1.0).tokens(da_motion)
+    both = {f"type1_subtype1_{end}" for end in ("accident", "normal")}
+    assert ({token.split("/")[0] for token in one}, {agent_of(token) for token in one}) == (both, {"infrastructure"})
+    assert [int(token[-3:]) for token in one] == [25, 30] * 2
+
+
+def test_whole_scenarios_of_accidents_alone(da_motion: DeepAccident) -> None:
+    every, accidents = (
+        SampleSelection(split="train", samples="all", scope=scope, horizon=0.3).tokens(da_motion)
+        for scope in ("all", "accident")
+    )
+    assert accidents == [token for token in every if "_accident/" in token]
+    assert len(every) == 2 * len(accidents) == 2 * 5 * 7
+
+
+def test_defaults_by_task() -> None:
+    motion, warning = (
+        default_selection(EvaluationSetup(task=task, protocol=protocol, horizon=3.0))
+        for task, protocol in (("motion", "paper"), ("warning", "clean"))
+    )
+    assert motion == SampleSelection(split="val", horizon=3.0)
+    assert warning == SampleSelection(split="val", samples="all", scope="all", horizon=3.0)
+
+
+def test_agents_are_put_in_order() -> None:
+    given = SampleSelection(split="val", agents=("infrastructure", "ego_vehicle"))
+    assert given.agents == ("ego_vehicle", "infrastructure")
+    assert given.text() == (
+        "split val, samples evaluate (the last 2 s), scope accident, agents ego_vehicle, infrastructure"
+    )
+
+
+def test_parts_of_tokens() -> None:
+    scenario = "type1_subtype1_accident/Town01_type001_subtype0001_scenario00001"
+    sample = f"{scenario}/ego_vehicle/003"
+    assert (scenario_of(sample), agent_of(sample), agent_of("nonsense")) == (scenario, "ego_vehicle", "")
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"samples": "some"}, r"samples: expected one of evaluate, all, found 'some'"),
+        ({"scope": "normal"}, r"scope: expected one of accident, all, found 'normal'"),
+        ({"agents": ("ego",)}, r"agents: expected one of ego_vehicle, .*found 'ego'; did you mean 'ego_vehicle'"),
+        ({"agents": ()}, r"agents: expected at least one agent, or None for all, found none"),
+    ],
+)
+def test_wrong_choices(changes: dict[str, object], sentence: str) -> None:
+    assert_refused(
+        (lambda: SampleSelection(split="val", **changes), ChoiceError, sentence),
+    )
+
+
+def test_a_horizon_between_samples(da_b: DeepAccident) -> None:
+    assert_refused(
+        (
+            lambda: SampleSelection(split="val", horizon=1.2).tokens(da_b),
+            ConfigError,
+            r"horizon: samples to evaluate are 0.5 s apart, so that 1.2 s does not say",
+        ),
+    )
+
+
+@pytest.mark.slow
+def test_nothing_to_evaluate(tmp_path: Path) -> None:
+    short = make_release(tmp_path / "release", SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False))
+    assert_refused(
+        (
+            lambda: SampleSelection(split="val", agents=("ego_vehicle",)).tokens(
+                DeepAccident("v1", short, verbose=False)
+            ),
+            NotAvailableError,
+            r"val: this release has no labelled samples of ego_vehicle there",
+        ),
+    )
+
+
+def test_a_horizon_may_be_rounded_a_little(da_motion: DeepAccident) -> None:
+    exact = SampleSelection(split="train", horizon=1.5).tokens(da_motion)
+    assert SampleSelection(split="train", horizon=1.5 - 1e-9).tokens(da_motion) == exact
+
+
+MISSING, EXTRA, UNKNOWN = ({"missing": ("a", "b")}, {"extra": ("c",)}, {"unknown": ("d", "e", "f")})
+
+
+@pytest.mark.parametrize(
+    ("parts", "told"),
+    [
+        ([], ["all 6 samples have a prediction, and nothing else has"]),
+        ([MISSING], ["2 of 6 samples have no prediction (a, b)"]),
+        ([EXTRA], ["1 predictions are of samples that are not evaluated (c)", "leave them out with --allow-partial"]),
+        ([UNKNOWN], ["3 predictions are of no sample of this release (d, e, f)"]),
+        ([MISSING, EXTRA], ["2 of 6 samples have no", "1 predictions are of samples that are not evaluated (c)"]),
+        ([EXTRA, UNKNOWN], ["1 predictions are of samples", "3 predictions are of no sample"]),
+        ([{"missing": tuple("abcd")}], ["4 of 6 samples have no prediction (a, b, c, …)"]),
+        (
+            [MISSING, {"splits": ("train", "val"), "agents": ("ego_vehicle",)}],
+            ["2 of 6 samples", "the predictions are of the splits train, val and the agents ego_vehicle"],
+        ),
+    ],
+)
+def test_what_is_told_of_the_coverage(parts: list[dict[str, Any]], told: list[str]) -> None:
+    found = Coverage(expected=6, **{name: each for part in parts for name, each in part.items()})
+    assert found.is_complete is (parts == [])
+    texts = found.to_text().replace("True); no", "True), no").split("; ")
+    assert [text[: len(start)] for text, start in zip(texts, told, strict=True)] == told
+
+
+@pytest.fixture(scope="module")
+def expected(da_b: DeepAccident, selection: SampleSelection) -> list[str]:
+    return selection.tokens(da_b)
+
+
+def test_missing_extra_and_unknown_three_of_each(
+    da_b: DeepAccident, selection: SampleSelection, expected: list[str]
+) -> None:
+    extra = replace(selection, agents=("ego_vehicle_behind",)).tokens(da_b)
+    found = coverage(da_b, [*expected[4:], *extra, "mine/1", "mine/2", "mine/3", "mine/4"], selection)
+    assert (found.expected, found.missing, found.extra) == (6, tuple(expected[:4]), tuple(sorted(extra)))
+    assert found.unknown == ("mine/1", "mine/2", "mine/3", "mine/4")
+    assert found.to_text().startswith(
+        f"4 of 6 samples have no prediction ({', '.join(expected[:3])}, …); "
+        f"2 predictions are of samples that are not evaluated ({', '.join(sorted(extra))}); "
+        "4 predictions are of no sample of this release (mine/1, mine/2, mine/3, …)"
+    )
+
+
+def test_what_the_predictions_are_of(da_b: DeepAccident, selection: SampleSelection) -> None:
+    others = SampleSelection(split="train", samples="all", scope="all", agents=("infrastructure", "ego_vehicle"))
+    found = coverage(da_b, [*others.tokens(da_b), "mine"], selection)
+    assert (found.splits, found.agents) == (("train",), ("ego_vehicle", "infrastructure"))
+    assert found.to_text().endswith(
+        "; the predictions are of the splits train and the agents ego_vehicle, infrastructure"
+    )
+    assert "the predictions are of" not in coverage(da_b, ["mine"], selection).to_text()

@@ -1,26 +1,40 @@
-"""A summary for people: of a run and of a stored bundle alike, marked where it is partial."""
+"""Summaries for people: of a run and of a stored bundle alike, marked where it is partial; notes, and predictors."""
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pytest
+from refusals import assert_refused
+
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
     Partial,
     SampleSelection,
+    bundles,
     evaluate_results,
     read_bundle,
     results_text,
     save_run,
     summary_text,
 )
+from deepaccident_devkit.evaluation.runs.bundles import chosen_threshold
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.evaluation.runs.text import _notes
+from deepaccident_devkit.evaluation.runs.text import (
+    notes_of,
+    number_text,
+    predictor_tables,
+    predictors_text,
+    reading_notes,
+)
 
 Write = Callable[..., Results]
 
@@ -58,16 +72,16 @@ def test_intervals_and_why_there_is_none(run: EvaluationRun) -> None:
 
 
 def test_switches_and_no_intervals(run: EvaluationRun) -> None:
-    switched = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
-    lines = lines_of(summary_text(switched.summary()))
+    lines = lines_of(
+        summary_text(replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5})).summary())
+    )
     assert "task accident, protocol boxes with reading.danger_distance=0.5" in lines
     assert "number value" in lines
 
 
 def test_the_bundle_on_disk_reads_alike(run: EvaluationRun, tmp_path: Path) -> None:
     broken = run.broken_down(["all", "agent"], Resampling(resamples=10))
-    stored = read_bundle(save_run(broken, tmp_path / "bundle")).summary
-    assert summary_text(stored) == summary_text(broken.summary())
+    assert summary_text(read_bundle(save_run(broken, tmp_path / "bundle")).summary) == summary_text(broken.summary())
 
 
 def test_results_of_other_choices_stand_beside(
@@ -105,7 +119,7 @@ def test_what_a_results_file_holds(
 
 def test_notes_of_results_that_stand_beside_say_of_which() -> None:
     metrics = {"notes": ["both"], "beside": {"paper": {"notes": ["both", "its own"]}}}
-    assert list(_notes(metrics)) == ["both", "if paper: its own"]
+    assert list(notes_of(metrics)) == ["both", "if paper: its own"]
 
 
 SUMMARY: dict[str, Any] = {
@@ -181,3 +195,203 @@ def test_of_meta_every_letter_is_shown(tmp_path: Path) -> None:
         writer.add("t/s/ego_vehicle/001", [])
     *_, line = results_text(read_results(tmp_path / "a.json")).splitlines()
     assert line == 'meta         {"über": "π"}'
+
+
+FORM = {
+    "stored": "heads",
+    "x": [-50.0, 50.0, 0.5],
+    "y": [-50.0, 50.0, 0.5],
+    "orientation": "devkit",
+    "predictions": 6,
+    "frames": 5,
+    "step": 0.5,
+    "labels": None,
+}
+PATHS = {"path_true_positive": 9, "path_false_negative": 1, "ranges": {"30x30": {}, "100x100": {}}}
+
+
+def notes(
+    task: str = "motion", protocol: str = "released", *, metrics: dict[str, Any] | None = None, **form: Any
+) -> list[str]:
+    told = None if task == "detection" else FORM | form
+    return reading_notes(
+        {"task": task, "protocol": protocol, "horizon": 2.0, "metrics": metrics or PATHS, "results": {"form": told}}
+    )
+
+
+@pytest.mark.parametrize("task", ["motion", "accident"])
+def test_the_published_form_has_none(task: str) -> None:
+    assert notes(task) == []
+
+
+def test_other_cells() -> None:
+    small = [-25.0, 25.0, 0.5]
+    cells, wide = notes(x=small, y=small)
+    assert cells.startswith(
+        "the maps have cells of 0.5 m, x from -25 to 25 m, y from -25 to 25 m, and so have the labels"
+    )
+    assert wide == "100x100: the maps end before this range does; only their cells count"
+    [coarse] = notes(x=[-50.0, 50.0, 1.0])
+    assert coarse.startswith("the maps have cells of 1 m, x from -50 to 50 m")
+
+
+def test_past_frames() -> None:
+    [note] = notes(frames=7)
+    assert note.startswith("predictions have 7 frames; the first 5 are evaluated")
+
+
+def test_published_accidents_are_of_six_heads() -> None:
+    maps, single = notes("accident", stored="instances", predictions=1)
+    assert maps.startswith("instance maps: cannot be compared with published APA")
+    assert single.startswith("predictions of a sample: 1; published numbers are of 6")
+    assert notes("accident", "paper", stored="instances", predictions=1) == []
+
+
+def test_few_paths() -> None:
+    [note] = notes(metrics=PATHS | {"path_true_positive": 31, "path_false_negative": 193})
+    assert note == "31 of 224 true paths have a match; min_ade, min_fde and miss_rate are of these alone"
+
+
+def test_detection_of_the_released_code() -> None:
+    [note] = notes("detection")
+    assert note.startswith("released: hidden boxes are truth")
+    assert notes("detection", "paper") == []
+
+
+@pytest.mark.parametrize("field", ["x", "y"])
+def test_each_axis_is_that_of_published_numbers(field: str) -> None:
+    assert len(notes(**{field: [-50.0, 50.0, 0.25]})) == 1
+    [_, wide] = notes(**{field: [-50.0, 49.5, 0.5]})
+    assert wide.startswith("100x100: the maps end before")
+    ranges = PATHS | {"ranges": {"30x120": {}, "100x100": {}, "102x30": {}}}
+    assert [note.split(":")[0] for note in notes(metrics=ranges, **{field: [-51.0, 51.0, 0.5]})[1:]] == [
+        "30x120",
+        "102x30",
+    ]
+
+
+def test_up_to_where_numbers_are_as_published() -> None:
+    assert notes(frames=5) == notes(frames=1) == []
+    assert notes(frames=6)[0].startswith("predictions have 6 frames; the first 5 are evaluated")
+    assert notes(frames=3, step=1.0) == notes(frames=8, step=0.3) == []
+    assert notes(frames=4, step=1.0)[0].startswith("predictions have 4 frames; the first 3 are evaluated")
+    [note] = notes("accident", predictions=5)
+    assert note == "predictions of a sample: 5; published numbers are of 6, five samples and then their mean"
+    assert notes("accident", predictions=7) == []
+    [note] = notes(metrics=PATHS | {"path_true_positive": 89, "path_false_negative": 11})
+    assert note.startswith("89 of 100 true paths")
+    assert notes("warning", "clean", metrics={}) == []
+
+
+TRAINED = "type1_subtype1_accident/Town01_000"
+OTHER = "type1_subtype1_normal/Town02_000/ego_vehicle/001"
+CLEAN = ("auc_ahead", "twin_wins", "average_precision", "mean_time")
+AT_POINT = (
+    "precision",
+    "time_in_alarm",
+    "alarm_seconds_per_minute",
+    "episodes_per_minute",
+    "recall",
+    "tta0",
+    "tta_hit",
+)
+FIELD = ("average_precision", "mean_time", "time_at_r80")
+
+
+def clean(first: float, **more: Any) -> dict[str, Any]:
+    """Numbers that rise by a hundredth from column to column."""
+    columns = dict(zip((*CLEAN, *AT_POINT), (first + at / 100 for at in range(11)), strict=True))
+    operating = {name: columns.pop(name) for name in AT_POINT} | {"threshold": 0.123456}
+    return columns | {"operating": operating, "tta0_after": {}, "best_f1": 0.25, "quiet": None} | more
+
+
+def test_a_table_a_group_of_the_protocol_clean() -> None:
+    groups = {"ego_involved": clean(0.1), "bystander": clean(0.2, tta0_after={"0.0": 1.5, "0.3": None})}
+    references = {"always": {"ego_involved": clean(9.95), "bystander": clean(-9.95)}}
+    metrics = {"groups": groups, "references": references, "operating_by": "given"}
+    one, other = predictor_tables(metrics)
+    assert one.rows[0] == (
+        *("ego_involved", "auc_ahead", "twin_wins", "AP", "mTTA", "precision", "in alarm", "s/min", "runs/min"),
+        *("recall", "tta0", "tta_hit"),
+    )
+    assert one.rows[1] == ("given", *(f"{0.1 + at / 100:.3f}" for at in range(11)))
+    assert one.rows[2] == ("always", "9.950", "9.960", "9.970", "9.980", "9.990", *(["10.0"] * 6))
+    assert [row[:2] for row in other.rows[1:]] == [("given", "0.200"), ("always", "-9.950")]
+    assert one.notes == ("threshold 0.1235 (given); for another split: best_f1 0.250, quiet –",)
+    assert other.notes[1:] == ("tta0 if the two who collide are told after a latency of 0.0 s: 1.500 s, 0.3 s: –",)
+    assert predictors_text(metrics) == f"{one.to_text()}\n\n{other.to_text()}"
+    metrics |= {"operating_by": "recall"}
+    groups["ego_involved"]["operating"]["threshold"] = None
+    assert (
+        predictor_tables(metrics)[0]
+        .notes[0]
+        .startswith("threshold none (of recall 0.8, or the highest, on these recordings); for")
+    )
+
+
+@pytest.mark.parametrize(
+    ("code", "more"),
+    [
+        ("ustring", {}),
+        ("dsta", {"P@R80": "precision_at_r80"}),
+        ("drive", {"P@0.5": "precision_at_half", "R@0.5": "recall_at_half", "TTA@0.5": "time_at_half"}),
+        ("dad", {}),
+    ],
+)
+def test_a_published_code_has_columns_of_its_own(code: str, more: dict[str, str]) -> None:
+    names = (*FIELD, *more.values())
+    figures = {f"{code} bystander": {name: at / 8 for at, name in enumerate(names)}}
+    (table,) = predictor_tables({"figures": figures, "references": {"never": figures}})
+    assert table.rows[0] == (f"{code} bystander", "AP", "mTTA", "TTA@R80", *more)
+    assert table.rows[1:] == tuple(
+        (name, *(f"{at / 8:.3f}" for at in range(len(names)))) for name in ("given", "never")
+    )
+    assert table.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (0.0, "0.000"), (9.9994, "9.999"), (-10.0, "-10.0"), (10.0, "10.0"), (-9.5, "-9.500")],
+)
+def test_numbers(value: float | None, text: str) -> None:
+    assert number_text(value) == text
+
+
+def stored(monkeypatch: pytest.MonkeyPatch, **summary: Any) -> None:
+    """A bundle with this summary, of one scenario."""
+    bundle = SimpleNamespace(
+        summary={"task": "warning", "protocol": "clean", **summary}, scenarios=lambda: {TRAINED: "hash"}
+    )
+    monkeypatch.setattr(bundles, "read_bundle", lambda _: bundle)
+
+
+@pytest.mark.parametrize(
+    ("summary", "by", "error", "sentence"),
+    [
+        (
+            {"task": "motion"},
+            "quiet",
+            EvaluationError,
+            "^b: is an evaluation of motion clean; expected one of warning, p",
+        ),
+        (
+            {"protocol": "field"},
+            "quiet",
+            EvaluationError,
+            "^b: is an evaluation of warning field; expected one of warn",
+        ),
+        ({}, "quiet", ResultsError, "^b: its summary has no metrics of warnings; evaluate again$"),
+        ({"prevented": None}, "braking", ResultsError, "no prevented accidents; evaluate again with --prevented$"),
+        ({"metrics": {"groups": {"bystander": {}}}}, "quiet", ResultsError, "has no metrics of warnings"),
+        ({"metrics": {"groups": {}}}, "best_f1", EvaluationError, "^b: found no threshold by best_f1; choose another"),
+        ({"metrics": {"groups": {"bystander": {"quiet": None}}}}, "quiet", EvaluationError, "found no threshold by qu"),
+        ({"metrics": {"groups": {"bystander": {"quiet": math.inf}}}}, "quiet", EvaluationError, "found no threshold"),
+    ],
+)
+def test_evaluations_without_a_threshold(
+    monkeypatch: pytest.MonkeyPatch, summary: dict[str, Any], by: Any, error: type[Exception], sentence: str
+) -> None:
+    stored(monkeypatch, **summary)
+    assert_refused(
+        (lambda: chosen_threshold(Path("b"), by, [OTHER]), error, sentence),
+    )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError
@@ -122,11 +123,9 @@ class TestNamed:
     @pytest.mark.parametrize("kind", ["label", "meta", "calib"])
     def test_a_file_of_a_scenario(self, bundle: Path, own_release: Path, kind: str) -> None:
         opened = DeepAccident(dataroot=own_release, verbose=False)
-        pattern = "val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*"
-        path = min(own_release.glob(pattern))
+        path = min(own_release.glob("val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*"))
         path.write_bytes(path.read_bytes() + b"\n")
-        token = min(opened.split_scenarios("val"))
-        verification = verify(bundle, opened)
+        token, verification = min(opened.split_scenarios("val")), verify(bundle, opened)
         assert found(verification) == ["metrics_summary.json: release/fingerprint", f"scenarios.json: {token}/{kind}"]
         assert "edited in place" in verification.notes[0]
 
@@ -155,8 +154,9 @@ class TestNamed:
     def test_other_results(
         self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
     ) -> None:
-        other = write_accidents(tmp_path / "other.json", results.tokens, moved=1.0)
-        differing = found(verify(bundle, da_b, results=other.path))
+        differing = found(
+            verify(bundle, da_b, results=write_accidents(tmp_path / "other.json", results.tokens, moved=1.0).path)
+        )
         assert {each.split(": ")[0] for each in differing} == {"metrics_summary.json", "counts.json", "samples.parquet"}
         assert "metrics_summary.json: results/fingerprint" in differing
 
@@ -220,21 +220,14 @@ class TestNamed:
     def test_many_are_counted(self) -> None:
         many = tuple(Difference(where=str(index), stored=0, found=1) for index in range(22))
         text = Verification(folder=Path("b"), samples=3, differences=many, notes=("so",)).to_text().splitlines()
-        assert text[0] == "b: 22 differences; 3 samples evaluated again"
-        assert text[-2:] == ["  and 2 more", "note: so"]
+        assert (text[0], text[-2:]) == ("b: 22 differences; 3 samples evaluated again", ["  and 2 more", "note: so"])
         assert len(text) == 23
 
 
-class TestRefused:
-    def test_no_results(self, bundle: Path, da_b: DeepAccident, results: Results) -> None:
-        results.path.unlink()
-        with pytest.raises(ResultsError, match=r"accidents.json: no such file or folder"):
-            verify(bundle, da_b)
-
-
 def read_scenarios(bundle: Path, ending: str) -> list[str]:
-    stored = json.loads((bundle / "scenarios.json").read_text())["scenarios"]
-    return [token for token in stored if f"{ending}/" in token]
+    return [
+        token for token in json.loads((bundle / "scenarios.json").read_text())["scenarios"] if f"{ending}/" in token
+    ]
 
 
 @pytest.mark.parametrize(
@@ -255,8 +248,7 @@ def test_differing(stored: Any, found: Any, expected: list[tuple[str, Any, Any]]
 
 
 def test_long_values_are_cut_in_a_line() -> None:
-    text = Difference(where="x", stored="y" * 100, found=ABSENT).text()
-    assert text == f"x: stored '{'y' * 58}…, found absent"
+    assert Difference(where="x", stored="y" * 100, found=ABSENT).text() == f"x: stored '{'y' * 58}…, found absent"
 
 
 class TestStrangers:
@@ -289,8 +281,13 @@ class TestStrangers:
         (bundle / name).unlink()
         os.mkfifo(bundle / name)
         if name == "metrics_summary.json":
-            with pytest.raises(ResultsError, match=r"metrics_summary.json: not a regular file \(a named pipe\)"):
-                verify(bundle, da_b)
+            assert_refused(
+                (
+                    lambda: verify(bundle, da_b),
+                    ResultsError,
+                    r"metrics_summary.json: not a regular file \(a named pipe\)",
+                ),
+            )
         else:
             assert name in found(verify(bundle, da_b))
 
@@ -298,13 +295,19 @@ class TestStrangers:
         self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path
     ) -> None:
         command = f"evaluate verify {bundle} --dataroot {da_b.dataroot} --results {results.path}"
-        with pytest.raises(ResultsError, match=f"are opened only if you give them: deepaccident {command}$"):
-            verify(bundle, da_b, results=None)
+        assert_refused(
+            (
+                lambda: verify(bundle, da_b, results=None),
+                ResultsError,
+                f"are opened only if you give them: deepaccident {command}$",
+            ),
+        )
         splits = tmp_path / "mine.txt"
         os.mkfifo(splits)
         changed(bundle / "metrics_summary.json", lambda summary: summary.update(split=str(splits)))
-        with pytest.raises(ResultsError, match=f"{command} --split {splits}$"):
-            verify(bundle, da_b)
+        assert_refused(
+            (lambda: verify(bundle, da_b), ResultsError, f"{command} --split {splits}$"),
+        )
         splits.unlink()
         scenarios = sorted({token.rsplit("/", 2)[0] for token in results.tokens})
         splits.write_text("".join(f"{token.replace('/', ' ')}\n" for token in scenarios))
@@ -325,8 +328,13 @@ class TestStrangers:
         if kind == "a pipe":
             copy.unlink()
             os.mkfifo(copy)
-        with pytest.raises(ResultsError, match=r"bundle: results(/accidents.json)? is (a link|not a regular file)"):
-            verify(bundle, da_b)
+        assert_refused(
+            (
+                lambda: verify(bundle, da_b),
+                ResultsError,
+                r"bundle: results(/accidents.json)? is (a link|not a regular file)",
+            ),
+        )
 
     @pytest.mark.parametrize(
         "resampling",
@@ -349,10 +357,14 @@ class TestStrangers:
         )
         assert "all numbers" in found(verify(bundle, da_b))
 
+    def test_no_results(self, bundle: Path, da_b: DeepAccident, results: Results) -> None:
+        results.path.unlink()
+        assert_refused((lambda: verify(bundle, da_b), ResultsError, ("accidents.json", "no such file or folder")))
+
     def test_deep_nesting_is_refused(self, bundle: Path, da_b: DeepAccident) -> None:
-        path = bundle / "counts.json"
-        path.write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
+        (bundle / "counts.json").write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
         assert "counts.json" in found(verify(bundle, da_b))
         (bundle / "metrics_summary.json").write_text("[" * 900 + "]" * 900)
-        with pytest.raises(ResultsError, match="is nested more than 64 levels deep"):
-            verify(bundle, da_b)
+        assert_refused(
+            (lambda: verify(bundle, da_b), ResultsError, "is nested more than 64 levels deep"),
+        )

@@ -1,11 +1,13 @@
-"""From a results file to an evaluation: what is refused early, what is partial, what a broken-off run goes on with."""
+"""From a results file to an evaluation: refusals, partial and broken-off runs, workers and executors."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
@@ -19,15 +21,20 @@ from deepaccident_devkit.evaluation.runs import (
     SampleSelection,
     evaluate_results,
     evaluation_run,
+    save_run,
     scenario_hashes,
+    verify_bundle,
 )
-from deepaccident_devkit.evaluation.runs.evaluation_run import _partial, breakdowns_of, check_metas
+from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of, check_metas, partial_of
+from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import (
     Coverage,
     EvaluationSetup,
+    SampleLoader,
     TaskName,
     checkpoint_path,
     remove_checkpoints,
+    scenario_of,
 )
 from deepaccident_devkit.splits import save_selection
 
@@ -50,9 +57,7 @@ class TestRun:
         by_hand = AccidentEvaluator("boxes")
         for token in results.tokens:
             by_hand.update(token, results.prediction(token), None, accident_context(da_b, token, 2.0))
-        assert run.result == by_hand.compute()
-        assert run.result.positives == 3
-        assert run.partial is None
+        assert (run.result, run.result.positives, run.partial) == (by_hand.compute(), 3, None)
         assert run.attributes == sample_attributes(da_b, results.tokens)
         assert set(run.times_to_impact.values()) == {0.5, None}
 
@@ -82,8 +87,13 @@ class TestRun:
         assert [each.by for each in broken.breakdowns] == ["agent", "all"]
         assert broken.breakdowns[1].groups[0].result == run.result
         assert [each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns] == list(BREAKDOWNS)
-        with pytest.raises(ChoiceError, match=r"by: expected one of all, .*, found 'wether'; did you mean 'weather'"):
-            run.broken_down(["wether"])
+        assert_refused(
+            (
+                lambda: run.broken_down(["wether"]),
+                ChoiceError,
+                r"by: expected one of all, .*, found 'wether'; did you mean 'weather'",
+            ),
+        )
 
 
 @pytest.mark.usefixtures("nothing_long")
@@ -91,15 +101,25 @@ class TestRefused:
     def test_a_kind_that_the_task_does_not_take(
         self, da_b: DeepAccident, results: Results, selection: SampleSelection
     ) -> None:
-        with pytest.raises(EvaluationError, match=r"holds accident results; motion is evaluated from motion results"):
-            evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection),
+                EvaluationError,
+                r"holds accident results; motion is evaluated from motion results",
+            ),
+        )
 
     def test_predictions_that_do_not_look_far_enough(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
     ) -> None:
         results = write_motion(tmp_path / "motion", selection.tokens(da_b))
-        with pytest.raises(EvaluationError, match=r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the"):
-            evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection),
+                EvaluationError,
+                r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the",
+            ),
+        )
 
     @pytest.mark.parametrize(("task", "protocol"), [("accident", "boxes"), ("warning", "clean")])
     def test_scenarios_without_meta_are_counted_before_the_start(
@@ -113,8 +133,15 @@ class TestRefused:
         with ResultsWriter(tmp_path / "none.json", "accident") as writer:
             for sample in every.tokens(partial):
                 writer.add(sample, [])
-        with pytest.raises(EvaluationError, match=r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'"):
-            evaluate_results(partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every)
+        assert_refused(
+            (
+                lambda: evaluate_results(
+                    partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every
+                ),
+                EvaluationError,
+                r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'",
+            ),
+        )
         save_selection(partial.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
         chosen = replace(every, split=str(tmp_path / "mine.txt"))
         check_metas(partial, chosen.tokens(partial), chosen.split)
@@ -125,25 +152,38 @@ class TestRefused:
         results = write_motion(tmp_path / "motion", selection.tokens(da_b))
         shard = next((tmp_path / "motion" / "shards").iterdir())
         shard.write_bytes(shard.read_bytes()[:-100])
-        with pytest.raises(ResultsError, match=shard.name):
-            evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection),
+                ResultsError,
+                shard.name,
+            ),
+        )
 
     def test_missing_samples(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
     ) -> None:
         results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
         missing = selection.tokens(da_b)[0]
-        with pytest.raises(
-            ResultsError, match=rf"some.json: 1 of 6 samples have no prediction \({missing}\); the pred"
-        ):
-            evaluate_results(da_b, results, SETUP, selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, SETUP, selection),
+                ResultsError,
+                rf"some.json: 1 of 6 samples have no prediction \({missing}\); the pred",
+            ),
+        )
 
     def test_nothing_in_common(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
     ) -> None:
         other = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
-        with pytest.raises(ResultsError, match=r"of the splits train .*; nothing is left to evaluate"):
-            evaluate_results(da_b, other, SETUP, selection, allow_partial=True)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, other, SETUP, selection, allow_partial=True),
+                ResultsError,
+                r"of the splits train .*; nothing is left to evaluate",
+            ),
+        )
 
 
 class TestPartial:
@@ -171,11 +211,15 @@ class TestPartial:
         tokens = selection.tokens(da_b)
         extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
         results = write_accidents(tmp_path / "more.json", [*tokens, *extra])
-        with pytest.raises(ResultsError, match=r"\); leave them out with --allow-partial .*; no sample"):
-            evaluate_results(da_b, results, SETUP, selection)
+        assert_refused(
+            (
+                lambda: evaluate_results(da_b, results, SETUP, selection),
+                ResultsError,
+                r"\); leave them out with --allow-partial .*; no sample",
+            ),
+        )
         run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
-        assert run.evaluator.tokens == set(tokens)
-        assert run.partial is None
+        assert (run.evaluator.tokens, run.partial) == (set(tokens), None)
 
 
 class TestBrokenOff:
@@ -215,8 +259,7 @@ class TestBrokenOff:
         first = broken_after(9)
         with pytest.raises(KeyboardInterrupt):
             self.run_of(da_b, ten, tmp_path / "out")
-        then = broken_after(None)
-        run = self.run_of(da_b, ten, tmp_path / "out")
+        then, run = broken_after(None), self.run_of(da_b, ten, tmp_path / "out")
         assert [*first[:8], *then] == list(ten.tokens)
         assert run.summary() == self.run_of(da_b, ten, tmp_path / "elsewhere").summary()
 
@@ -249,8 +292,7 @@ class TestBrokenOff:
                 (SETUP, ["x"], {"release": "c"}),
             )
         }
-        assert len(names) == 4
-        assert {name.parent for name in names} == {tmp_path / "out.unfinished" / "counts"}
+        assert (len(names), {name.parent for name in names}) == (4, {tmp_path / "out.unfinished" / "counts"})
 
     def test_removing_leaves_what_is_not_its_own(self, tmp_path: Path) -> None:
         folder = tmp_path / "out.unfinished"
@@ -269,5 +311,98 @@ def test_warnings_are_broken_down_by_whole_recordings_alone() -> None:
 
 
 def test_extra_samples_are_those_of_other_lists_and_those_of_no_release() -> None:
-    found = _partial(Coverage(expected=5, missing=("a",), extra=("b", "c"), unknown=("d",)))
+    found = partial_of(Coverage(expected=5, missing=("a",), extra=("b", "c"), unknown=("d",)))
     assert (found.missing, found.extra, found.expected, found.evaluated) == (1, 3, 5, 4)
+
+
+FEW = Resampling(resamples=5)
+
+
+@dataclass(frozen=True)
+class Job:
+    """An evaluation."""
+
+    dataset: DeepAccident
+    results: Results
+    selection: SampleSelection
+    setup: EvaluationSetup = SETUP
+
+    def whole(self, out: Path | None = None, **how: Any) -> EvaluationRun:
+        return evaluate_results(
+            *(self.dataset, self.results, self.setup, self.selection), **{"workers": 1, **how}, out=out
+        )
+
+
+@pytest.fixture(scope="module")
+def job(da_b: DeepAccident, write_accidents: Write, tmp_path_factory: pytest.TempPathFactory) -> Job:
+    """All six scenarios: thirty samples."""
+    folder = tmp_path_factory.mktemp("shards")
+    save_selection(da_b.find(), folder / "all.txt")
+    every = SampleSelection(split=str(folder / "all.txt"), scope="all")
+    return Job(da_b, write_accidents(folder / "accidents.json", every.tokens(da_b)), every)
+
+
+@pytest.fixture(scope="module")
+def bundle(job: Job, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_run(job.whole().broken_down(["all", "town"], FEW), tmp_path_factory.mktemp("bundle") / "whole")
+
+
+@pytest.fixture
+def loaded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The samples that are evaluated."""
+    tokens: list[str] = []
+    original = SampleLoader.__call__
+
+    def load(loader: SampleLoader, token: str) -> tuple[Any, ...]:
+        tokens.append(token)
+        return original(loader, token)
+
+    monkeypatch.setattr(SampleLoader, "__call__", load)
+    return tokens
+
+
+def test_processes_that_are_given_one_folder_share_the_samples(job: Job, tmp_path: Path, loaded: list[str]) -> None:
+    with ThreadPoolExecutor(3) as threads:
+        runs = list(threads.map(lambda _: job.whole(tmp_path / "out"), range(3)))
+    assert sorted(loaded) == sorted(job.results.tokens)
+    assert all(run.summary() == job.whole().summary() for run in runs)
+
+
+class Counting(ThreadPoolExecutor):
+    """Threads that count what they are given."""
+
+    given = 0
+
+    def submit(self, *arguments: Any, **named: Any) -> Any:
+        self.given += 1
+        return super().submit(*arguments, **named)
+
+
+CALLS: dict[str, Callable[..., Any]] = {
+    "evaluate": lambda job, **how: job.whole(**how).summary(),
+    "hashes": lambda job, **how: scenario_hashes(job.dataset, map(scenario_of, job.results.tokens), **how),
+    "breakdowns": lambda job, **how: job.whole().broken_down(["agent", "all"], FEW, **how).summary(),
+    "sanity": lambda job, **how: check_sanity(job.dataset, job.results, SETUP, job.results.tokens, **how),
+}
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_any_executor_gives_the_same(job: Job, call: str) -> None:
+    with Counting(2) as executor:
+        found = CALLS[call](job, executor=executor)
+        assert executor.given > 0
+    assert found == CALLS[call](job, workers=1)
+
+
+def test_a_bundle_is_verified_on_any_executor(job: Job, bundle: Path) -> None:
+    with Counting(2) as executor:
+        found = verify_bundle(bundle, job.dataset, results=job.results, split=job.selection.split, executor=executor)
+        assert executor.given > 6 + 4  # hashes, samples and breakdowns
+    assert found.is_same, found.to_text()
+
+
+def test_checks_of_motion_run_on_any_executor(job: Job, tmp_path: Path, write_motion: Write) -> None:
+    results = write_motion(tmp_path / "motion", job.results.tokens[:1])
+    with Counting(1) as executor:
+        results.check(executor=executor)
+        assert executor.given == 1

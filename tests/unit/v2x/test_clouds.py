@@ -1,4 +1,5 @@
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.clouds import moved_points
 from deepaccident_devkit.v2x.messages import messages
-from deepaccident_devkit.v2x.poses import _colors_at
+from deepaccident_devkit.v2x.poses import colors_at
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -22,8 +23,7 @@ def sample(da: DeepAccident) -> str:
 
 
 def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str) -> None:
-    scenario = da.scenario[0]["token"]
-    cloud = da.aggregate_point_cloud(sample, sweeps=2)
+    scenario, cloud = da.scenario[0]["token"], da.aggregate_point_cloud(sample, sweeps=2)
     parts = [
         da.load_point_cloud(f"{scenario}/{agent}/{index}", "world") for index in ("004", "003") for agent in AGENTS
     ]
@@ -35,19 +35,33 @@ def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str)
     assert len(da.aggregate_point_cloud(sample, agents="single", sweeps=99)) == sum(
         len(da.load_point_cloud(f"{scenario}/ego_vehicle/{index:03d}")) for index in range(1, 5)
     )
-    with pytest.raises(ChoiceError, match="sweeps: expected a whole number of frames from 1, found 0"):
-        da.aggregate_point_cloud(sample, sweeps=0)
+    assert_refused(
+        (
+            lambda: da.aggregate_point_cloud(sample, sweeps=0),
+            ChoiceError,
+            "sweeps: expected a whole number of frames from 1, found 0",
+        ),
+    )
 
 
 def test_missing_clouds_are_an_error_or_left_out(
     da: DeepAccident, da_partial: DeepAccident, sample: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     names = list(AGENTS[:3])
-    for call in (da_partial.aggregate_point_cloud, da_partial.message_sizes):
-        with pytest.raises(MissingFileError, match=r"no such file; .*, or leave out .* with on_missing='skip'"):
-            call(sample)
-        with pytest.raises(ChoiceError, match="on_missing: expected one of raise, skip, found 'ignore'"):
-            call(sample, on_missing="ignore")
+    assert_refused(
+        *[
+            (partial(call, sample), MissingFileError, r"no such file; .*, or leave out .* with on_missing='skip'")
+            for call in (da_partial.aggregate_point_cloud, da_partial.message_sizes)
+        ],
+        *[
+            (
+                partial(call, sample, on_missing="ignore"),
+                ChoiceError,
+                "on_missing: expected one of raise, skip, found 'ignore'",
+            )
+            for call in (da_partial.aggregate_point_cloud, da_partial.message_sizes)
+        ],
+    )
     assert not caplog.records
     cloud = da_partial.aggregate_point_cloud(sample, sweeps=2, on_missing="skip")
     assert len(cloud) == len(da.aggregate_point_cloud(sample, agents=names, sweeps=2))
@@ -107,8 +121,7 @@ def test_a_point_keeps_its_place_in_its_box() -> None:
     then = Boxes.from_arrays([[0.0, 0, 0], [50, 0, 0]], [[4.0, 2, 2]] * 2, [0.0, 0], actor_id=[7, 8])
     now = Boxes.from_arrays([[10.0, 5, 1], [0, 0, 0]], [[4.0, 2, 2]] * 2, [np.pi / 2, 0], actor_id=[7, 9])
     points = np.array([[1.5, 0.5, 0.2], [3, 0, 0], [50, 0, 0]])
-    moved = moved_points(points, then, now)
-    assert_allclose(moved, [[9.5, 6.5, 1.2], [3, 0, 0], [50, 0, 0]])
+    assert_allclose(moved_points(points, then, now), [[9.5, 6.5, 1.2], [3, 0, 0], [50, 0, 0]])
     assert_allclose(points[0], [1.5, 0.5, 0.2])
 
 
@@ -143,10 +156,8 @@ def test_lost_clouds_leave_no_points(da: DeepAccident, sample: str) -> None:
 
 def test_a_cloud_in_an_image_of_its_own_agent(da: DeepAccident, sample: str) -> None:
     camera = f"{sample}/Camera_Front"
-    image = da.load_image(camera)
-    shown = da.map_pointcloud_to_image(camera)
-    cloud = da.load_point_cloud(sample, "lidar")
-    optical = da.transform(sample, sample, "Camera_Front", "lidar").apply(cloud.xyz)
+    image, shown = da.load_image(camera), da.map_pointcloud_to_image(camera)
+    optical = da.transform(sample, sample, "Camera_Front", "lidar").apply(da.load_point_cloud(sample, "lidar").xyz)
     assert_allclose(shown.depth, optical[:, 2], atol=1e-9)
     assert shown.mask.sum() > 100
     assert not shown.mask[optical[:, 2] <= 0].any()
@@ -165,14 +176,14 @@ def test_an_image_that_was_stored_smaller_is_read_at_the_same_place() -> None:
     image = np.arange(75, dtype=np.uint8).reshape(5, 5, 3)
     last = np.nextafter(13.0, 0)  # times 5/13 that is 5, which is no column any more
     lens, pixels = PinholeCamera(np.eye(3), 13, 13), np.array([[last, last], [0, 3.0], [20, 1]])
-    colors = _colors_at(image, lens, pixels, np.array([True, True, False]))
-    assert_array_equal(colors, [image[4, 4], image[1, 0], [0, 0, 0]])
+    assert_array_equal(
+        colors_at(image, lens, pixels, np.array([True, True, False])), [image[4, 4], image[1, 0], [0, 0, 0]]
+    )
 
 
 def test_points_of_any_agent_in_any_camera_and_frame(da: DeepAccident, sample: str) -> None:
     pole = sample.replace("ego_vehicle", "infrastructure").replace("/004", "/002")
-    camera = f"{sample}/Camera_Back"
-    cloud = da.load_point_cloud(pole, "lidar")
+    camera, cloud = f"{sample}/Camera_Back", da.load_point_cloud(pole, "lidar")
     shown = da.map_pointcloud_to_image(camera, pole, colors=False)
     world = da.load_point_cloud(pole, "world")
     for again in (
@@ -196,24 +207,33 @@ def test_sensors_that_are_no_camera_or_of_another_scenario(da: DeepAccident, sam
         ),
     )
     other = f"{da.scenario[1]['token']}/ego_vehicle/001"
-    with pytest.raises(ChoiceError, match="expected two samples of one scenario"):
-        da.project_to_image(np.zeros((1, 3)), other, f"{sample}/{CAMERAS[0]}")
+    assert_refused(
+        (
+            lambda: da.project_to_image(np.zeros((1, 3)), other, f"{sample}/{CAMERAS[0]}"),
+            ChoiceError,
+            "expected two samples of one scenario",
+        ),
+    )
 
 
 def test_message_sizes(da: DeepAccident, sample: str) -> None:
     sizes = da.message_sizes(sample, bev_shape=(8, 100, 50), bev_dtype=np.float16)
     assert list(sizes) == list(AGENTS)
     mine = sizes["ego_vehicle"]
-    assert mine.images == 24 + 6 * 64 * 36 * 3
-    assert mine.cloud == 24 + 16 * len(da.load_point_cloud(sample))
-    assert mine.boxes == 24 + 45 * len(da.boxes(sample))
-    assert mine.bev == 24 + 8 * 100 * 50 * 2
+    assert (mine.images, mine.cloud) == (24 + 6 * 64 * 36 * 3, 24 + 16 * len(da.load_point_cloud(sample)))
+    assert (mine.boxes, mine.bev) == (24 + 45 * len(da.boxes(sample)), 24 + 8 * 100 * 50 * 2)
     assert da.message_sizes(sample, agents="single", clouds=False)["ego_vehicle"].cloud is None
-    for wrong in ((8, 100), (0, 1, 1), 5, (1.5, 2, 3), "abc", None, ("a", 1, 1)):
-        with pytest.raises(ChoiceError, match="bev_shape: expected"):
-            da.message_sizes(sample, bev_shape=wrong)
-    with pytest.raises(ChoiceError, match="bev_dtype: expected a type such as 'float32', found 'foo'"):
-        da.message_sizes(sample, bev_dtype="foo")
+    assert_refused(
+        *[
+            (partial(da.message_sizes, sample, bev_shape=wrong), ChoiceError, "bev_shape: expected")
+            for wrong in ((8, 100), (0, 1, 1), 5, (1.5, 2, 3), "abc", None, ("a", 1, 1))
+        ],
+        (
+            lambda: da.message_sizes(sample, bev_dtype="foo"),
+            ChoiceError,
+            "bev_dtype: expected a type such as 'float32', found 'foo'",
+        ),
+    )
     assert da.message_sizes(sample, agents="single", bev_shape=np.array((8, 100, 50)))["ego_vehicle"].bev == 24 + 160000
     assert da.message_sizes(sample, agents="single", bev_shape=(1, 1, 1))["ego_vehicle"].bev == 24 + 4
     usual = da.message_sizes(sample, agents="single")["ego_vehicle"]
@@ -231,14 +251,24 @@ def test_message_sizes_are_of_what_arrives(da: DeepAccident, sample: str) -> Non
     arrived = [message.agent for message in messages(da, sample, None, lossy)]
     assert 1 < len(arrived) < len(AGENTS)
     assert da.message_sizes(sample, link=lossy) == {agent: now[agent] for agent in arrived}
-    with pytest.raises(ConfigError, match=r"from frame 004; the longest possible is 0\.3 s"):
-        da.message_sizes(sample, link=Link(latency=0.4))
+    assert_refused(
+        (
+            lambda: da.message_sizes(sample, link=Link(latency=0.4)),
+            ConfigError,
+            r"from frame 004; the longest possible is 0\.3 s",
+        ),
+    )
 
 
 @pytest.mark.parametrize("sweeps", [0, -1, 2.0, 2.5, "a", None])
 def test_sweeps_are_whole_numbers_from_1(da: DeepAccident, sample: str, sweeps: object) -> None:
-    with pytest.raises(ChoiceError, match="sweeps: expected a whole number of frames from 1, found"):
-        da.aggregate_point_cloud(sample, sweeps=sweeps)
+    assert_refused(
+        (
+            lambda: da.aggregate_point_cloud(sample, sweeps=sweeps),
+            ChoiceError,
+            "sweeps: expected a whole number of frames from 1, found",
+        ),
+    )
 
 
 def test_numpy_whole_numbers_are_sweeps(da: DeepAccident, sample: str) -> None:
@@ -258,8 +288,9 @@ def test_the_lidars_frame_has_one_name(da: DeepAccident, sample: str) -> None:
     ]
     assert [result.frame for result in results] == ["lidar"] * len(results)
     assert_array_equal(da.world_from(sample, "lidar01").matrix, da.world_from(sample, "lidar").matrix)
-    overlap = da.boxes(sample, "lidar01").iou_bev(da.cooperative_boxes(sample, frame="lidar")).max()
-    assert overlap == pytest.approx(1, abs=1e-12)
+    assert da.boxes(sample, "lidar01").iou_bev(da.cooperative_boxes(sample, frame="lidar")).max() == pytest.approx(
+        1, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("frame", ["map", "", None, 3, ["ego"]])
@@ -273,6 +304,13 @@ def test_frames_that_do_not_exist(da: DeepAccident, sample: str, frame: object) 
         lambda token, frame: da.transform(token, token, frame),
         lambda token, frame: da.trajectory(da.instance[0], token, frame),
     ]
-    for call in calls:
-        with pytest.raises(ChoiceError, match=r"frame: expected one of world, ego, lidar, Camera_Front, .* found"):
-            call(sample, frame)
+    assert_refused(
+        *[
+            (
+                partial(call, sample, frame),
+                ChoiceError,
+                r"frame: expected one of world, ego, lidar, Camera_Front, .* found",
+            )
+            for call in calls
+        ],
+    )

@@ -1,11 +1,12 @@
-"""Two evaluations side by side: which differences are real, and which two cannot be compared."""
+"""Two evaluations side by side: which differences are real, which two cannot be compared; the permutation test."""
 
 import csv
+import itertools
 import json
 import math
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import copytree
 from typing import Any
@@ -13,13 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 from generated_bundles import MAIN, write_bundle
+from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 from scipy.stats import binom
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, ResultsError
-from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.accident.scoring import exact_parts
-from deepaccident_devkit.evaluation.intervals import numbers_of
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.intervals import Resampling, numbers_of
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import (
     Comparison,
@@ -29,7 +32,17 @@ from deepaccident_devkit.evaluation.runs import (
     evaluate_results,
     save_run,
 )
-from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, _text_row
+from deepaccident_devkit.evaluation.runs.comparison import (
+    ComparedNumber,
+    PairedTest,
+    Swaps,
+    holm,
+    p_values,
+    paired_test,
+    swaps_of,
+    text_row,
+    undecided,
+)
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 Write = Callable[..., Results]
@@ -98,8 +111,7 @@ HARD = [5 * number for number in range(16)]
 
 class TestNumbers:
     def test_the_better_one_is_named(self, generated: Callable[..., Comparison]) -> None:
-        better = [each + 3 + number % 3 for number, each in enumerate(HARD)]
-        iou = by_name(generated(HARD, better))[MAIN]
+        iou = by_name(generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]))[MAIN]
         assert (iou.family, iou.real, iou.better, iou.decision) == ("main", True, "b", "b is better")
         assert iou.difference == pytest.approx(iou.b - iou.a)
         assert 3 < iou.low < iou.difference < iou.high < 5
@@ -136,8 +148,7 @@ class TestNumbers:
 
     def test_the_other_headlines_are_tested_together(self, generated: Callable[..., Comparison]) -> None:
         """Both ranges have the same numbers: by itself one is real, of several it is not."""
-        worse = [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]
-        numbers = by_name(generated([50] * 10, [50 + each for each in worse]))
+        numbers = by_name(generated([50] * 10, [50 + each for each in [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]]))
         alone, together = numbers[MAIN], numbers["iou 100x100"]
         assert alone.p == together.p == alone.adjusted_p <= 0.05 < together.adjusted_p
         assert (alone.real, together.real, together.better) == (True, False, None)
@@ -180,8 +191,7 @@ class TestNumbers:
 
 class TestForms:
     def test_text(self, motion_bundles: tuple[Path, Path]) -> None:
-        comparison = compare_bundles(*motion_bundles, FEW)
-        text = comparison.to_text()
+        text = compare_bundles(*motion_bundles, FEW).to_text()
         head = "motion, protocol released: 6 samples of 2 scenarios\nclusters: 1 (an accident and its twin are one)"
         assert text.startswith(f"{head}\na: {motion_bundles[0]}\n")
         (line,) = (line for line in text.splitlines() if line.startswith("iou 100x100"))
@@ -192,8 +202,7 @@ class TestForms:
     def test_text_of_a_decision(self, generated: Callable[..., Comparison]) -> None:
         text = generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]).to_text()
         (line,) = (line.split() for line in text.splitlines() if line.startswith("iou 30x30"))
-        assert line[3:6] == ["37.500", "41.438", "+3.938"]
-        assert line[-5:] == ["+4.393]", "0.001", "b", "is", "better"]
+        assert (line[3:6], line[-5:]) == (["37.500", "41.438", "+3.938"], ["+4.393]", "0.001", "b", "is", "better"])
         assert "p: share of 1,000 random swaps" in text
 
     def test_json_and_csv_have_every_number(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
@@ -217,15 +226,16 @@ class TestForms:
 class TestSamples:
     def test_others_are_refused_or_left_out(self, saved: Save) -> None:
         a, b = saved("a"), saved("b", 1.0, agents=("ego_vehicle", "infrastructure"))
-        with pytest.raises(EvaluationError, match=r"2 samples only in .*a \(type1.*\); evaluate both at the same"):
-            compare_bundles(a, b, FEW)
+        assert_refused(
+            (
+                lambda: compare_bundles(a, b, FEW),
+                EvaluationError,
+                r"2 samples only in .*a \(type1.*\); evaluate both at the same",
+            ),
+        )
         comparison = compare_bundles(a, b, FEW, common=True)
         assert (comparison.samples, comparison.left_out) == (4, 2)
         assert "a, b: only the samples that both have; 2 left out" in comparison.to_text()
-
-    def test_nothing_in_common(self, saved: Save) -> None:
-        with pytest.raises(EvaluationError, match=r"have no sample in common"):
-            compare_bundles(saved("a"), saved("b", split="train"), FEW, common=True)
 
     def test_a_partial_one_is_marked(
         self, saved: Save, run: EvaluationRun, da_b: DeepAccident, write_accidents: Write, tmp_path: Path
@@ -237,50 +247,66 @@ class TestSamples:
         assert "b: PARTIAL: 5 of 6 samples" in comparison.to_text()
 
 
+def changed(path: Path, change: Callable[[Any], object]) -> None:
+    """Another content of a file of JSON."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
 class TestRefused:
-    def test_other_tasks_and_rules(self, saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
-        a = saved("a")
-        with pytest.raises(
-            EvaluationError, match=r"by the same rules: task 'accident' and 'motion'; protocol .*, and \d+"
-        ):
-            compare_bundles(a, motion_bundles[0], FEW)
-        other = saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
-        with pytest.raises(
-            EvaluationError,
-            match=r"switches/reading.danger_distance 'absent' and 0.5; settings/choices/reading/danger_distance 1.0",
-        ):
-            compare_bundles(a, other, FEW)
+    def test_other_samples_tasks_and_rules(
+        self, saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun
+    ) -> None:
+        a, other = saved("a"), saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
+        assert_refused(
+            (
+                lambda: compare_bundles(a, motion_bundles[0], FEW),
+                EvaluationError,
+                r"by the same rules: task 'accident' and 'motion'; protocol .*, and \d+",
+            ),
+            (
+                lambda: compare_bundles(a, other, FEW),
+                EvaluationError,
+                r"switches/reading.danger_distance 'absent' and 0.5; settings/choices/reading/danger_distance 1.0",
+            ),
+            (
+                lambda: compare_bundles(a, saved("c", split="train"), FEW, common=True),
+                EvaluationError,
+                ("have no sample in common",),
+            ),
+        )
 
     def test_other_cells(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
         """Labels are made on the predictions' own cells: other cells are another truth."""
-        small = copytree(motion_bundles[1], tmp_path / "small")
-        path = small / "metrics_summary.json"
-        summary = json.loads(path.read_text())
-        summary["results"]["form"]["x"] = [-25.0, 25.0, 0.5]
-        path.write_text(json.dumps(summary))
-        with pytest.raises(
-            EvaluationError, match=r"rules: cells/x '\[-50.0, 50.0, 0.5\]' and '\[-25.0, 25.0, 0.5\]'; eval"
-        ):
-            compare_bundles(motion_bundles[0], small, FEW)
+        small, axis = copytree(motion_bundles[1], tmp_path / "small"), [-25.0, 25.0, 0.5]
+        changed(small / "metrics_summary.json", lambda summary: summary["results"]["form"].update(x=axis))
+        assert_refused(
+            (
+                lambda: compare_bundles(motion_bundles[0], small, FEW),
+                EvaluationError,
+                ("rules: cells/x '[-50.0, 50.0, 0.5]' and '[-25.0, 25.0, 0.5]'",),
+            ),
+        )
 
-    def test_other_labels(self, saved: Save) -> None:
-        a, b = saved("a"), saved("b")
-        path = b / "scenarios.json"
-        stored = json.loads(path.read_text())
-        token = min(stored["scenarios"])
-        stored["scenarios"][token]["label"] = "0"
-        path.write_text(json.dumps(stored))
-        with pytest.raises(
-            EvaluationError, match=rf"calib files of 1 scenarios are not the same \({token}\); evaluate"
-        ):
-            compare_bundles(a, b, FEW)
-
-    def test_another_devkit(self, saved: Save) -> None:
-        a, b = saved("a"), saved("b")
-        path = b / "counts.json"
+    def test_other_labels_and_another_devkit(self, saved: Save, results: Results) -> None:
+        a, b, c = map(saved, "abc")
+        token = min(results.tokens).rsplit("/", 2)[0]
+        changed(b / "scenarios.json", lambda stored: stored["scenarios"][token].update(label="0"))
+        path = c / "counts.json"
         path.write_text(path.read_text().replace("of devkit ", "of devkit 9."))
-        with pytest.raises(EvaluationError, match=r"counts.json: was saved by AccidentEvaluator of devkit 9."):
-            compare_bundles(a, b, FEW)
+        assert_refused(
+            (
+                lambda: compare_bundles(a, b, FEW),
+                EvaluationError,
+                (f"calib files of 1 scenarios are not the same ({token})",),
+            ),
+            (
+                lambda: compare_bundles(a, c, FEW),
+                EvaluationError,
+                ("counts.json: was saved by AccidentEvaluator of devkit 9.",),
+            ),
+        )
 
 
 @pytest.mark.slow
@@ -289,11 +315,9 @@ def test_equally_good_runs_are_rarely_called_really_different(tmp_path: Path, cl
     """Of two runs of the same law, with clusters that are hard for both, at most 5 % but for chance."""
     source, real = np.random.default_rng(clusters), 0
     for pair in range(pairs):
-        hard = source.normal(0, 1, clusters)
-        folders = []
+        hard, folders = source.normal(0, 1, clusters), []
         for name in "ab":
-            share = 1 / (1 + np.exp(hard + source.normal(0, 0.7, clusters)))
-            found = source.binomial(20, share)
+            found = source.binomial(20, 1 / (1 + np.exp(hard + source.normal(0, 0.7, clusters))))
             folders.append(
                 write_bundle(tmp_path / f"{pair}{name}", [(each, 20 - each) for each in found.tolist()], twins=True)
             )
@@ -322,15 +346,17 @@ class TestNumbersThatAskForMemory:
         columns = {name: [[], []] for name in ("tp", "spent", "matches")}
         counts = {"token": "a", "truths": [], "scores": [0.5], "detections": [[10**12], [0]], "excused": [[]] * 3}
         evaluator.add("a", counts | columns | {"errors": [[]] * 6})
-        with pytest.raises(EvaluationError, match=r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}"):
-            evaluator.compute()
+        assert_refused(
+            (evaluator.compute, EvaluationError, r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}"),
+        )
 
     def test_of_warnings(self) -> None:
         evaluator = EvaluationSetup(task="warning", protocol="clean").evaluator()
         nothing = {"alarms": [], "unjudged": [], "references": [], "involvement": None, "ahead": None, "to_end": None}
         evaluator.add("a", {"recording": "s/t/a", "frame": 10**9, "kind": "others", "beyond": 0} | nothing)
-        with pytest.raises(EvaluationError, match="s/t/a: expected frames up to 10,000, found 1000000000"):
-            evaluator.compute()
+        assert_refused(
+            (evaluator.compute, EvaluationError, "s/t/a: expected frames up to 10,000, found 1000000000"),
+        )
 
     @pytest.mark.parametrize("value", [math.nan, math.inf])
     def test_of_accidents(self, value: float) -> None:
@@ -344,8 +370,7 @@ def test_names_of_many_samples_are_cut(tmp_path: Path, count: int, shown: int) -
     with pytest.raises(EvaluationError, match="only in") as raised:
         compare_bundles(one, more, FEW)
     told, names = str(raised.value).split(";")[0].split(" (")
-    assert told == f"{count} samples only in {more}"
-    assert len(names.split(", ")) == shown
+    assert (told, len(names.split(", "))) == (f"{count} samples only in {more}", shown)
     assert names.endswith("type1_subtype1_accident/Town03_003/ego_vehicle/001, …)") is (count > 3)
 
 
@@ -388,7 +413,196 @@ def test_cells_of_the_table() -> None:
         better=None,
         decision="why",
     )
-    assert _text_row(number) == ("y (m)", "1.000", "–", "–", "[-0.500, +0.250]", "–", "why")
-    shown = _text_row(replace(number, unit="share", low=None, difference=0.25, adjusted_p=0.0625))
+    assert text_row(number) == ("y (m)", "1.000", "–", "–", "[-0.500, +0.250]", "–", "why")
+    shown = text_row(replace(number, unit="share", low=None, difference=0.25, adjusted_p=0.0625))
     assert shown == ("y", "1.000", "–", "+0.250", "–", "0.062", "why")
-    assert _text_row(replace(number, unit=None, high=None))[:5:4] == ("y", "–")
+    assert text_row(replace(number, unit=None, high=None))[:5:4] == ("y", "–")
+
+
+@dataclass(frozen=True)
+class Mean:
+    mean: float
+
+
+class Means(Evaluator[Mean]):
+    """The mean of the values of samples."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    def update(self, token: str, *arguments: Any) -> None:
+        self.add(token, {"value": arguments[0], "count": 1})
+
+    def result_of(self, counts: Collection[Counts]) -> Mean:
+        return Mean(ratio(total(counts, "value"), total(counts, "count")))
+
+
+def paired(first: np.ndarray, second: np.ndarray, resampling: Resampling | None = None) -> PairedTest:
+    """Of a value a cluster; NaN for none."""
+    runs = tuple([[{"value": float(v), "count": 1}] if np.isfinite(v) else [] for v in run] for run in (first, second))
+    difference = float(np.nanmean(second) - np.nanmean(first))
+    return paired_test(Means(), runs, {"mean": difference}, resampling or Resampling())  # type: ignore[arg-type]
+
+
+def by_hand(first: np.ndarray, second: np.ndarray) -> float:
+    """The share of all swaps after which the two differ as much."""
+    apart = second - first
+    sums = [abs(sum(signs * apart)) for signs in itertools.product((1, -1), repeat=len(apart))]
+    return float(np.mean([each > abs(apart.sum()) - 1e-9 for each in sums]))
+
+
+@pytest.mark.parametrize("clusters", [2, 5, 8])
+def test_p_is_of_all_swaps(clusters: int) -> None:
+    source = np.random.default_rng(clusters)
+    for _ in range(5):
+        first, second = source.normal(0, 1, (2, clusters))
+        made = paired(first, second)
+        assert (made.swaps.complete, len(made.swaps.swapped)) == (True, 2 ** (clusters - 1))
+        assert made.p[0] == pytest.approx(by_hand(first, second))
+        first, second = source.integers(0, 3, (2, clusters)) * 1.0
+        assert paired(first, second).p[0] == pytest.approx(by_hand(first, second))  # with ties
+
+
+def test_random_swaps_are_near_all_of_them() -> None:
+    first, second = np.random.default_rng(3).normal((0, 0.8), 1, (10, 2)).T
+    exact = paired(first, second).p[0]
+    made = [paired(first, second, Resampling(resamples=500, seed=seed)) for seed in (1, 1, 2)]
+    assert not made[0].swaps.complete
+    assert [abs(each.p[0] - exact) < 0.05 for each in made] == [True] * 3
+    assert made[0].p[0] == made[1].p[0] != made[2].p[0]
+    assert all(each.p[0] >= 1 / 501 for each in made)
+
+
+def test_half_of_the_ties_of_random_swaps_count() -> None:
+    swaps = Swaps(swapped=np.zeros((9, 12), dtype=bool), complete=False)
+    swapped = np.array([3, -2, 2, -2, 2, 1, 1, 0, 0])[:, None]
+    assert p_values(np.array([2.0]), swapped, swaps)[0] == pytest.approx((1 + 1 + 4 / 2) / 10)
+    assert p_values(np.array([3.0]), swapped, swaps)[0] == pytest.approx(2 / 10)  # none differ more
+    assert p_values(np.array([0.0]), swapped, swaps)[0] == 1
+
+
+def test_pairs_are_what_is_tested() -> None:
+    """Clusters differ by far more than the runs; were one run's in another order, nothing would be real."""
+    hard = np.linspace(0, 10, 12)
+    better = hard + 0.1 + np.linspace(0, 0.02, 12)
+    assert paired(hard, better).p[0] <= 2 / 1001
+    assert paired(hard, np.roll(better, 3)).p[0] > 0.5
+
+
+def test_clusters_that_do_not_differ_are_not_swapped() -> None:
+    first = np.arange(40.0)
+    made = paired(first, first + np.where(np.arange(40) % 5 == 0, 1.0, 0.0))
+    assert (made.swaps.swapped.shape, made.p[0], paired(first, first).p[0]) == ((2**7, 8), 2 / 2**8, 1)
+
+
+def test_a_swap_without_the_number_counts_as_more() -> None:
+    swaps = Swaps(swapped=np.zeros((4, 3), dtype=bool), complete=True)
+    swapped = np.array([[2.0, 2.0], [1.0, math.nan], [-2.0, 0.0], [0.5, 1.0]])
+    assert_allclose(p_values(np.array([2.0, math.nan]), swapped, swaps), [0.5, math.nan])
+    assert_allclose(p_values(np.array([1.5, 2.0]), swapped, swaps)[1], 0.5)
+
+
+def test_holm() -> None:
+    assert_allclose(holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
+    assert_array_equal(holm(np.array([0.9, 0.8])), [1, 1])
+    assert len(holm(np.empty(0))) == 0
+
+
+def test_the_interval_is_students() -> None:
+    """Of differences of ± 1 around 3: 19 degrees of freedom, and t = 2.093 at 95 % and 1.729 at 90 %."""
+    first, second = np.zeros(20), 3 + np.tile([1.0, -1.0], 10)
+    error = math.sqrt(20 / 19) / math.sqrt(20)
+    for confidence, t in ((0.95, 2.093), (0.9, 1.729)):
+        made = paired(first, second, Resampling(confidence=confidence))
+        assert_allclose([made.low[0], made.high[0]], [3 - t * error, 3 + t * error], atol=1e-3)
+    assert_allclose(made.errors, error)
+
+
+class TestUndecided:
+    def test_clusters_that_are_too_few(self) -> None:
+        made = paired(np.zeros(5), np.arange(5) + 1.0)
+        assert undecided(made, 0, 1, 5) == "no decision is possible with 5 clusters; at least 6 are needed"
+        assert undecided(made, 0, 4, 5) == "no decision is possible with 5 clusters; at least 8 are needed"
+        few = paired(np.zeros(30), np.eye(30)[0])
+        text = "no decision is possible with 1 of 30 clusters in which the two differ; at least 6 are needed"
+        assert undecided(few, 0, 1, 30) == text
+
+    def test_resamples_that_are_too_few(self) -> None:
+        made = paired(np.zeros(30), np.arange(30) + 1.0, Resampling(resamples=10))
+        assert undecided(made, 0, 1, 30) == "no decision is possible with 10 resamples; at least 19 are needed"
+        assert undecided(paired(np.zeros(9), np.ones(9), Resampling(resamples=0)), 0, 1, 9).startswith("not tested: ")
+
+    def test_no_difference(self) -> None:
+        assert undecided(paired(np.zeros(8), np.tile([1.0, -1.0], 4)), 0, 1, 8) == "the difference is 0"
+        nothing = np.full(8, math.nan)
+        with np.errstate(all="ignore"), pytest.warns(RuntimeWarning):
+            assert undecided(paired(np.zeros(8), nothing), 0, 1, 8) == "nothing to compare"
+
+    def test_how_many_would_decide(self) -> None:
+        """A difference of 0.5 with a spread of 2: (1.96 + 0.84)² = 7.849 times the square of their ratio."""
+        made = paired(np.zeros(20), 0.5 + np.tile([2.0, -2.0], 10))
+        assert made.p[0] > 0.05
+        clusters = 7.849 * 20 / 19 * 4 / 0.5**2
+        needed = math.ceil(clusters * 2 / 10) * 10  # two scenarios each, with two digits
+        assert undecided(made, 0, 1, 40) == f"not decided: about {needed} scenarios would decide it"
+
+
+def test_all_swaps_or_random_ones() -> None:
+    assert swaps_of(3, Resampling()).swapped.tolist() == [[a, b, c] for c in (0, 1) for b in (0, 1) for a in (0,)]
+    assert swaps_of(0, Resampling()).swapped.shape == (1, 0)
+    assert swaps_of(11, Resampling(resamples=1000)).swapped.shape == (1000, 11)
+    assert swaps_of(5, Resampling(resamples=0)).swapped.shape == (0, 5)
+
+
+@pytest.mark.parametrize(
+    ("clusters", "resamples", "complete"),
+    [
+        (0, 1, True),
+        (1, 1, True),
+        (2, 1, False),
+        (2, 2, True),
+        (4, 7, False),
+        (4, 8, True),
+        (5, 8, False),
+        (11, 1024, True),
+    ],
+)
+def test_up_to_which_number_all_swaps_are_taken(clusters: int, resamples: int, *, complete: bool) -> None:
+    made = swaps_of(clusters, Resampling(resamples=resamples))
+    number = 2 ** max(clusters - 1, 0) if complete else resamples
+    assert (made.complete, made.swapped.shape) == (complete, (number, clusters))
+    assert made.least_p == (1 / number if complete else 1 / (number + 1))
+    assert not complete or not made.swapped[:, :1].any()
+
+
+@pytest.mark.parametrize(
+    ("observed", "complete", "p"),
+    [(1.0, True, 3 / 4), (1 + 5e-10, True, 3 / 4), (1 + 3e-9, True, 1 / 4), (2.0, True, 1 / 4)],
+)
+def test_equal_but_for_rounding(observed: float, p: float, *, complete: bool) -> None:
+    swaps = Swaps(swapped=np.zeros((4, 3), dtype=bool), complete=complete)
+    assert p_values(np.array([observed]), np.array([[2.0], [1.0], [-1.0], [0.0]]), swaps)[0] == p
+
+
+@pytest.mark.parametrize(
+    ("error", "scenarios", "told"),
+    [
+        (0.0, 9, None),
+        (0.1, 9, "9"),
+        (0.1, 10, "10"),
+        (0.5, 40, "79"),
+        (0.5, 100, "200"),
+        (5.0, 100, "20,000"),
+        (1.0, 64, "510"),
+    ],
+)
+def test_how_many_scenarios_would_decide(error: float, scenarios: int, told: str | None) -> None:
+    """At least those that there are; in two digits, rounded up."""
+    made = replace(paired(np.zeros(8), np.tile([3.0, -1.0], 4)), errors=np.array([error]))
+    other = replace(made, differences=-made.differences)
+    assert (
+        undecided(made, 0, 1, scenarios)
+        == undecided(other, 0, 1, scenarios)
+        == ("not decided" if told is None else f"not decided: about {told} scenarios would decide it")
+    )

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,6 +12,7 @@ import jsonschema
 import numpy as np
 import plain_results as plain
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes, MotionOutput
@@ -95,8 +97,7 @@ def test_what_the_schema_refuses_the_reader_refuses(task: str, tmp_path: Path) -
     """Every value of good results in turn made another one; the reader may know better, never less."""
     folder = tmp_path / "m"
     told, schema = document(task, folder), validator(task)
-    path = folder / "results.json"
-    refused = 0
+    path, refused = folder / "results.json", 0
     for place in list(places(told)):
         for value in STRANGE:
             strange = changed(told, place, value)
@@ -104,8 +105,9 @@ def test_what_the_schema_refuses_the_reader_refuses(task: str, tmp_path: Path) -
             if schema.is_valid(strange):
                 continue
             refused += 1
-            with pytest.raises(ResultsError, match=r"(?s)results\.json: ."):
-                read_results(path)
+            assert_refused(
+                (partial(read_results, path), ResultsError, r"(?s)results\.json: ."),
+            )
     assert refused > 100
 
 
@@ -119,8 +121,7 @@ def test_the_examples_of_the_page(tmp_path: Path) -> None:
 
 
 def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
-    token = plain.TOKENS[0]
-    ids = np.zeros((6, 5, 200, 200), dtype=int)
+    token, ids = plain.TOKENS[0], np.zeros((6, 5, 200, 200), dtype=int)
     ids[:, :, 120:124, 90:99] = 3
     given = {
         "folder": str(tmp_path),

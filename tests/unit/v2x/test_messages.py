@@ -3,6 +3,7 @@ import inspect
 import math
 import pickle
 from dataclasses import asdict
+from functools import partial
 from statistics import NormalDist
 
 import numpy as np
@@ -27,29 +28,38 @@ def sample(da_b: DeepAccident) -> str:
 def test_a_latency_that_is_no_multiple_of_a_frame_names_the_two_nearest() -> None:
     assert [Link(latency=frames / 10).latency_frames for frames in range(12)] == list(range(12))
     assert Link(latency=0.1 + 0.2).latency_frames == 3
-    with pytest.raises(
-        ConfigError, match=r"0\.25 s is no multiple of a frame \(0\.1 s\); the nearest are 0\.2 s and 0\.3"
-    ):
-        Link(latency=0.25)
-    for wrong in (-0.1, math.nan, math.inf):
-        with pytest.raises(ConfigError, match=r"latency: .* is not possible"):
-            Link(latency=wrong)
+    assert_refused(
+        (
+            lambda: Link(latency=0.25),
+            ConfigError,
+            r"0\.25 s is no multiple of a frame \(0\.1 s\); the nearest are 0\.2 s and 0\.3",
+        ),
+        *[
+            (partial(Link, latency=wrong), ConfigError, r"latency: .* is not possible")
+            for wrong in (-0.1, math.nan, math.inf)
+        ],
+    )
 
 
 def test_a_latency_longer_than_the_past_names_what_there_is(da_b: DeepAccident, sample: str) -> None:
     assert len(da_b.cooperative_boxes(sample, link=Link(latency=0.3))) > 0
-    for call in (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud, da_b.message_sizes):
-        with pytest.raises(
-            ConfigError, match=r"from frame 004; the longest possible is 0\.3 s, and .* works from frame 006 on"
-        ):
-            call(sample, agents=["infrastructure"], link=Link(latency=0.5))
+    assert_refused(
+        *[
+            (
+                partial(call, sample, agents=["infrastructure"], link=Link(latency=0.5)),
+                ConfigError,
+                r"from frame 004; the longest possible is 0\.3 s, and .* works from frame 006 on",
+            )
+            for call in (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud, da_b.message_sizes)
+        ],
+    )
 
 
 def test_settings_that_are_not_possible() -> None:
-    with pytest.raises(ConfigError, match="packet_loss: 2 is no probability"):
-        Link(packet_loss=2)
-    with pytest.raises(ConfigError, match="std is -1; choose a finite number"):
-        PoseNoise(std=-1)
+    assert_refused(
+        (lambda: Link(packet_loss=2), ConfigError, "packet_loss: 2 is no probability"),
+        (lambda: PoseNoise(std=-1), ConfigError, "std is -1; choose a finite number"),
+    )
     with pytest.raises(ConfigError, match="pose_noise: expected metres or a PoseNoise, found 'much'"):
         Link(pose_noise="much")  # type: ignore[arg-type]
     assert Link(pose_noise=0.3) == Link(pose_noise=PoseNoise(mean=0.3, std=0.02, heading_std=0))
@@ -98,8 +108,7 @@ def test_the_egos_own_data_are_never_disturbed(da_b: DeepAccident, sample: str) 
         assert_array_equal(got.center, alone.center)
         assert_array_equal(got.actor_id, alone.actor_id)
     nobody = da_b.cooperative_boxes(sample, agents=["infrastructure"], link=link)
-    assert len(nobody) == 0
-    assert nobody.frame == "world"
+    assert (len(nobody), nobody.frame) == (0, "world")
     assert da_b.visible_instances(sample, agents=["infrastructure"], link=link) == []
 
 
@@ -108,16 +117,14 @@ def test_pose_noise_moves_all_of_a_partners_boxes_by_the_same_distance(da_b: Dee
     true, noisy = (da_b.cooperative_boxes(sample, agents=pole, link=link) for link in (None, Link(pose_noise=0.4)))
     off = noisy.center - true.center
     assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=1e-9)
-    assert off[0, 2] == pytest.approx(0, abs=1e-9)
-    assert np.hypot(*off[0, :2]) == pytest.approx(0.4, abs=0.1)
+    assert (off[0, 2], np.hypot(*off[0, :2])) == (pytest.approx(0, abs=1e-9), pytest.approx(0.4, abs=0.1))
 
 
 def test_a_wrong_heading_turns_about_the_partner(da_b: DeepAccident, sample: str) -> None:
     link = Link(pose_noise=PoseNoise(std=0, heading_std=0.1))
     pole = da_b.world_from(sample.replace("ego_vehicle", "infrastructure"), "ego").translation
     true, noisy = (da_b.cooperative_boxes(sample, agents=["infrastructure"], link=way) for way in (None, link))
-    distances = [np.linalg.norm(boxes.center - pole, axis=1) for boxes in (true, noisy)]
-    assert_allclose(*distances, atol=1e-9)
+    assert_allclose(*[np.linalg.norm(boxes.center - pole, axis=1) for boxes in (true, noisy)], atol=1e-9)
     turned = np.angle(np.exp(1j * (noisy.yaw - true.yaw)))
     assert_allclose(turned, turned[0], atol=1e-6)
     assert abs(turned[0]) > 1e-3
@@ -148,21 +155,29 @@ def test_a_sweep_arrives_as_it_did_when_it_was_the_present(da_b: DeepAccident, s
 
 @pytest.mark.parametrize("wrong", ["0.2", None, [0.2], (0.1, 0.02), 1j])
 def test_what_is_no_number_is_refused(wrong: object) -> None:
-    for name in ("latency", "packet_loss"):
-        with pytest.raises(ConfigError, match=f"{name}: expected .*, found"):
-            Link(**{name: wrong})
-    for name in ("mean", "std", "heading_std"):
-        with pytest.raises(ConfigError, match=f"pose noise: {name}: expected a number from 0, found"):
-            PoseNoise(**{name: wrong})
+    assert_refused(
+        *[
+            (partial(Link, **{name: wrong}), ConfigError, f"{name}: expected .*, found")
+            for name in ("latency", "packet_loss")
+        ],
+        *[
+            (partial(PoseNoise, **{name: wrong}), ConfigError, f"pose noise: {name}: expected a number from 0, found")
+            for name in ("mean", "std", "heading_std")
+        ],
+    )
     if wrong is not None:
-        with pytest.raises(ConfigError, match="pose_noise: expected metres or a PoseNoise, found"):
-            Link(pose_noise=wrong)
+        assert_refused(
+            (lambda: Link(pose_noise=wrong), ConfigError, "pose_noise: expected metres or a PoseNoise, found"),
+        )
 
 
 def test_seeds_are_whole_numbers() -> None:
-    for wrong in (1.5, "a", None, 1.0):
-        with pytest.raises(ConfigError, match="seed: expected a whole number, found"):
-            Link(seed=wrong)
+    assert_refused(
+        *[
+            (partial(Link, seed=wrong), ConfigError, "seed: expected a whole number, found")
+            for wrong in (1.5, "a", None, 1.0)
+        ],
+    )
     assert Link(seed=-1) != Link(seed=1)
 
 
@@ -176,17 +191,23 @@ def test_equal_links_draw_alike_whatever_their_numbers_types() -> None:
     for link in links:
         assert (type(link.latency), type(link.packet_loss), type(link.seed)) == (float, float, int)
         assert type(link.pose_noise.mean) is float
-        draws = [link.pose_error("scenario", "agent", 4, np.zeros(3)).matrix.tobytes() for link in links]
-        assert len(set(draws)) == 1
+        assert len({link.pose_error("scenario", "agent", 4, np.zeros(3)).matrix.tobytes() for link in links}) == 1
     assert Link(pose_noise=np.int64(1)) == Link(pose_noise=1.0) == Link(pose_noise=PoseNoise(mean=np.uint8(1)))
 
 
 @pytest.mark.parametrize("wrong", [{"latency": 0.2}, "a", 0.2, Link])
 def test_what_is_no_link_is_refused_by_every_call(da_b: DeepAccident, sample: str, wrong: object) -> None:
     calls = (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud, da_b.message_sizes)
-    for call in calls:
-        with pytest.raises(ConfigError, match=r"link: expected a Link, such as Link\(latency=0\.2, .* found"):
-            call(sample, link=wrong)
+    assert_refused(
+        *[
+            (
+                partial(call, sample, link=wrong),
+                ConfigError,
+                r"link: expected a Link, such as Link\(latency=0\.2, .* found",
+            )
+            for call in calls
+        ],
+    )
 
 
 def test_every_call_that_takes_agents_takes_a_link() -> None:
@@ -235,8 +256,13 @@ def test_the_ends_of_each_range() -> None:
         (lambda: PoseNoise(mean=math.inf), ConfigError, "mean is inf; choose a finite number of at least 0"),
     )
     assert Link(latency=0.3).frame_sent("scenario", 4) == 1
-    with pytest.raises(ConfigError, match=r"of scenario from frame 003; the longest possible is 0\.2 s, .* 004 on"):
-        Link(latency=0.3).frame_sent("scenario", 3)
+    assert_refused(
+        (
+            lambda: Link(latency=0.3).frame_sent("scenario", 3),
+            ConfigError,
+            r"of scenario from frame 003; the longest possible is 0\.2 s, .* 004 on",
+        ),
+    )
 
 
 def test_draws_are_made_of_the_keys_digest() -> None:

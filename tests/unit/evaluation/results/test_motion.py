@@ -8,6 +8,7 @@ import numpy as np
 import plain_results as plain
 import pytest
 from accident_scenes import scene
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import MotionOutput, instances_of
@@ -45,12 +46,14 @@ def thirty_cars(seed: int, noise: float = 2.0) -> MotionOutput:
     predictions = []
     for _ in range(5):
         segmentation = good.segmentation + source.normal(0, noise, good.segmentation.shape)
-        flipped = edge & (source.random(edge.shape) < 0.3)
-        segmentation = np.where(flipped[:, None], segmentation[:, ::-1], segmentation)
+        segmentation = np.where(
+            (edge & (source.random(edge.shape) < 0.3))[:, None], segmentation[:, ::-1], segmentation
+        )
         offset, flow = (maps + source.normal(0, 0.7, maps.shape) for maps in (good.offset, good.flow))
         predictions.append((segmentation, good.centerness, offset, flow))
-    stacked = [np.stack(each).astype(np.float32) for each in zip(*predictions, strict=True)]
-    return MotionOutput.from_arrays(*stacked, grid=LARGE)
+    return MotionOutput.from_arrays(
+        *[np.stack(each).astype(np.float32) for each in zip(*predictions, strict=True)], grid=LARGE
+    )
 
 
 def labelled(ignore: int | None = None, frames: int = 3) -> MotionHeads:
@@ -107,8 +110,9 @@ class TestMotion:
     def test_paths_that_earlier_files_have_are_not_read(self, tmp_path: Path) -> None:
         folder = plain.write_motion(tmp_path / "b")
         paths = {"trajectory_id": np.array([1, 7]), "trajectory": np.zeros((2, 3, 2))}
-        samples = {token: plain.instance_arrays() | paths for token in (FIRST, SECOND)}
-        plain.write_shard(folder / "shards" / "00000.npz", samples)
+        plain.write_shard(
+            folder / "shards" / "00000.npz", {token: plain.instance_arrays() | paths for token in (FIRST, SECOND)}
+        )
         plain.relist(folder)
         read_results(folder).check()
 
@@ -121,8 +125,7 @@ class TestMotion:
             assert isinstance(read, MotionOutput)
             assert len(read) == 5
             assert len(np.unique(read.instances)) > 25  # type: ignore[arg-type]
-        size = sum(path.stat().st_size for path in (tmp_path / "m").rglob("*") if path.is_file())
-        assert size / len(tokens) < 50_000
+        assert sum(path.stat().st_size for path in (tmp_path / "m").rglob("*") if path.is_file()) / len(tokens) < 50_000
 
     def test_shards_of_64_samples(self, tmp_path: Path) -> None:
         maps = instances_of(plain.instance_arrays()["instance"], GRID)
@@ -135,7 +138,7 @@ class TestMotion:
         assert results.tokens == tuple(tokens)
 
     def test_shards_of_some_megabytes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("deepaccident_devkit.evaluation.results.writer._MOST_BYTES", 2000)
+        monkeypatch.setattr("deepaccident_devkit.evaluation.results.writer.MOST_BYTES", 2000)
         written(tmp_path / "m", "motion", {token: heads(1) for token in plain.TOKENS}, store="heads")
         assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
 
@@ -152,18 +155,25 @@ class TestMotion:
     def test_predictions_that_do_not_go_together(self, tmp_path: Path, output: MotionOutput, words: str) -> None:
         with ResultsWriter(tmp_path / "m", "motion", store="heads") as writer:
             writer.add(FIRST, heads())
-            with pytest.raises(ResultsError, match=f"m: {SECOND}: .*{words}"):
-                writer.add(SECOND, output)
+            assert_refused(
+                (lambda: writer.add(SECOND, output), ResultsError, f"m: {SECOND}: .*{words}"),
+            )
         assert read_results(tmp_path / "m").tokens == (FIRST,)
 
     def test_the_grid_that_was_asked_for(self, tmp_path: Path) -> None:
         with ResultsWriter(tmp_path / "m", "motion", grid=LARGE) as writer:
-            with pytest.raises(ResultsError, match="expected a prediction on BevGrid"):
-                writer.add(FIRST, heads())
+            assert_refused(
+                (lambda: writer.add(FIRST, heads()), ResultsError, "expected a prediction on BevGrid"),
+            )
             writer.add(FIRST, instances_of(np.zeros((1, 2, 200, 200)), LARGE))
 
     def test_negative_ids(self, tmp_path: Path) -> None:
         with ResultsWriter(tmp_path / "m", "motion") as writer:
-            with pytest.raises(ResultsError, match="instances: expected ids from 1, and 0 elsewhere, found -7"):
-                writer.add(FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID))
+            assert_refused(
+                (
+                    lambda: writer.add(FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID)),
+                    ResultsError,
+                    "instances: expected ids from 1, and 0 elsewhere, found -7",
+                ),
+            )
             writer.add(FIRST, heads())

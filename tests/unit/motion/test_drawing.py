@@ -1,12 +1,19 @@
+"""Labels of boxes: who is drawn where, missing frames, ids, centres and vectors."""
+
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.geometry import SE3, BevGrid
+from deepaccident_devkit.exact.polygon_fill import topmost
+from deepaccident_devkit.geometry import SE3, BevGrid, conventions
 from deepaccident_devkit.geometry.bev_grid import axes_of, to_orientation
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -14,9 +21,12 @@ from deepaccident_devkit.motion import (
     Augmentation,
     FrameBoxes,
     MotionLabelConfig,
+    drawing,
     motion_labels_from_boxes,
 )
-from deepaccident_devkit.motion.box_polygons import box_polygons
+from deepaccident_devkit.motion.box_polygons import Footprints, box_polygons
+from deepaccident_devkit.motion.drawing import following_centers
+from deepaccident_devkit.motion.warping import sampling_matrix
 
 STILL = np.zeros((7, 6))
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
@@ -45,8 +55,7 @@ def labels(frames, motion=STILL, **changes):
 
 @pytest.mark.parametrize("augmentation", [None, Augmentation(rotation=0.2, scale=1.1, flip=True)])
 def test_without_a_lean_both_rules_of_poses_give_the_same_corners(augmentation: Augmentation | None) -> None:
-    rows = ((10, -5, 7, 0, 1), (-3, 8, 8, 0, 1), (0, 30, 9, 0, 1))
-    boxes = frame(*rows, lidar=SE3.from_yaw(0.3, (1.0, -2.0, 0.5)))
+    boxes = frame(*((10, -5, 7, 0, 1), (-3, 8, 8, 0, 1), (0, 30, 9, 0, 1)), lidar=SE3.from_yaw(0.3, (1.0, -2.0, 0.5)))
     size = boxes.size * ([1, 1, 1], [2, 1, 1], [-1, -1, 1])  # a release may have negative ones
     boxes = replace(boxes, yaw=np.array([0.4, -2.0, 3.0]), size=size)
     found = []
@@ -93,8 +102,7 @@ def test_who_is_drawn_when() -> None:
         "now": [{1, 3}, {3}, {2, 3}, {2, 3}, {2, 3}],
     }.items():
         config = MotionLabelConfig(protocol=replace(RELEASED, drawn_when=when), draw_ego=False)
-        drawn = box_polygons(frames, config)
-        assert [set(one.key.tolist()) for one in drawn] == expected
+        assert [set(one.key.tolist()) for one in box_polygons(frames, config)] == expected
     everybody = box_polygons(frames, MotionLabelConfig(filter_invisible=False, draw_ego=False))
     assert [set(one.key.tolist()) for one in everybody] == [{1, 2, 3}] * 5
 
@@ -107,8 +115,7 @@ def test_nobody_is_drawn_where_the_present_is_missing_in_the_released_way() -> N
 
 def test_vehicles_alone() -> None:
     frames = [frame(*((0, 5 * category, category + 1, category, 1) for category in range(6)))] * 5
-    drawn = box_polygons(frames, MotionLabelConfig(only_vehicle=True, draw_ego=False))
-    assert drawn[0].key.tolist() == [1, 2, 3, 4, 5]
+    assert box_polygons(frames, MotionLabelConfig(only_vehicle=True, draw_ego=False))[0].key.tolist() == [1, 2, 3, 4, 5]
 
 
 def test_the_egos_own_box_and_its_slips() -> None:
@@ -137,11 +144,11 @@ def test_where_the_agent_leans_the_middle_of_a_boxs_bottom_counts(protocol: str)
     if protocol == "released":
         own = lidar.apply((own - [0, 0, 0.75])[None])[0]
     config = MotionLabelConfig(protocol=protocol)
-    drawn = box_polygons([boxes] * 5, config)[0]
-    assert_allclose(drawn.corners.mean(axis=1), [own[:2], other[:2]], atol=1e-5)
+    assert_allclose(box_polygons([boxes] * 5, config)[0].corners.mean(axis=1), [own[:2], other[:2]], atol=1e-5)
     high = replace(frame((10, 5, 7, 0, 1), (9, 9, 8, 0, 1), lidar=lidar), center=[[10, 5, 2.0], [9, 9, 4]])
-    keys = box_polygons([high] * 5, config)[0].key.tolist()
-    assert keys == ([OWN_BOX_ID, 7, 8] if protocol == "released" else [7, 8])
+    assert box_polygons([high] * 5, config)[0].key.tolist() == (
+        [OWN_BOX_ID, 7, 8] if protocol == "released" else [7, 8]
+    )
     if protocol == "released":  # a default box at the height of the first row's middle
         default = lidar.apply(np.array([[0, 0, 2.0 - 1.62 / 2]]))[0]
         assert_allclose(box_polygons([high] * 5, config)[0].corners[0].mean(axis=0), default[:2], atol=1e-5)
@@ -164,18 +171,15 @@ def test_half_a_cell_more_or_less() -> None:
     released = labels(frames, draw_ego=False).instance[0]
     for made, rows, columns in ((clean, (100, 104), (100, 108)), (released, (100, 104), (101, 109))):
         found = np.argwhere(made)
-        assert (found[:, 1].min(), found[:, 1].max()) == columns
-        assert (found[:, 0].min(), found[:, 0].max()) == rows
+        assert ((found[:, 1].min(), found[:, 1].max()), (found[:, 0].min(), found[:, 0].max())) == (columns, rows)
 
 
 def test_beverse_rounds_in_its_own_right_handed_frame() -> None:
     """BEVerse draws corners at round((x + 50) / 0.5), round((y + 50) / 0.5); its y points left."""
     for y in (0.3, 0.2, -0.3, 5.4):
-        drawn = labels([frame((2.2, y, 7, 0, 1))] * 5, protocol="beverse", draw_ego=False).instance[0]
-        found = np.argwhere(drawn)
+        found = np.argwhere(labels([frame((2.2, y, 7, 0, 1))] * 5, protocol="beverse", draw_ego=False).instance[0])
         for axis, (low, high) in enumerate(((y - 1, y + 1), (0.2, 4.2))):
-            rounded = [round((edge + 50) / 0.5) for edge in (low, high)]
-            assert [found[:, axis].min(), found[:, axis].max()] == rounded
+            assert [found[:, axis].min(), found[:, axis].max()] == [round((edge + 50) / 0.5) for edge in (low, high)]
     released = labels([frame((2.2, 0.3, 7, 0, 1))] * 5, draw_ego=False).instance[0]
     assert np.argwhere(released)[:, 0].min() == 199 - round((0.7 + 50) / 0.5)
 
@@ -194,29 +198,37 @@ def test_untracked_rows_are_one_or_each_its_own() -> None:
 
 def test_ids_go_on_where_another_sample_left_off() -> None:
     given = {5: 1, 9: 2}
-    made = labels([frame((0, 10, 9, 0, 1), (0, 20, 3, 0, 1))] * 5, draw_ego=False)
-    assert made.id_map == {9: 1, 3: 2}
+    assert labels([frame((0, 10, 9, 0, 1), (0, 20, 3, 0, 1))] * 5, draw_ego=False).id_map == {9: 1, 3: 2}
     continued = motion_labels_from_boxes(
         [frame((0, 10, 9, 0, 1), (0, 20, 3, 0, 1))] * 5, STILL, MotionLabelConfig(draw_ego=False), id_map=given
     )
-    assert continued.id_map == {5: 1, 9: 2, 3: 3}
-    assert given == {5: 1, 9: 2}
+    assert (continued.id_map, given) == ({5: 1, 9: 2, 3: 3}, {5: 1, 9: 2})
     assert set(np.unique(continued.instance)) == {0, 2, 3}
 
 
 def test_ids_go_on_only_where_the_protocol_keeps_them() -> None:
     frames = [frame((0, 10, 9, 0, 1))] * 5
-    for protocol in ("clean", "beverse"):
-        with pytest.raises(ConfigError, match="count from 1 in every sample; leave it out, or choose a protocol with"):
-            motion_labels_from_boxes(frames, STILL, MotionLabelConfig(protocol=protocol), id_map={9: 4})
+    assert_refused(
+        *[
+            (
+                partial(motion_labels_from_boxes, frames, STILL, MotionLabelConfig(protocol=protocol), id_map={9: 4}),
+                ConfigError,
+                "count from 1 in every sample; leave it out, or choose a protocol with",
+            )
+            for protocol in ("clean", "beverse")
+        ],
+    )
     kept = replace(CLEAN, ids_kept_between_samples=True)
     made = motion_labels_from_boxes(frames, STILL, MotionLabelConfig(protocol=kept), id_map={np.int64(9): np.int32(4)})
     assert made.id_map == {9: 4}
     nobody = MotionLabelConfig(draw_ego=False)
     assert motion_labels_from_boxes([frame()] * 5, STILL, nobody, id_map={3: 2**24}).id_map == {3: 2**24}
-    for wrong in ({"a": 2}, {3: -4}, {7: 0}, {3: 1.5}, {3: 2**24 + 1}, [3]):
-        with pytest.raises(ConfigError, match="id_map: expected"):
-            motion_labels_from_boxes(frames, STILL, id_map=wrong)
+    assert_refused(
+        *[
+            (partial(motion_labels_from_boxes, frames, STILL, id_map=wrong), ConfigError, "id_map: expected")
+            for wrong in ({"a": 2}, {3: -4}, {7: 0}, {3: 1.5}, {3: 2**24 + 1}, [3])
+        ],
+    )
 
 
 @pytest.mark.parametrize("protocol", sorted(LABEL_PROTOCOLS))
@@ -229,8 +241,7 @@ def test_missing_frames_are_the_same_at_the_present(protocol) -> None:
         present = made.to_present(mode)
         assert present.instance[2].any()
         for name in ("segmentation", "instance", "centerness"):
-            values = 0 if protocol == "released" else 255
-            assert (getattr(present, name)[3:] == values).all()
+            assert (getattr(present, name)[3:] == (0 if protocol == "released" else 255)).all()
         if protocol != "released":
             assert (present.offset[3:] == 255).all()
             assert (present.flow[3:] == 255).all()
@@ -241,8 +252,9 @@ def test_a_frame_that_is_not_valid_is_missing() -> None:
     made = motion_labels_from_boxes(frames, STILL, "beverse", valid=[True] * 6 + [False])
     assert made.label_valid.tolist() == [True] * 4 + [False]
     assert (made.instance[4] == 255).all()
-    gone = motion_labels_from_boxes([*frames[:4], None], STILL, valid=[True] * 7)
-    assert gone.label_valid.tolist() == [True] * 4 + [False]
+    assert motion_labels_from_boxes([*frames[:4], None], STILL, valid=[True] * 7).label_valid.tolist() == [True] * 4 + [
+        False
+    ]
 
 
 def test_a_small_mark_is_no_vector() -> None:
@@ -253,8 +265,7 @@ def test_a_small_mark_is_no_vector() -> None:
 
 
 def test_huge_peaks_and_far_boxes() -> None:
-    made = labels([frame((0, 0, 1, 0, 1))] * 5, sigma=10_000, draw_ego=False)
-    assert made.centerness.min() > 0.999
+    assert labels([frame((0, 0, 1, 0, 1))] * 5, sigma=10_000, draw_ego=False).centerness.min() > 0.999
     for protocol in LABEL_PROTOCOLS:
         far = labels([frame((1e30, 0, 1, 0, 1), (0, 0, 2, 0, 1))] * 5, protocol=protocol, draw_ego=False)
         assert np.unique(far.instance).tolist() == [0, 2]
@@ -290,8 +301,7 @@ def test_nobody_at_all() -> None:
         empty = labels([frame()] * 5, protocol=protocol, draw_ego=False)
         assert not empty.instance.any()
         assert (empty.flow == 255).all()
-    nothing = labels([None] * 5)
-    assert not nothing.label_valid.any()
+    assert not labels([None] * 5).label_valid.any()
 
 
 def test_other_grids_sigmas_and_horizons() -> None:
@@ -335,14 +345,22 @@ def test_arrays_are_read_only_and_whole() -> None:
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_remedy(make: Callable[[], object], sentence: str) -> None:
-    with pytest.raises(GeometryError, match=sentence):
-        make()
+    assert_refused(
+        (make, GeometryError, sentence),
+    )
 
 
 def test_vectors_have_two_channels_of_cells() -> None:
-    for wrong in (np.zeros((2, 5)), np.zeros((3, 4, 5))):
-        with pytest.raises(GeometryError, match=r"vectors: expected shape \(…, 2, H, W\), found"):
-            to_orientation(wrong, vectors=True, source="devkit", target="fiery")
+    assert_refused(
+        *[
+            (
+                partial(to_orientation, wrong, vectors=True, source="devkit", target="fiery"),
+                GeometryError,
+                r"vectors: expected shape \(…, 2, H, W\), found",
+            )
+            for wrong in (np.zeros((2, 5)), np.zeros((3, 4, 5)))
+        ],
+    )
 
 
 def test_axes_as_rows_and_columns_count_them() -> None:
@@ -359,3 +377,59 @@ def test_labels_say_in_a_line_what_they_are() -> None:
     )
     own = labels([frame()] * 5, protocol=replace(RELEASED, half_cell_shift=False), draw_ego=False).to_present()
     assert repr(own).endswith("0 actors in id_map, own protocol, all at the present)")
+
+
+CONFIG = MotionLabelConfig(grid=BevGrid((-20, 20, 0.5), (-15, 15, 0.5)), receptive_field=1, future_frames=1)
+CORNERS = st.lists(
+    st.lists(st.tuples(st.integers(-20, 100), st.integers(-20, 100)), min_size=4, max_size=4), min_size=1, max_size=6
+)
+MOTIONS = st.tuples(
+    *(st.floats(-30, 30) for _ in range(2)), *(st.floats(-0.2, 0.2) for _ in range(3)), st.floats(-4, 4)
+)
+
+
+def footprints(corners: list, config: MotionLabelConfig) -> Footprints:
+    """All in the second of two frames."""
+    shape = config.grid.with_orientation(config.rules.native).shape
+    image, given = np.ones(len(corners), dtype=np.int64), np.array(corners, dtype=np.int64)
+    return Footprints(given, image, 1 + np.arange(len(given)) // 2, topmost(given, shape, image, 2))
+
+
+@given(CORNERS, MOTIONS, st.sampled_from(list(LABEL_PROTOCOLS)))
+def test_near_cells_are_enough(corners: list, motion: tuple[float, ...], protocol: str) -> None:
+    config = replace(CONFIG, protocol=protocol)
+    shown, matrices = footprints(corners, config), sampling_matrix(conventions.matrices_of_six([motion]), config.rules)
+    found = following_centers(shown, matrices, config, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drawing, "even_spread", lambda *_: None)  # as for points that are far away
+        assert_array_equal(found, following_centers(shown, matrices, config, 3))
+
+
+def test_few_cells_are_looked_at() -> None:
+    """Else the shortcut could be lost without any other test failing."""
+    shown = footprints([[(30, 20), (38, 20), (38, 24), (30, 24)]], CONFIG)
+    lines = drawing.sampling_lines(np.eye(4)[None], CONFIG.grid, CONFIG.rules)
+    assert (
+        9 * 5 <= drawing.runs_near(shown, *drawing.even_spread(lines, CONFIG.grid), CONFIG.grid).length.sum() <= 12 * 8
+    )
+
+
+@pytest.mark.parametrize("motion", [(1e7, 0, 0, 0, 0, 0), (0, 0, 0, np.pi / 2, 0, 0)], ids=["far away", "upright"])
+def test_points_that_do_not_lie_evenly_are_looked_at_one_by_one(motion: tuple[float, ...]) -> None:
+    config = replace(CONFIG, protocol="clean")
+    shown = footprints([[(0, 0), (79, 0), (79, 59), (0, 59)]], config)
+    matrices = sampling_matrix(conventions.matrices_of_six([motion]), config.rules)
+    lines = drawing.sampling_lines(matrices, config.grid.with_orientation("released"), config.rules)
+    assert drawing.even_spread(lines, config.grid.with_orientation("released")) is None
+    assert np.isnan(following_centers(shown, matrices, config, 1)[0, 1]).all() == (motion[0] > 0)
+
+
+def test_one_frame_that_does_not_lie_evenly_is_enough_to_look_at_every_cell() -> None:
+    grid = CONFIG.grid.with_orientation("released")
+    turned = conventions.matrices_of_six([(0, 0, 0, np.pi / 2, 0, 0)])[0]
+    for other in (turned, np.diag([0.45, 0.45, 1, 1]), np.diag([2.1, 2.1, 1, 1])):
+        lines = drawing.sampling_lines(np.stack([np.eye(4), other]), grid, LABEL_PROTOCOLS["clean"])
+        assert drawing.even_spread(lines, grid) is None
+    near = np.stack([np.eye(4), np.diag([0.55, 0.55, 1, 1]), np.diag([1.9, 1.9, 1, 1])])
+    lines = drawing.sampling_lines(near, grid, LABEL_PROTOCOLS["clean"])
+    assert drawing.even_spread(lines, grid) is not None

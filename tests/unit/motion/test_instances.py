@@ -50,8 +50,7 @@ def test_a_square_that_moves_keeps_its_id_and_has_a_path() -> None:
     assert ids_at(linked.instance[1], (5, 9), (20, 31), (0, 0)) == [1, 2, 0]
     assert_array_equal(linked.centers[1], [[5, 5], [5, 9]])
     assert_array_equal(linked.paths[2].cell_counts, [25, 25])
-    assert linked.instance.dtype == np.int32
-    assert linked.redrawn is None
+    assert (linked.instance.dtype, linked.redrawn) == (np.int32, None)
 
 
 def test_a_pair_must_be_nearer_than_the_link_distance() -> None:
@@ -82,8 +81,7 @@ def test_without_any_background_the_lowest_instance_becomes_it() -> None:
     heads = drawn({(5, 5): (0, 0), (20, 30): (0, 0)})
     full = replace(heads, segmentation=np.broadcast_to(np.float32([[[-1]], [[1]]]), heads.segmentation.shape))
     linked = predict_instances(full)
-    assert ids_at(linked.instance[0], (5, 5), (20, 30)) == [0, 1]
-    assert list(linked.paths) == [1]
+    assert (ids_at(linked.instance[0], (5, 5), (20, 30)), list(linked.paths)) == ([0, 1], [1])
     accident = predict_instances(full, "accident")
     assert accident.redrawn is not None
     assert set(np.unique(accident.redrawn)) == {0, 1}
@@ -111,8 +109,7 @@ def test_labels_are_not_taken_for_logits(orientation) -> None:
     encoded = replace(heads, segmentation=np.stack([~actor, actor], axis=1) * np.float32(10))
     for rules in (POST_PROCESSING["accident"], PostProcessing(foreground="sigmoid")):
         assert (predict_instances(encoded, rules).instance > 0).sum() == 25
-        literal = replace(rules, labels_bypass_sigmoid=False)
-        assert (predict_instances(encoded, literal).frame_instance == 0).all()
+        assert (predict_instances(encoded, replace(rules, labels_bypass_sigmoid=False)).frame_instance == 0).all()
 
 
 def test_the_sigmoid_is_above_its_threshold_where_its_logit_is() -> None:
@@ -124,8 +121,7 @@ def test_the_sigmoid_is_above_its_threshold_where_its_logit_is() -> None:
 
 
 def test_redrawn_boxes_follow_the_path_but_not_across_a_gap() -> None:
-    heads = drawn({(5, 5): (0, 8)}, {(5, 13): (0, 8)}, {(5, 21): (0, 0)})
-    redrawn = predict_instances(heads, "accident").redrawn
+    redrawn = predict_instances(drawn({(5, 5): (0, 8)}, {(5, 13): (0, 8)}, {(5, 21): (0, 0)}), "accident").redrawn
     assert redrawn is not None
     for frame, column in zip(redrawn, (5, 13, 21), strict=True):
         rows, columns = np.nonzero(frame)
@@ -146,13 +142,11 @@ def test_redrawn_boxes_are_cut_to_a_cars_size_and_later_ids_lie_on_top() -> None
     linked = predict_instances(replace(heads, segmentation=long, centerness=centerness), "accident")
     assert linked.redrawn is not None
     rows, columns = np.nonzero(linked.redrawn[0] == 3)
-    assert (np.ptp(rows), np.ptp(columns)) == (2, 10)
-    assert ids_at(linked.redrawn[0], (4, 12), (4, 9)) == [2, 1]
+    assert (np.ptp(rows), np.ptp(columns), ids_at(linked.redrawn[0], (4, 12), (4, 9))) == (2, 10, [2, 1])
 
 
 def test_trajectories_undo_the_half_cell() -> None:
-    grid = BevGrid(x=(-10, 10, 0.5), y=(-5, 10, 0.5))
-    heads = drawn({(5, 8): (0, 0)})
+    grid, heads = BevGrid(x=(-10, 10, 0.5), y=(-5, 10, 0.5)), drawn({(5, 8): (0, 0)})
     assert_allclose(trajectories(predict_instances(heads), grid)[1], [[-6.0, 7.5]])
     assert_allclose(trajectories(predict_instances(heads), grid, half_cell_shift=False)[1], [[-5.75, 7.25]])
     turned = predict_instances(heads.in_orientation("devkit"))
@@ -168,8 +162,13 @@ def test_trajectories_undo_the_half_cell() -> None:
         for linked in (turned, native):
             assert_allclose(trajectories(linked, grid, protocol)[1], [place])
             assert_allclose(trajectories(linked, grid, protocol, half_cell_shift=False)[1], [[-5.75, 7.25]])
-    with pytest.raises(GeometryError, match=r"grid: has \(30, 20\) cells, but the instances have \(30, 40\)"):
-        trajectories(turned, BevGrid(x=(0, 10, 0.5), y=(-5, 10, 0.5)))
+    assert_refused(
+        (
+            lambda: trajectories(turned, BevGrid(x=(0, 10, 0.5), y=(-5, 10, 0.5))),
+            GeometryError,
+            r"grid: has \(30, 20\) cells, but the instances have \(30, 40\)",
+        ),
+    )
 
 
 def test_results_cannot_be_changed_and_own_nobodys_arrays() -> None:
@@ -258,8 +257,10 @@ def test_a_redrawn_box_turns_after_a_move_of_four_cells_and_is_10_by_4_at_most(m
     hull = [(28, 8), (28, 16), (12, 16), (12, 8)]  # 16 × 8, along a row
     centers = np.array([[[12.0, 20.0], [12.0 + move, 20.0], [13.0 + move, 20.0]]])
     positions, ids = redrawn_cells([hull], centers, np.ones((1, 3), dtype=bool), (40, 40))
-    extents = [tuple(np.ptp(position, axis=1).tolist()) for position in positions]
-    assert extents == [(4, 10), *[(10, 4) if turns else (4, 10)] * 2]
+    assert [tuple(np.ptp(position, axis=1).tolist()) for position in positions] == [
+        (4, 10),
+        *[(10, 4) if turns else (4, 10)] * 2,
+    ]
     assert [position.mean(axis=1).tolist() for position in positions] == centers[0].tolist()
     assert all((one == 1).all() for one in ids)
 

@@ -68,6 +68,4 @@ def test_the_part_that_comes_last_outside_of_all_holes_counts() -> None:
 
 def test_no_hulls_no_rectangles() -> None:
     size, angle = min_area_rects([])
-    assert size.shape == (0, 2)
-    assert angle.shape == (0,)
-    assert are_one_part(*[np.zeros(0, dtype=int)] * 3, 0).shape == (0,)
+    assert (size.shape, angle.shape, are_one_part(*[np.zeros(0, dtype=int)] * 3, 0).shape) == ((0, 2), (0,), (0,))

@@ -1,0 +1,39 @@
+"""Every default and constant of results, against what is written out here."""
+
+from pathlib import Path
+
+from refusals import assert_refused
+from written_out import written_out
+
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
+from deepaccident_devkit.evaluation.results.records import json_meta
+
+WRITTEN = {
+    "motion.MEMBER": "'{}/{}.npy'",
+    "motion.HEADS": "{'segmentation': 2, 'centerness': 1, 'offset': 2, 'flow': 2}",
+    "motion.NOT_READ": "('trajectory_id', 'trajectory')",
+    "motion.MotionForm": "step=0.5, labels=None",
+    "reader.EntryContents": "form=None",
+    "reader.contents_of": "fingerprint=''",
+    "records.FORMAT": "'DeepAccident results'",
+    "records.FORMAT_VERSION": "1",
+    "records.RESULTS_NAMES": (
+        "mappingproxy({'motion': 'motion', 'accident': 'accident.json', 'detection': 'detection.json'})"
+    ),
+    "records.RESULTS_FILE": "'results.json'",
+    "records.WORDS": "'^[^/\\\\\\\\]+(/[^/\\\\\\\\]+)*$'",
+    "records.LARGEST": "1000000.0",
+    "records.LENGTH_FIRST": "[1, 0, 2]",
+    "records.parsed_json": "levels=64",
+    "records.entry_place": "number=None",
+    "writer.MOST_BYTES": "33554432",
+    "writer.ResultsWriter": "meta=None, grid=None, step=0.5, labels='released', store='instances'",
+}
+
+
+def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
+    assert written_out("deepaccident_devkit.evaluation.results") == WRITTEN
+    assert json_meta({}) == {}
+    assert repr(ResultsWriter(tmp_path / "x", "motion")) == f"ResultsWriter(motion to {tmp_path / 'x'}: 0 samples)"
+    assert_refused((lambda: read_results(tmp_path / "x"), ResultsError, ("x: no such file",)))

@@ -1,0 +1,84 @@
+"""Every default and constant of evaluation runs, against what is written out here."""
+
+from pathlib import Path
+
+from refusals import assert_refused
+from written_out import written_out
+
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.runs import compare_bundles
+from deepaccident_devkit.evaluation.runs.bundles import checked_target
+from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of
+from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
+from deepaccident_devkit.evaluation.runs.sanity import SanityReport
+from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, Coverage, EvaluationSetup, default_selection
+from deepaccident_devkit.evaluation.runs.text import notes_of
+from deepaccident_devkit.evaluation.runs.verification import differing
+
+WRITTEN = {
+    "bundles.SUMMARY_FILE": "'metrics_summary.json'",
+    "bundles.COUNTS_FILE": "'counts.json'",
+    "bundles.ROWS_FILE": "'samples.parquet'",
+    "bundles.SCENARIOS_FILE": "'scenarios.json'",
+    "bundles.FILES_FILE": "'files.json'",
+    "bundles.RESULTS_FOLDER": "'results'",
+    "bundles.SCENARIOS_FORMAT": "'DeepAccident scenario hashes'",
+    "bundles.FILES_FORMAT": "'DeepAccident evaluation bundle'",
+    "bundles.checksums_of": "listed=None",
+    "bundles.save_run": "include_results=False, overwrite=False, extras=()",
+    "bundles.checked_target": "overwrite=False",
+    "comparison.compare_bundles": "resampling=None, common=False",
+    "evaluation_run.SUMMARY_FORMAT": "'DeepAccident metrics summary'",
+    "evaluation_run.SUMMARY_VERSION": "1",
+    "evaluation_run.BREAKDOWNS": (
+        "('all', 'time_to_impact', 'accident_visibility', 'agent', 'scenario_type', 'town', "
+        "'weather_group', 'time_of_day_group', 'road_type', 'trajectory_type', 'collision_status')"
+    ),
+    "evaluation_run.EvaluationRun": "sanity=None, left_out=0, further=<factory>",
+    "evaluation_run.EvaluationRun.broken_down": "by=None, resampling=None",
+    "evaluation_run.evaluate_results": "selection='val', allow_partial=False, out=None",
+    "further.with_further": "resampling=None",
+    "rows.STAMP_KEY": "b'deepaccident'",
+    "sanity.NOTHING_WRONG": "'Nothing looks wrong with the predictions.'",
+    "sanity.SAMPLES": "20",
+    "sanity.LISTS": "60",
+    "sanity.NEAR_IN_TIME": "0.15",
+    "sanity.MOVING": "4.0",
+    "sanity.STRAIGHT": "0.2617993877991494",
+    "sanity.FEWEST_FRAMES": "3",
+    "sanity.Seen": "empty=False, scores=(), probabilities=False, headings=(0, 0)",
+    "setups.LIST_STEP": "0.5",
+    "setups.TASK_RESULTS": (
+        "mappingproxy({'motion': ('motion',), 'accident': ('motion', 'accident'), "
+        "'detection': ('detection',), 'warning': ('motion', 'accident')})"
+    ),
+    "setups.SampleSelection": "samples='evaluate', scope='accident', agents=None, horizon=2.0",
+    "setups.Coverage": "missing=(), extra=(), unknown=(), splits=(), agents=()",
+    "setups.EvaluationSetup": "protocol='released', switches=<factory>, horizon=2.0",
+    "setups.default_selection": "split='val', samples=None, scope=None, agents=None",
+    "setups.evaluation_store": "command=''",
+    "text.SHOWN_BREAKDOWNS": "('time_to_impact', 'accident_visibility')",
+    "text.summary_text": "by=('time_to_impact', 'accident_visibility')",
+    "verification.ABSENT": "'absent'",
+    "verification.differing": "without=(), path=''",
+    "verification.verify_bundle": "results=None, split=None",
+}
+
+PROTOCOLS = {
+    "motion": ("released", "paper"),
+    "accident": ("released", "paper", "boxes"),
+    "detection": ("released", "released_iou", "paper", "opencood"),
+    "warning": ("clean", "field"),
+}
+
+
+def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
+    assert written_out("deepaccident_devkit.evaluation.runs") == WRITTEN
+    assert {task: tuple(protocols) for task, protocols in TASK_PROTOCOLS.items()} == PROTOCOLS
+    setup = EvaluationSetup(task="motion")
+    assert default_selection(setup).text() == "split val, samples evaluate (the last 2 s), scope accident, all agents"
+    write_rows(tmp_path / "rows", [], {})
+    assert (read_rows(tmp_path / "rows"), list(differing({}, {})), list(notes_of({}))) == (([], {}), [], [])
+    assert (checked_target(tmp_path / "new"), breakdowns_of("warning")[:2]) == (tmp_path / "new", ("all", "agent"))
+    assert (SanityReport(samples=0, warnings=()).warnings_text(), Coverage(expected=1).is_complete) == ("", True)
+    assert_refused((lambda: compare_bundles(tmp_path / "a", tmp_path / "b"), ResultsError, ("no such folder",)))

@@ -1,0 +1,59 @@
+"""Every default and constant of V2X, against what is written out here."""
+
+import numpy as np
+from written_out import written_out
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.v2x import cooperative_view, relative_pose_to_ego
+from deepaccident_devkit.v2x.clouds import moved_points
+from deepaccident_devkit.v2x.collisions import labelled_pair
+from deepaccident_devkit.v2x.tracks import scenario_tracks
+
+WRITTEN = {
+    "agents.SHEER_CURTAINS": "('Town05_type001_subtype0002_scenario00035', 'Town05_type001_subtype0002_scenario00004')",
+    "agents.VISIBILITIES": "('visible', 'partial', 'invisible')",
+    "agents.AVAILABLE": "'available'",
+    "agents.AGENT_SETS": (
+        "('single', '+behind', '+other', '+infrastructure', '+behind+other', 'vehicles', 'all', 'available')"
+    ),
+    "agents.AgentConfig": "partners=()",
+    "agents.AgentConfig.agents_for": "side='ego_vehicle'",
+    "agents.cooperating_agents": "agents=None",
+    "agents.accident_visible_mask": "collision=True, exempt=False",
+    "agents.pair_in_view": "own_id=None",
+    "clouds.aggregate_point_cloud": "agents=None, sweeps=1, frame='world', compensate=False, "
+    "link=None, on_missing='raise'",
+    "collisions.CONTACT_GAP": "1.5",
+    "cooperation.SAME_PLACE": "0.5",
+    "cooperation.visible_instances": "agents=None, link=None",
+    "cooperation.visible_actors": "agents=None, link=None",
+    "cooperation.cooperative_boxes": "agents=None, frame='world', visible=None, link=None",
+    "cooperation.cooperative_view": "agents=None, frame='world', visible=None, link=None",
+    "cooperation.seen_actors": "agents='single', link=None, frame='ego'",
+    "messages.POINT_BYTES": "16",
+    "messages.BOX_BYTES": "45",
+    "messages.POSE_BYTES": "24",
+    "messages.PoseNoise": "mean=0.0, std=0.02, heading_std=0.0",
+    "messages.Link": "latency=0.0, pose_noise=None, packet_loss=0.0, seed=0",
+    "messages.message_sizes": (
+        "agents=None, bev_shape=(64, 200, 200), bev_dtype=<class 'numpy.float32'>, clouds=True, "
+        "link=None, on_missing='raise'"
+    ),
+    "messages.messages": "agents=None, link=None, sweeps=1",
+    "poses.transform": "target='ego', source='ego'",
+    "poses.future_egomotion": "valid=None",
+    "poses.project_to_image": "frame=None, colors=True",
+    "poses.map_pointcloud_to_image": "sample=None, colors=True",
+    "tracks.Trajectory": "present=None",
+    "tracks.trajectory": "sample=None, frame='world'",
+}
+
+
+def test_every_default_and_constant_written_out(da_b: DeepAccident) -> None:
+    assert written_out("deepaccident_devkit.v2x") == WRITTEN
+    # of each module something is called: what the mutation runner changes is looked for by tests that come there
+    nobody = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
+    assert len(moved_points(np.zeros((0, 3)), nobody, nobody)) == len(relative_pose_to_ego([SE3.identity()])) - 1 == 0
+    assert labelled_pair(None, np.zeros(1)) is None
+    assert len(cooperative_view(da_b, da_b.sample[0]).source) > 0 < len(scenario_tracks(da_b, da_b.scenario[0]).index)
