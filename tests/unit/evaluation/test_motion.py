@@ -126,6 +126,7 @@ HALVED[:, 1, 100:104, 100:102] = 1e-6
 """Logits of which half of a box's cells are as much background as actor."""
 VECTORS = np.zeros_like(HALVED)
 UNSURE = MotionHeads.from_arrays(HALVED, VECTORS[:, :1], VECTORS, VECTORS)
+NOBODY = MotionHeads.from_arrays(VECTORS, VECTORS[:, :1], VECTORS, VECTORS)
 COUNTS = ("true_positive", "false_positive", "false_negative")
 
 
@@ -148,6 +149,8 @@ COUNTS = ("true_positive", "false_positive", "false_negative")
         (still(boxes(_7=100), boxes(_1=50)), TRUE, "30x30", {"pq": 0}),
         (MotionOutput(grid=CONFIG.grid, heads=(UNSURE,)), TRUE, "30x30", {"iou": 50}),
         (MotionOutput(grid=CONFIG.grid, heads=(UNSURE,)), TRUE, "100x100", {"iou": 50}),
+        (MotionOutput(grid=CONFIG.grid, heads=(UNSURE, NOBODY)), TRUE, "100x100", {"iou": 0, "false_negative": 5}),
+        (MotionOutput(grid=CONFIG.grid, heads=(NOBODY, UNSURE)), TRUE, "100x100", {"iou": 50}),
     ],
 )
 def test_cells_and_instances_within_a_range(prediction, label, name, expected) -> None:

@@ -61,6 +61,10 @@ def all_unknown(code: str, note: str) -> tuple[Any, ...]:
                 "dad": (11 / 12, 3.125, 5, None, None, None, None, ""),
             },
         ),
+        (
+            series(np.zeros((2, 4)), [False] * 2),
+            dict.fromkeys(("ustring", "dsta"), f"{RAISES}no threshold has another recall than the others"),
+        ),
         (series(np.zeros((3, 4)), TWO), {"ustring": ABOVE, "dsta": ABOVE, "drive": (0, 0, 0, None, 0, 0, 0, "")}),
         (series(np.full((3, 4), LOW), TWO), {"ustring": ABOVE, "dad": (0, 0, 0, None, None, None, None, "")}),
         (
