@@ -1,26 +1,32 @@
-"""Results by attribute, of any evaluator, with intervals over scenarios."""
+"""The attributes of samples, and results by them, of any evaluator, with intervals over scenarios."""
 
-from collections.abc import Collection
+import math
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 from generated_bundles import motion_counts
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.breakdowns import (
+    ATTRIBUTES,
     NO_IMPACT,
     SampleAttributes,
     breakdown,
     cluster_of,
     sample_attributes,
+    time_bin,
+    tokens_by_value,
 )
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.predictions import instances_of
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE
+from deepaccident_devkit.v2x import accident_visible
 
 STORY = {
     "scenario_type": "type1_subtype1_accident",
@@ -94,19 +100,25 @@ def filled(numbers: range = range(100), kind: type[Shares] = Shares) -> Shares:
 MANY = {f"{number:03d}": attributes_of(number) for number in range(100)}
 
 
+ALL_AT_ONCE = Resampling(resamples=0)
+
+
+def shown(groups: Sequence[Any]) -> dict[Any, int]:
+    return {group.value: group.samples for group in groups}
+
+
 def test_groups_are_the_results_of_their_samples() -> None:
     evaluator = filled()
     found = breakdown(evaluator, MANY, "town")
+    assert (found.by, found.resampling) == ("town", Resampling())
     assert [group.value for group in found.groups] == ["Town00", "Town01", "Town02"]
     for index, group in enumerate(found.groups):
         tokens = [token for token in MANY if int(token) // 10 % 3 == index]
-        assert group.result == evaluator.compute(tokens)
-        assert (group.samples, group.scenarios) == (len(tokens), len(tokens) // 10)
-        assert group.intervals == {}
         count = len(tokens) // 10
         text = f"no intervals: of {count} clusters (an accident and its twin are one); at least 6 are needed"
-        assert group.notes == (text,)
-    assert sum(group.result.hits for group in found.groups) == evaluator.compute().hits
+        assert group.result == evaluator.compute(tokens)
+        assert (group.samples, group.scenarios, group.clusters) == (len(tokens), count, count)
+        assert (group.intervals, group.notes) == ({}, (text,))
 
 
 def test_everything_is_a_breakdown_too() -> None:
@@ -118,16 +130,48 @@ def test_everything_is_a_breakdown_too() -> None:
     assert (set(group.intervals), group.notes) == ({"share"}, ())
 
 
-def test_times_are_in_order_and_what_is_unknown_comes_last() -> None:
-    changed = {"time_to_impact": None, "impact_step": NO_IMPACT}
-    attributes = MANY | {token: attributes_of(int(token), **changed) for token in ("000", "013")}
-    by_second = breakdown(filled(), attributes, "time_to_impact", Resampling(resamples=0))
-    assert [group.value for group in by_second.groups] == ["0 s", "1 s", "2 s", "3 s", "4 s", None]
-    by_step = breakdown(filled(), attributes, "impact_step", Resampling(resamples=0))
-    values = [group.value for group in by_step.groups]
-    assert values == ["0 s", "0.5 s", "1 s", "1.5 s", "2 s", "2.5 s", "3 s", "3.5 s", "4 s", "4.5 s", NO_IMPACT]
-    assert by_step.groups[-1].samples == 2
-    assert not by_step.groups[0].intervals
+def changed(some: Callable[[int], bool], **changes: Any) -> dict[str, SampleAttributes]:
+    return {token: replace(each, **changes) if some(int(token)) else each for token, each in MANY.items()}
+
+
+FIRST_TWO = changed(lambda number: number in (0, 13), time_to_impact=None, impact_step=NO_IMPACT)
+POLES = changed(lambda number: number % 10 < 4, agent=INFRASTRUCTURE)
+AGENT_EACH = {token: replace(each, agent=AGENTS[int(token) % 5]) for token, each in MANY.items()}
+
+
+@pytest.mark.parametrize(
+    ("attributes", "by", "groups", "without"),
+    [
+        (
+            FIRST_TWO,
+            "time_to_impact",
+            {"0 s": 19, "1 s": 19, **dict.fromkeys(("2 s", "3 s", "4 s"), 20), None: 2},
+            None,
+        ),
+        (
+            FIRST_TWO,
+            "impact_step",
+            {
+                "0 s": 9,
+                "0.5 s": 10,
+                "1 s": 10,
+                "1.5 s": 9,
+                **{f"{at / 2:g} s": 10 for at in range(4, 10)},
+                NO_IMPACT: 2,
+            },
+            None,
+        ),
+        (POLES, "town", {"Town00": 40, "Town01": 30, "Town02": 30}, {"Town00": 24, "Town01": 18, "Town02": 18}),
+        (POLES, "agent", {"ego_vehicle": 60, INFRASTRUCTURE: 40}, {"ego_vehicle": 60}),
+        (AGENT_EACH, "agent", dict.fromkeys(AGENTS, 20), dict.fromkeys(AGENTS[:-1], 20)),  # in their usual order
+    ],
+)
+def test_groups_are_in_order_and_the_pole_is_left_out_beside(attributes, by, groups, without) -> None:
+    """What is unknown comes last."""
+    found = breakdown(filled(), attributes, by, ALL_AT_ONCE)
+    assert list(shown(found.groups).items()) == list(groups.items())
+    assert list(shown(found.without_infrastructure).items()) == list((without or groups).items())
+    assert {len(group.intervals) for group in found.groups} == {0}
 
 
 @pytest.mark.parametrize(
@@ -143,22 +187,6 @@ def test_a_cluster_has_no_ending(scenario: str, cluster: str) -> None:
     assert cluster_of(scenario) == cluster
 
 
-def test_the_pole_is_left_out_beside() -> None:
-    poles = {token: replace(each, agent=INFRASTRUCTURE) for token, each in MANY.items() if int(token) % 10 < 4}
-    found = breakdown(filled(), MANY | poles, "town", Resampling(resamples=0))
-    assert [group.samples for group in found.groups] == [40, 30, 30]
-    assert [group.samples for group in found.without_infrastructure] == [24, 18, 18]
-    by_agent = breakdown(filled(), MANY | poles, "agent", Resampling(resamples=0))
-    assert [group.value for group in by_agent.groups] == ["ego_vehicle", INFRASTRUCTURE]
-    assert [group.value for group in by_agent.without_infrastructure] == ["ego_vehicle"]
-
-
-def test_agents_are_in_their_usual_order() -> None:
-    attributes = {token: replace(each, agent=AGENTS[int(token) % 5]) for token, each in MANY.items()}
-    found = breakdown(filled(), attributes, "agent", Resampling(resamples=0))
-    assert [group.value for group in found.groups] == list(AGENTS) != sorted(AGENTS)
-
-
 @pytest.mark.parametrize("kind", [Shares, PooledShares])
 def test_no_order_makes_a_difference(kind: type[Shares]) -> None:
     expected = breakdown(filled(kind=kind), MANY, "town")
@@ -166,19 +194,15 @@ def test_no_order_makes_a_difference(kind: type[Shares]) -> None:
     assert breakdown(filled(range(99, -1, -1), kind), backwards, "town") == expected
     parts = filled(range(50, 100), kind).merge(filled(range(60), kind))
     assert breakdown(parts, backwards, "town") == expected
-    assert [group.intervals for group in expected.groups] == [
-        group.intervals for group in breakdown(filled(), MANY, "town").groups
-    ]
+    assert expected.groups == breakdown(filled(), MANY, "town").groups
 
 
 def test_an_accident_and_its_twin_are_one_cluster() -> None:
     """Twins that are equal tell nothing new: the interval is that of the accidents alone."""
-    accidents, both = Shares(), Shares()
-    attributes = {}
+    accidents, both, attributes = Shares(), Shares(), {}
     for number in range(80):
         for kind in ("accident", "normal"):
-            token = f"{number:03d} {kind}"
-            story = f"type1_subtype1_{kind}/Town03_{number // 10}"
+            token, story = f"{number:03d} {kind}", f"type1_subtype1_{kind}/Town03_{number // 10}"
             attributes[token] = attributes_of(number, scenario=story)
             for evaluator in (accidents, both) if kind == "accident" else (both,):
                 evaluator.add(token, {"hit": float(number // 10 % 2)})
@@ -200,19 +224,59 @@ def test_a_percentage_that_is_always_100_is_not_sure() -> None:
 
 
 def test_what_cannot_be_broken_down() -> None:
-    for error, words, refused in (
-        (
-            EvaluationError,
-            "1 samples have no attributes, such as 099",
-            lambda: breakdown(filled(), dict(list(MANY.items())[:-1]), "town"),
-        ),
-        (EvaluationError, "100 samples have no attributes, such as 000", lambda: breakdown(filled(), {}, "town")),
-        (ChoiceError, r"by: expected one of .*town, .* found 'moon'", lambda: breakdown(filled(), MANY, "moon")),
-        (ConfigError, "resamples: expected a whole number from 0", lambda: Resampling(resamples=-1)),
-        (ConfigError, "confidence: expected a share between 0 and 1", lambda: Resampling(confidence=95)),
-    ):
-        with pytest.raises(error, match=words):
-            refused()
+    few = dict(list(MANY.items())[:-1])
+    assert_refused(
+        (lambda: breakdown(filled(), few, "town"), EvaluationError, ("1 samples", "such as 099", "sample_attributes")),
+        (lambda: breakdown(filled(), {}, "town"), EvaluationError, ("100 samples", "such as 000")),
+        (lambda: breakdown(filled(), MANY, "moon"), ChoiceError, ("by: expected one of", "town", "'moon'")),
+        (lambda: MANY["000"].value("moon"), ChoiceError, ("by: expected one of", "'moon'")),
+    )
+
+
+@pytest.mark.parametrize(
+    ("frames", "second", "step"),
+    [
+        (0, "0 s", "0 s"),
+        (1, "1 s", "0.5 s"),
+        (5, "1 s", "0.5 s"),
+        (6, "1 s", "1 s"),
+        (30, "3 s", "3 s"),
+        (31, "4 s", "3.5 s"),
+    ],
+)
+def test_bins_of_time_have_their_upper_edge(frames: int, second: str, step: str) -> None:
+    assert (time_bin(frames, 10), time_bin(frames, 5)) == (second, step)
+
+
+def test_the_attributes_of_samples_are_those_of_their_records(da_motion: DeepAccident) -> None:
+    """Of two recordings of 3.5 s: every tenth of a second of one agent, and the samples that are evaluated."""
+    evaluated = da_motion.samples("train", "evaluate")
+    tokens = [sample["token"] for sample in da_motion.sample if sample["agent"] == AGENTS[-1]]
+    attributes = sample_attributes(da_motion, [*evaluated, *tokens])
+    assert list(attributes) == list(dict.fromkeys([*evaluated, *tokens]))
+    words = {True: "visible", False: "invisible", None: None}
+    for token, each in attributes.items():
+        sample = da_motion.sample.get(token)
+        scenario = da_motion.scenario.get(sample["scenario_token"])
+        tenths = round(10 * (sample["time_to_impact"] or 0))
+        bins = f"{math.ceil(tenths / 10)} s", f"{math.ceil(tenths / 5) / 2:g} s"
+        assert (each.scenario, each.agent, each.time_to_end) == (
+            sample["scenario_token"],
+            sample["agent"],
+            f"{(35 - int(token[-3:])) / 10:.1f}",
+        )
+        assert (each.time_to_impact, each.impact_step) == (bins if scenario["collision"] else (NO_IMPACT, NO_IMPACT))
+        assert each.accident_visibility == words[accident_visible(da_motion, token)]
+        assert [each.value(name) for name in ("agent", "all", "town", "Weather")] == [
+            sample["agent"],
+            "all",
+            scenario["town"],
+            scenario["weather"],
+        ]
+    chosen = {token: attributes[token] for token in evaluated}
+    by_value = {name: tokens_by_value(chosen, name) for name in ATTRIBUTES}
+    assert {sum(map(len, each.values())) for each in by_value.values()} == {len(evaluated)}
+    assert {value: len(each) for value, each in by_value["time_to_impact"].items()} == {"2 s": 10, "1 s": 10}
 
 
 def test_a_breakdown_of_motion_metrics(da_motion: DeepAccident) -> None:
@@ -224,10 +288,7 @@ def test_a_breakdown_of_motion_metrics(da_motion: DeepAccident) -> None:
         label = da_motion.motion_labels(token)
         evaluator.update(token, instances_of(label.to_present().instance, label.config.grid), label)
     found = breakdown(evaluator, sample_attributes(da_motion, tokens), "collision_status")
-    assert [(group.value, group.samples) for group in found.groups] == [
-        ("collides_between_vehicles", 2),
-        ("no_collision", 2),
-    ]
-    assert [group.samples for group in found.without_infrastructure] == [1, 1]
+    assert shown(found.groups) == {"collides_between_vehicles": 2, "no_collision": 2}
+    assert shown(found.without_infrastructure) == {"collides_between_vehicles": 1, "no_collision": 1}
     (everything,) = breakdown(evaluator, sample_attributes(da_motion, tokens), "all").groups
     assert (everything.clusters, dict(everything.intervals)) == (1, {})

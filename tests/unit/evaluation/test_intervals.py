@@ -1,13 +1,15 @@
-"""Intervals of numbers: by Student's t and Wilson's formula, and where there is none."""
+"""Intervals of numbers: by Student's t and Wilson's formula, and where there is none; what numbers can be."""
 
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
@@ -15,14 +17,18 @@ from deepaccident_devkit.evaluation.intervals import (
     LEAST_CLUSTERS,
     Intervals,
     Resampling,
-    _notes,
     difference_intervals,
-    few_clusters,
+    has_interval,
     interval_ends,
     intervals_of,
+    numbers_of,
     parts_of,
+    range_of,
     standard_errors,
 )
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
+from deepaccident_devkit.evaluation.task import HEADLINE_UNITS
 
 
 @dataclass(frozen=True)
@@ -100,31 +106,45 @@ def test_errors_of_numbers_that_hang_on_one_cluster_are_uncertain() -> None:
     assert standard_errors(np.zeros(1), mostly_one)[1] == pytest.approx(20 / 19, abs=0.01)
 
 
-class TestNone:
-    def test_of_few_clusters(self) -> None:
-        few = made([0.0, 1.0] * 2 + [1.0])
-        text = "no intervals: of 5 clusters (an accident and its twin are one); at least 6 are needed"
-        assert (few.ends, few.notes) == ({}, (text,))
-        assert made([0.0, 1.0] * 3).ends
+LEFT_OUT = f"(an accident and its twin are one); at least {LEAST_CLUSTERS} are needed"
 
-    def test_of_a_number_that_few_clusters_have(self) -> None:
-        few = made([0.3, 0.4, 0.5, 0.2, 0.1] + [0] * 20, [1] * 5 + [0] * 20)
-        assert few.ends == {}
-        assert few.notes == ("no interval of ratio: fewer than 6 clusters have such a number",)
 
-    def test_of_a_length_that_is_the_same_everywhere(self) -> None:
-        same = made([2.5] * 20)
-        assert same.ends == {}
-        assert same.notes == ("no interval of ratio: fewer than 6 clusters change it",)
+@pytest.mark.parametrize(
+    ("above", "below", "resampling", "ends", "notes"),
+    [
+        ([0, 1, 0, 1, 1], None, None, (), (f"no intervals: of 5 clusters {LEFT_OUT}",)),
+        ([1], None, None, (), (f"no intervals: of 1 cluster {LEFT_OUT}",)),
+        ([0, 1] * 3, None, None, ("ratio",), ()),
+        (
+            [0.3, 0.4, 0.5, 0.2, 0.1] + [0] * 20,
+            [1] * 5 + [0] * 20,
+            None,
+            (),
+            ("no interval of ratio: fewer than 6 clusters have such a number",),
+        ),
+        ([2.5] * 20, None, None, (), ("no interval of ratio: fewer than 6 clusters change it",)),
+        ([0.1 * 3, 0.3] * 10, [0.1, 0.1] * 10, None, (), ("no interval of ratio: fewer than 6 clusters change it",)),
+        ([0, 1] * 10, None, None, ("ratio",), ()),  # of NaN and of medians there is none
+        ([0, 1] * 10, None, Resampling(resamples=0), (), ()),
+    ],
+)
+def test_which_numbers_have_an_interval(above, below, resampling, ends, notes) -> None:
+    found = made(above, below, resampling)
+    assert (tuple(found.ends), found.notes) == (ends, notes)
 
-    def test_of_rounding(self) -> None:
-        assert made([0.1 * 3, 0.3] * 10, [0.1, 0.1] * 10).ends == {}
 
-    def test_of_nan_and_of_medians(self) -> None:
-        assert set(made([0.0, 1.0] * 10).ends) == {"ratio"}
+def test_of_many_numbers_without_an_interval_three_are_named() -> None:
+    class Many(Ratios):
+        """The same number under several names."""
 
-    def test_without_resamples(self) -> None:
-        assert made([0, 1] * 10, resampling=Resampling(resamples=0)) == Intervals(ends={}, notes=())
+        def result_of(self, _counts: Collection[Counts]) -> Any:
+            return dict.fromkeys("abcdefg"[: self.count], 2.5)
+
+    for count, text in ((3, "a, b, c"), (4, "a, b, c and 1 others"), (7, "a, b, c and 4 others")):
+        evaluator = Many()
+        evaluator.count = count
+        found = intervals_of(evaluator, [[{}]] * 8, evaluator.result_of([]))
+        assert found.notes == (f"no interval of {text}: fewer than 6 clusters change it",)
 
 
 def test_many_clusters_are_joined() -> None:
@@ -164,34 +184,20 @@ def test_a_share_of_none_or_all_ends_there_exactly(share: float, end: int) -> No
         assert ends[1 - end] != share
 
 
-def test_at_the_least_number_of_clusters_it_is_that_they_are_alike() -> None:
-    few, alike = _notes({"few": LEAST_CLUSTERS - 1, "alike": LEAST_CLUSTERS})
-    assert few.startswith("no interval of few: fewer than")
-    assert alike == f"no interval of alike: fewer than {LEAST_CLUSTERS} clusters change it"
-    (four,) = _notes(dict.fromkeys("abcd", 0))
-    (three,) = _notes(dict.fromkeys("abc", 0))
-    assert (four[:32], three[:27]) == ("no interval of a, b, c and 1 oth", "no interval of a, b, c: few")
-
-
-def test_how_few_clusters_there_are_is_said_in_good_words() -> None:
-    assert few_clusters(1) == "of 1 cluster (an accident and its twin are one); at least 6 are needed"
-
-
 def test_settings_and_their_edges() -> None:
     assert Resampling() == Resampling(resamples=1000, confidence=0.95, seed=0)
-    assert Resampling(resamples=100_000, confidence=0.001).seed == 0
-    for settings, words in (
-        ({"resamples": 100_001}, "resamples: expected a whole number from 0 to 100,000, found 100001"),
-        ({"resamples": -1}, "resamples"),
-        ({"resamples": True}, "resamples"),
-        ({"resamples": 10.0}, "resamples"),
-        ({"seed": -1}, "seed: expected a whole number from 0, found -1"),
-        ({"seed": 1.0}, "seed"),
-        ({"confidence": 0}, "confidence: expected a share between 0 and 1, such as 0.95, found 0"),
-        ({"confidence": 1}, "confidence"),
-    ):
-        with pytest.raises(ConfigError, match=words):
-            Resampling(**settings)  # type: ignore[arg-type]
+    assert Resampling(resamples=100_000, confidence=0.001, seed=0).resamples == 100_000
+    assert_refused(
+        *(
+            (partial(Resampling, **{name: value}), ConfigError, (f"{name}: expected", words, f"found {value!r}"))
+            for name, words, values in (
+                ("resamples", "from 0 to 100,000", (100_001, -1, True, 10.0)),
+                ("seed", "from 0", (-1, 1.0)),
+                ("confidence", "such as 0.95", (0, 1, 95)),
+            )
+            for value in values
+        )
+    )
 
 
 @pytest.mark.parametrize("changing", [1, 5, 6, 10])
@@ -213,3 +219,68 @@ def test_a_share_that_hangs_on_one_part_is_no_less_sure_than_as_many_draws_as_pa
     left_out = np.array([0.55, *[0.5 + 1e-7, 0.5 - 1e-7] * 9, 0.5 + 1e-7])[:, None]
     ends = interval_ends(np.array([0.5]), left_out, np.array([[0, 1]]), 0.95)
     assert np.ravel(ends) == pytest.approx(wilson(0.5, 20, 2.0930), abs=1e-4)
+
+
+def test_the_numbers_of_a_result() -> None:
+    numbers = numbers_of(MotionEvaluator().compute())
+    scales = [f"ranges/{name}/{each}" for name in ("30x30", "100x100") for each in ("iou", "pq", "sq", "rq")]
+    assert list(numbers) == [*scales, "min_ade", "min_fde", "miss_rate", "path_accuracy"]
+    assert numbers_of({5.0: [Ratio(0.5)], "words": ("a", None, 3, 2.0)}) == pytest.approx(
+        {"5/0/ratio": 0.5, "5/0/nothing": math.nan, "5/0/median_of_all": 0.5, "words/3": 2.0}, nan_ok=True
+    )
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("ranges/30x30/iou", (0, 100)),
+        ("ranges/30x30/sq", (0, 100)),
+        ("iou/road", (0, 100)),
+        ("class_average_precision/car", (0, 100)),
+        ("within/5/accuracy", (0, 1)),
+        ("beside/sample_choice=mean_first/within/5/accuracy", (0, 1)),
+        ("mean_errors/ASE", (0, 1)),
+        ("mean_errors/ATE", (0, math.inf)),
+        ("episodes_per_minute", (0, math.inf)),
+        ("lateness", (-math.inf, math.inf)),
+        ("beside/time/lateness", (-math.inf, math.inf)),
+        ("groups/all/tta0_after/2", (0, math.inf)),
+        ("precision_at_5", (0, 1)),
+        ("groups/all/operating/alarm_seconds_per_minute", (0, math.inf)),
+        ("area_under_curve", (0, 1)),
+        ("mean_time", (0, math.inf)),
+    ],
+)
+def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, float]) -> None:
+    assert range_of(path, np.array([-0.5, 0.5])) == expected
+
+
+@pytest.mark.parametrize(
+    ("alone", "expected"),
+    [
+        ([0.0, 0.5, 1.0, math.nan], (0, 1)),
+        ([0.0, 1.5], (0, math.inf)),
+        ([-0.1, 0.5], (-math.inf, math.inf)),
+        ([math.nan], (0, 1)),
+        ([0.2, math.inf], (0, 1)),
+        ([1.001], (0, math.inf)),
+        ([-0.001, 3.0], (-math.inf, math.inf)),
+    ],
+)
+def test_a_number_of_others_is_what_its_clusters_are(alone: list[float], expected: tuple[float, float]) -> None:
+    assert range_of("theirs", np.array(alone)) == expected
+
+
+def test_totals_settings_and_medians_have_no_interval() -> None:
+    without = ("false_recordings", "within/5/distance", "median_warning", "threshold", "at/best_f1", "quiet")
+    assert [has_interval(path) for path in (*without, "beside/a=b/within/5/distance")] == [False] * 7
+    assert all(has_interval(path.replace("*", "5")) for path in HEADLINE_UNITS)
+
+
+@pytest.mark.parametrize("task", TASK_PROTOCOLS)
+def test_every_number_of_the_devkits_own_has_a_unit(task: str) -> None:
+    """Else it would be taken for what its clusters are, and change with them."""
+    for protocol in TASK_PROTOCOLS[task]:  # type: ignore[index]
+        for path in numbers_of(EvaluationSetup(task=task, protocol=protocol).evaluator().compute()):  # type: ignore[arg-type]
+            guesses = {range_of(path, np.array(alone)) for alone in ([0.5], [2.0], [-1.0])}
+            assert len(guesses) == 1 or not has_interval(path), path

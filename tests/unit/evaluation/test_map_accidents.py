@@ -18,49 +18,72 @@ from deepaccident_devkit.motion import LABEL_PROTOCOLS
 RELEASED = LABEL_PROTOCOLS["released"]
 
 
-def test_pairs_beyond_the_gate_use_nobody_up() -> None:
-    """1 is 3 m from 7 and 5 m from 8; 2 stands on 7 and is 3 m from 8: the least sum of all would leave 1 alone."""
-    truth = InstanceTracks(identity=np.array([7, 8]), center=np.array([[[0.0, 0.0], [3.0, 0.0]]]))
-    x = -7 / 6
-    predicted = InstanceTracks(identity=np.array([1, 2]), center=np.array([[[x, math.sqrt(9 - x * x)], [0.0, 0.0]]]))
-    assert match_tracks(predicted, truth, 4.0) == {1: 7, 2: 8}
-    assert match_tracks(predicted, truth, 6.0) == {1: 8, 2: 7}
+def tracks(names: list[int], *frames: list[tuple[float, float]]) -> InstanceTracks:
+    return InstanceTracks(identity=np.array(names), center=np.array(frames, dtype=np.float64))
 
 
-def test_points_and_lines_have_distances_too() -> None:
-    grid = BevGrid()
+GONE, X = (math.nan, math.nan), -7 / 6
+
+
+@pytest.mark.parametrize(
+    ("predicted", "truth", "gate", "pairs"),
+    [
+        # 1 is 3 m from 7 and 5 m from 8; 2 stands on 7 and is 3 m from 8: the least sum of all would leave 1 alone
+        (tracks([1, 2], [(X, math.sqrt(9 - X * X)), (0, 0)]), tracks([7, 8], [(0, 0), (3, 0)]), 4.0, {1: 7, 2: 8}),
+        (tracks([1, 2], [(X, math.sqrt(9 - X * X)), (0, 0)]), tracks([7, 8], [(0, 0), (3, 0)]), 6.0, {1: 8, 2: 7}),
+        # the mean over the moments at which both are there
+        (
+            tracks([1, 2], [(0, 0), (9, 9)], [(0, 8), GONE]),
+            tracks([7, 8], [(0, 0), GONE], [(0, 0), (9, 9)]),
+            4.0,
+            {1: 7},
+        ),
+        (tracks([1, 2], [(0, 0), (9, 9)], [(0, 8), GONE]), tracks([7, 8], [(0, 0), GONE], [(0, 0), (9, 9)]), 3.99, {}),
+    ],
+)
+def test_who_is_matched_within_the_gate(predicted, truth, gate: float, pairs: dict[int, int]) -> None:
+    """As many as possible: pairs beyond the gate use nobody up."""
+    assert match_tracks(predicted, truth, gate) == pairs
+
+
+POINTS_AND_LINES = [([100] * 4, range(100, 104), 5), ([101], [105], 7)]
+ACROSS = [([100, 104, 108], [100, 103, 106], 1), ([102], [99], 2)]
+"""A line of direction (3, 4) and a cell exactly two cells from it; their bounding boxes are nearer."""
+
+
+@pytest.mark.parametrize(
+    ("cells", "grid", "danger", "expected"),
+    [
+        (POINTS_AND_LINES, BevGrid(), 2.0, (0, (5, 7), math.sqrt(5) / 2)),
+        (ACROSS, BevGrid(), 1.01, (0, (1, 2), 1)),
+        (ACROSS, BevGrid(), 1.0, None),  # a metre across is none either
+        (POINTS_AND_LINES, BevGrid((-50, 50, 0.5), (-100, 100, 1.0)), 2.0, (0, (5, 7), math.sqrt(2))),  # of 0.5 × 1 m
+        ([], BevGrid(), 1.0, None),
+    ],
+)
+def test_points_and_lines_have_distances_too(cells, grid: BevGrid, danger: float, expected) -> None:
     maps = np.zeros((1, 200, 200), dtype=np.int32)
-    maps[0, 100, 100:104] = 5
-    maps[0, 101, 105] = 7
-    found = accident_of(maps, grid, RELEASED, AccidentReading(danger_distance=2.0))
-    assert found.contact.ids == (5, 7)
-    assert found.contact.distance == pytest.approx(math.sqrt(5) / 2)
+    for rows, columns, name in cells:
+        maps[0, rows, columns] = name
+    found = accident_of(maps, grid, RELEASED, AccidentReading(danger_distance=danger))
+    contact = found.contact and (found.contact.frame, found.contact.ids, found.contact.distance)
+    assert contact == (expected and (*expected[:2], pytest.approx(expected[2])))
+    assert found.positions.shape == (2, 2)
+    assert np.isnan(found.positions).all() == (expected is None)
+
+
+@pytest.mark.parametrize(
+    ("rules", "place"), [(None, (0.5, 0.5)), (LABEL_PROTOCOLS["clean"], (0.5, 0.5)), (RELEASED, (0, 1))]
+)
+def test_positions_are_means_of_cells_where_the_labels_have_them(rules, place: tuple[float, float]) -> None:
+    maps = np.zeros((2, 200, 200), dtype=np.int32)
+    maps[1, 100, [100, 102]], maps[1, 101, 103] = 3, 4
+    found = accident_of(maps, BevGrid(), rules, AccidentReading())
+    assert found.positions.tolist() == [[(x + place[0]) / 2, (y + place[1]) / 2] for x, y in ((1, 0), (3, 1))]
+    explicit = found.explicit(0.5)
+    assert (explicit.time, explicit.score, explicit.ids) == (0.5, 1.0, None)
+    assert accident_of(maps[:1], BevGrid(), rules, AccidentReading()).explicit(0.5) is None
 
 
 def test_of_no_points_there_are_no_hulls() -> None:
     assert convex_hulls(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)).shape == (0, 1, 2)
-
-
-def test_where_nothing_comes_near_there_are_no_positions() -> None:
-    calm = accident_of(np.zeros((1, 200, 200), dtype=np.int32), BevGrid(), RELEASED, AccidentReading())
-    assert calm.contact is None
-    assert calm.positions.shape == (2, 2)
-    assert np.isnan(calm.positions).all()
-
-
-def test_a_metre_across_is_no_accident_either() -> None:
-    """A line of direction (3, 4) and a cell exactly two cells from it; their bounding boxes are nearer."""
-    maps = np.zeros((1, 200, 200), dtype=np.int32)
-    maps[0, [100, 104, 108], [100, 103, 106]] = 1
-    maps[0, 102, 99] = 2
-    found = accident_of(maps, BevGrid(), RELEASED, AccidentReading(danger_distance=1.01))
-    assert found.contact.distance == 1
-    assert accident_of(maps, BevGrid(), RELEASED, AccidentReading()).contact is None
-
-
-def test_the_distance_of_two_paths_is_the_mean_over_the_moments_at_which_both_are_there() -> None:
-    gone = (math.nan, math.nan)
-    predicted = InstanceTracks(identity=np.array([1, 2]), center=np.array([[(0, 0), (9, 9)], [(0, 8), gone]]))
-    truth = InstanceTracks(identity=np.array([7, 8]), center=np.array([[(0, 0), gone], [(0, 0), (9, 9)]]))
-    assert match_tracks(predicted, truth, 4.0) == {1: 7}
-    assert match_tracks(predicted, truth, 3.99) == {}

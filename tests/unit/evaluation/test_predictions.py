@@ -1,17 +1,21 @@
 """What models say: motion in maps of any framework, and explicit accidents."""
 
 import pickle
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from refusals import assert_refused
 
+from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import Accident, MotionOutput, instances_of
-from deepaccident_devkit.evaluation.predictions import checked_prediction
+from deepaccident_devkit.evaluation.predictions import cells_within, checked_prediction, label_config, labels_at_present
 from deepaccident_devkit.geometry import BevGrid, Boxes
-from deepaccident_devkit.motion import MotionHeads
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
+from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig
 
 GRID = BevGrid((-4.0, 4.0, 0.5), (-3.0, 3.0, 0.5))
 NAMES = ("segmentation", "centerness", "offset", "flow")
@@ -73,52 +77,42 @@ class TestMotionOutput:
 
     @pytest.mark.parametrize("heads", [stacked()[0], stacked(), dict(zip(NAMES, stacked(), strict=True)), 3, [None]])
     def test_arrays_are_no_heads(self, heads: Any) -> None:
-        with pytest.raises(GeometryError, match=r"heads: expected MotionHeads, found .*MotionOutput\.from_arrays\("):
-            MotionOutput(grid=GRID, heads=heads)
+        words = ("heads: expected MotionHeads, found", "MotionOutput.from_arrays(")
+        assert_refused((lambda: MotionOutput(grid=GRID, heads=heads), GeometryError, words))
 
     def test_boxes_are_no_prediction_and_none_of_them_no_quiet_one(self) -> None:
         none = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
-        for given in (none, [none]):
-            with pytest.raises(EvaluationError, match=r"expected a MotionOutput or a list of Accidents, found .*Boxes"):
-                checked_prediction(given)
+        words = ("a MotionOutput or a list of Accidents", "Boxes", "instances_of")
+        assert_refused(
+            *((lambda given=given: checked_prediction(given), EvaluationError, words) for given in (none, [none]))
+        )
 
     def test_what_is_no_output(self) -> None:
         segmentation, centerness, offset, flow = stacked()
-        for words, refused in (
-            (
-                r"offset: expected \(K, T, channels, H, W\).* offset \(2, 5",
-                lambda: MotionOutput.from_arrays(segmentation, centerness, offset[:2], flow, grid=GRID),
-            ),
-            (
-                r"segmentation: expected \(K, T, channels, H, W\)",
-                lambda: MotionOutput.from_arrays(segmentation[0, 0], centerness, offset, flow, grid=GRID),
-            ),
-            (
-                "flow: expected shape",
-                lambda: MotionOutput.from_arrays(segmentation, centerness, offset, flow[:, :4], grid=GRID),
-            ),
-            (
-                "at least one prediction",
-                lambda: MotionOutput.from_arrays(segmentation[:0], centerness[:0], offset[:0], flow[:0], grid=GRID),
-            ),
-            (
-                r"grid: expected a BevGrid, .*found NoneType",
-                lambda: MotionOutput.from_arrays(segmentation, centerness, offset, flow, grid=None),  # type: ignore[arg-type]
-            ),
-            ("and not both", lambda: MotionOutput(grid=GRID)),
-            (
-                r"heads: expected maps of \(12, 16\) cells in orientation devkit, found \(6, 8\) in devkit",
-                lambda: MotionOutput(
-                    grid=GRID,
-                    heads=MotionOutput.from_arrays(
-                        *stacked(1, (6, 8)), grid=BevGrid((-4.0, 4.0, 1.0), (-3.0, 3.0, 1.0))
-                    ).heads,
-                ),
-            ),
-            ("at least one prediction", lambda: instances_of(np.zeros((0, 5, *GRID.shape), dtype=int), GRID)),
-        ):
-            with pytest.raises(GeometryError, match=words):
-                refused()
+        coarse = MotionOutput.from_arrays(*stacked(1, (6, 8)), grid=BevGrid((-4.0, 4.0, 1.0), (-3.0, 3.0, 1.0)))
+        made = partial(partial, MotionOutput.from_arrays, grid=GRID)
+        assert_refused(
+            *(
+                (given, GeometryError, words)
+                for given, words in (
+                    (made(segmentation, centerness, offset[:2], flow), ("offset", "(K, T, channels, H, W)", "(2, 5")),
+                    (made(segmentation[0, 0], centerness, offset, flow), ("segmentation", "(K, T, channels, H, W)")),
+                    (made(segmentation, centerness, offset, flow[:, :4]), ("flow", "expected shape")),
+                    (made(*(each[:0] for each in stacked())), ("at least one prediction",)),
+                    (made(*stacked(), grid=None), ("grid", "BevGrid", "NoneType")),
+                    (lambda: MotionOutput(grid=GRID), ("heads, or instances", "not both")),
+                    (
+                        lambda: MotionOutput(grid=GRID, heads=coarse.heads),
+                        ("(12, 16) cells in orientation devkit", "(6, 8) in devkit"),
+                    ),
+                    (lambda: MotionOutput(grid=GRID, heads=()), ("at least one prediction",)),
+                    (
+                        lambda: instances_of(np.zeros((0, 5, *GRID.shape), dtype=int), GRID),
+                        ("at least one prediction",),
+                    ),
+                )
+            )
+        )
 
     def test_its_text_says_how_many_predictions_of_which_form(self) -> None:
         three, one = MotionOutput.from_arrays(*stacked(), grid=GRID), instances_of(np.zeros((4, *GRID.shape)), GRID)
@@ -168,8 +162,52 @@ class TestAccident:
         ],
     )
     def test_what_is_no_accident(self, changes: dict[str, Any], message: str) -> None:
-        with pytest.raises(GeometryError, match=message):
-            Accident(**{"positions": np.zeros((2, 2)), "time": 1.0, **changes})
+        given = {"positions": np.zeros((2, 2)), "time": 1.0} | changes
+        assert_refused((lambda: Accident(**given), GeometryError, message))
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize("extent", [30.0, 30.5, 41.0, 1.0, 300.0])
+def test_the_cells_of_a_range(orientation, extent: float) -> None:
+    """A centre on the edge is in on one side."""
+    for grid in (
+        BevGrid((-20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation),
+        BevGrid((20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation),
+    ):
+        inside = (grid.centers() >= -extent / 2) & (grid.centers() < extent / 2)
+        found = np.zeros(grid.shape, dtype=bool)
+        found[cells_within(grid, extent)] = True
+        np.testing.assert_array_equal(found, inside.all(axis=-1))
+
+
+def test_labels_are_compared_at_the_present_with_bilinear_centres(da_motion: DeepAccident) -> None:
+    label = da_motion.motion_labels(f"{da_motion.scenario[0]['token']}/ego_vehicle/010")
+    moved = label.to_present(centerness="bilinear")
+    assert (labels_at_present(label).centerness == moved.centerness).all()
+    assert labels_at_present(moved) is moved
+
+
+def shown(config: MotionLabelConfig | None) -> tuple[str, int, int] | None:
+    return config and (config.protocol, config.step, config.future_frames)
+
+
+@pytest.mark.parametrize(
+    ("rules", "form", "horizon", "expected"),
+    [
+        ({"labels": "released"}, None, 2.0, ("released", 5, 4)),
+        ({"labels": None}, None, 3.0, ("released", 5, 6)),
+        ({}, None, 2.0, None),  # explicit accidents by rules without labels
+        ({}, {"step": 0.2, "labels": None}, 1.0, ("clean", 2, 5)),
+        ({}, {"step": 0.5, "labels": "released"}, 2.0, ("released", 5, 4)),
+        ({"labels": "clean"}, {"step": 0.5, "labels": "released"}, 2.0, ("clean", 5, 4)),
+    ],
+)
+def test_which_labels_predictions_are_compared_with(rules, form, horizon, expected) -> None:
+    """By the rules' label protocol, or else by the form's."""
+    given = form and SimpleNamespace(grid=GRID, **form)
+    config = label_config(SimpleNamespace(**rules), given, horizon)
+    assert shown(config) == expected
+    assert form is None or config.grid == GRID
 
 
 def same(one: MotionOutput, other: MotionOutput) -> bool:

@@ -1,14 +1,30 @@
-"""The five doors of each task lead to the numbers of a whole evaluation."""
+"""The five doors of each task, the choices of its protocols, and the headlines and text of its results."""
 
+import copy
+import json
+import math
+import pickle
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from evaluation_runs import stored_run
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup, TaskName
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.accident import PaperAccidents
+from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
+from deepaccident_devkit.evaluation.intervals import numbers_of
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, TASKS, EvaluationSetup, TaskName
+from deepaccident_devkit.evaluation.task import FrozenDict, headlines, plain, switch_names, switched, value_text
 
 TOP = Path(__file__).parents[3]
+every_protocol = pytest.mark.parametrize(
+    ("task", "protocol"), [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
+)
 
 
 @pytest.mark.parametrize(
@@ -41,3 +57,130 @@ def test_a_sample_enters_few_modules(monkeypatch: pytest.MonkeyPatch) -> None:
         own = [module for module in made[walk] if module.startswith("deepaccident_devkit.evaluation")]
         assert len(made[walk]) <= 35, walk
         assert len(own) <= 10, walk
+
+
+def test_what_each_task_is() -> None:
+    facts = {name: (task.name, task.kinds, task.whole_recordings, task.needs_meta) for name, task in TASKS.items()}
+    assert facts == {
+        "motion": ("motion", ("motion",), False, False),
+        "accident": ("accident", ("motion", "accident"), False, True),
+        "detection": ("detection", ("detection",), False, False),
+        "warning": ("warning", ("motion", "accident"), True, True),
+    }
+
+
+@every_protocol
+def test_each_choice_of_every_protocol_can_be_given(task: TaskName, protocol: str) -> None:
+    rules = TASK_PROTOCOLS[task][protocol]
+    for name in switch_names(rules):
+        value: Any = rules
+        for part in name.split("."):
+            value = getattr(value, part)
+        assert switched(rules, {name: json.loads(json.dumps(value)) if value != np.inf else value}) == rules
+    assert switched(rules, {}) is rules
+
+
+def test_choices_may_be_of_a_part_lists_for_tuples_and_null_where_one_takes_it() -> None:
+    released, paper = DETECTION_PROTOCOLS["released"], DETECTION_PROTOCOLS["paper"]
+    changed = switched(PaperAccidents(), {"reading.danger_distance": 2, "sample_choice": "mean_first"})
+    assert switch_names(changed) == ["reading.danger_distance", "sample_choice"]
+    assert (changed.reading.danger_distance, changed.sample_choice) == (2, "mean_first")
+    assert switched(released, {"area": None, "error_threshold": None}).error_threshold is None
+    rings = switched(paper, {"ranges": [[0, 30], [30, 50]], "error_threshold": None})  # which go together alone
+    assert rings.ranges == ((0, 30), (30, 50))
+
+
+@pytest.mark.parametrize(
+    ("rules", "switches", "words"),
+    [
+        (
+            PaperAccidents(),
+            {"reading.danger_distnce": 1},
+            ("PaperAccidents", "reading.danger_distnce", "there are read"),
+        ),
+        (PaperAccidents(), {"reading": {}}, ("PaperAccidents", "'reading'")),
+        (PaperAccidents(), {"reading.danger_distance": "2"}, ("danger_distance", "a number, such as 1.0", "'2'")),
+        (PaperAccidents(), {"reading.danger_distance": True}, ("danger_distance", "a number, such as 1.0", "True")),
+        (PaperAccidents(), {"sample_choice": 3}, ("sample_choice", "a word, such as 'best'", "3")),
+        (PaperAccidents(), {"sample_choice": "all"}, ("sample_choice", "best, mean_first", "'all'")),
+        (DETECTION_PROTOCOLS["paper"], {"min_recall": None}, ("min_recall", "a number, such as 0.1", "None")),
+        (DETECTION_PROTOCOLS["paper"], {"own_box": 1}, ("own_box", "true or false, such as False", "1")),
+        (DETECTION_PROTOCOLS["paper"], {"thresholds": 1}, ("thresholds", "a list, such as (1.0, 2.0, 4.0)", "found 1")),
+        (TASK_PROTOCOLS["warning"]["field"], {"scores_of": "pair"}, ("FieldWarnings", "'scores_of'", "it has none")),
+    ],
+)
+def test_choices_that_are_none(rules: Any, switches: dict[str, Any], words: tuple[str, ...]) -> None:
+    assert_refused((lambda: switched(rules, switches), ChoiceError, words))
+
+
+@every_protocol
+def test_each_headline_is_a_number_of_the_result_by_its_path(task: TaskName, protocol: str) -> None:
+    result = EvaluationSetup(task=task, protocol=protocol).evaluator().compute()
+    known, found = numbers_of(result), headlines(task, result)
+    assert len({each.name for each in found}) == len(found)
+    assert len(found) > 2 or protocol in ("clean", "field")  # by group, of which there is none yet
+    for each in found:
+        value = known.get(each.path, math.nan)
+        assert each.value == (None if math.isnan(value) else value)
+
+
+HEADLINES = {
+    "motion": "iou 30x30 %+, iou 100x100 %+, vpq 30x30 %+, vpq 100x100 %+, min_ade m-, min_fde m-, miss_rate share-",
+    "accident": "apa share+, precision share+, recall share+, false_alarm_rate share-, average_precision share+, "
+    "accuracy@5 share+, accuracy@10 share+, accuracy@15 share+, id_error share-, position_error m-, time_error s-, "
+    "lateness s ",
+    "detection": "mAP %+, mATE m-, mASE 1 - overlap-, mAOE rad-, mAVE m/s-, AP vehicle %+",
+}
+
+
+@pytest.mark.parametrize(
+    ("task", "protocol"), [("motion", "released"), ("accident", "boxes"), ("detection", "opencood")]
+)
+def test_headlines_have_names_units_and_a_better_side(task: TaskName, protocol: str) -> None:
+    found = headlines(task, EvaluationSetup(task=task, protocol=protocol).evaluator().compute())
+    sides = {True: "+", False: "-", None: " "}
+    assert [f"{each.name} {each.unit}{sides[each.higher_is_better]}" for each in found] == HEADLINES[task].split(", ")
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "signed", "text"),
+    [
+        (41.2, "%", False, "41.20 %"),
+        (0.5, "%", True, "+0.50"),
+        (0.875, "share", False, "0.875"),
+        (0.25, "1 - overlap", True, "+0.250"),
+        (-1.3, "m", True, "-1.300 m"),
+        (None, "m", False, "–"),
+    ],
+)
+def test_texts_of_values(value: float | None, unit: Any, signed: bool, text: str) -> None:
+    assert value_text(value, unit, signed=signed) == text
+    assert signed or value_text(value, unit) == text
+
+
+def test_the_text_of_a_result_is_its_first_headlines() -> None:
+    result = MotionEvaluator("released").compute()
+    first = "iou 30x30 0.00 %, iou 100x100 0.00 %, vpq 30x30 0.00 %, vpq 100x100 0.00 %"
+    assert repr(result) == f"MotionResult(0 samples: {first}, …)"
+    html = result._repr_html_()
+    assert (html.count("<tr"), "MotionResult, 0 samples" in html, ">0.00 %<" in html, ">–<" in html) == (8, *[True] * 3)
+    assert (
+        repr(EvaluationSetup(task="warning", protocol="clean").evaluator().compute())
+        == "AnticipationResult(0 samples: )"
+    )
+    assert_refused((lambda: headlines("maps", None), ChoiceError, ("task", "motion, accident, detection", "maps")))
+
+
+def test_results_within_others_and_arrays_are_plain_too() -> None:
+    result = MotionEvaluator().compute()
+    nested = plain({2.0: np.array([1.0, np.nan, np.inf]), 0.5: "a", "of": [result]})
+    assert nested == {"2": [1.0, None, None], "0.5": "a", "of": [result.as_dict()]}
+    assert nested["of"][0]["ranges"]
+
+
+def test_mappings_of_results_are_frozen_and_have_a_hash() -> None:
+    frozen = FrozenDict({"a": 1, "b": 2})
+    changes = ("__setitem__", "__delitem__", "__ior__", "clear", "pop", "popitem", "setdefault", "update")
+    assert_refused(*((getattr(frozen, name), TypeError, ("make a dict of it",)) for name in changes))
+    assert [pickle.loads(pickle.dumps(frozen)), copy.deepcopy(frozen)] == [frozen] * 2
+    assert hash(frozen) == hash(FrozenDict({"b": 2, "a": 1})) != hash(FrozenDict({"a": 1}))

@@ -16,7 +16,7 @@ from deepaccident_devkit.evaluation.accident import (
     BoxTruth,
     PaperAccidents,
 )
-from deepaccident_devkit.evaluation.accident.scoring import actor_of, exact_parts
+from deepaccident_devkit.evaluation.accident.scoring import actor_of, exact_parts, foreseen, hit_of
 from deepaccident_devkit.evaluation.map_accidents import accident_of
 from deepaccident_devkit.geometry import BevGrid
 
@@ -34,8 +34,7 @@ def pair_at(row: int, column: int, first: int = 1, frames: int = 1) -> np.ndarra
 
 
 def counted(predicted: np.ndarray, truth: np.ndarray):
-    label = scene({1: standing(20, 10)})
-    protocol = PaperAccidents()
+    label, protocol = scene({1: standing(20, 10)}), PaperAccidents()
     maps = np.zeros_like(label.instance)
     maps[: len(truth)] = truth
     given = np.zeros((len(predicted), *maps.shape), dtype=np.int32)
@@ -45,12 +44,26 @@ def counted(predicted: np.ndarray, truth: np.ndarray):
     return counts, protocol.result([counts])
 
 
-def test_an_instance_is_of_the_actor_that_most_of_its_labelled_cells_are() -> None:
-    drawn = np.array([[[0, 0, 0, 0, 7, 7, 9]]])
-    label = SimpleNamespace(instance=drawn, id_map={70: 7, 90: 9})
-    assert actor_of(np.ones((1, 7), dtype=bool), 0, label, AccidentContext()) == 70
-    assert actor_of(drawn[0] == 9, 0, label, AccidentContext()) == 90
-    assert actor_of(drawn[0] == 0, 0, label, AccidentContext()) is None
+@pytest.mark.parametrize(
+    ("drawn", "cells", "ids", "actor"),
+    [
+        ([0, 0, 0, 0, 7, 7, 9], [0, 1, 2, 3, 4, 5, 6], {70: 7, 90: 9}, 70),  # most of its labelled cells
+        ([0, 0, 0, 0, 7, 7, 9], [6], {70: 7, 90: 9}, 90),
+        ([0, 0, 0, 0, 7, 7, 9], [0, 1, 2, 3], {70: 7, 90: 9}, None),
+        ([9, 7, 9, 7, 0, 0, 0], [0, 1, 2, 3], {90: 9, 70: 7, -101: 3}, 70),  # of equally many the one drawn first
+        ([1, 1, 2, 0, 0, 0, 0], [0, 1, 2], {-101: 1, 70: 2}, 5),
+    ],
+)
+def test_an_instance_is_of_the_actor_that_most_of_its_labelled_cells_are(drawn, cells, ids, actor) -> None:
+    label = SimpleNamespace(instance=np.array([[[0] * 7], [drawn]]), id_map=ids)
+    there = np.isin(np.arange(7), cells)[None]
+    assert actor_of(there, 1, label, AccidentContext(own_actor_id=5)) == actor
+
+
+def test_the_first_alarm_that_is_near_enough_hits() -> None:
+    alarms = [foreseen(), *(foreseen(position) for position in (5 - 1e-10, 5 - 1e-8, 1.0))]
+    assert [hit_of(alarms, distance) for distance in (1.0, 1.1, 5.0, 5.1)] == [None, alarms[3], alarms[2], alarms[1]]
+    assert foreseen(1 / 3, 0.5, 1, score=2.0) == {"position": 0.333333333, "time": 0.5, "id": 1, "score": 2.0}
 
 
 def test_of_two_pairs_alike_that_with_the_lower_ids_collides() -> None:
@@ -71,7 +84,7 @@ def test_a_difference_of_exactly_the_distance_is_not_within_it_and_the_gate_is()
 
 
 def test_the_first_of_equally_near_predictions_is_compared() -> None:
-    for row, column in PLACES:
+    for row, column in PLACES[::4]:
         truth = pair_at(row, column, frames=2)
         late = np.roll(truth, -2, 1)
         late[0] = 0
@@ -80,35 +93,25 @@ def test_the_first_of_equally_near_predictions_is_compared() -> None:
 
 
 def test_alarms_exactly_at_the_distance_miss_and_their_order_counts_nothing() -> None:
-    rng = np.random.default_rng(1)
-    for _ in range(60):
-        pair = rng.uniform(-50, 50, (2, 2))
+    source = np.random.default_rng(1)
+    evaluators = [AccidentEvaluator(protocol="boxes") for _ in range(3)]
+    for number in range(60):
+        pair, angle = source.uniform(-50, 50, (2, 2)), source.uniform(0, 2 * math.pi)
+        off = Accident(positions=pair + 2.5 * np.array([math.cos(angle), math.sin(angle)]), time=2.0)
+        right = [Accident(positions=pair + shift, time=2.0, ids=(1, 9)) for shift in (0.5, 1.0)]
         truth = BoxTruth(
             time=np.arange(21) / 10,
             actor_id=np.zeros(0, dtype=np.int64),
             footprint=np.zeros((21, 0, 5)),
             accident=Accident(positions=pair, time=2.0, ids=(1, 2)),
         )
-        angle = rng.uniform(0, 2 * math.pi)
-        off = Accident(positions=pair + 2.5 * np.array([math.cos(angle), math.sin(angle)]), time=2.0)
-        right = [Accident(positions=pair + shift, time=2.0, ids=(1, 9)) for shift in (0.5, 1.0)]
-        results = []
-        for alarms in ([off, *right], [*right[::-1], off]):
-            evaluator = AccidentEvaluator(protocol="boxes")
-            evaluator.update("one", alarms, None, AccidentContext(truth=truth))
-            results.append(evaluator.compute())
-        assert results[0] == results[1]
-        alone = AccidentEvaluator(protocol="boxes")
-        alone.update("one", [off], None, AccidentContext(truth=truth))
-        assert [each.tp for each in alone.compute().within.values()] == [0, 1, 1]
-
-
-def test_of_equally_many_cells_the_actor_drawn_first_counts() -> None:
-    drawn = np.array([[[9, 7, 9, 7, 0, 0, 0]]])
-    label = SimpleNamespace(instance=drawn, id_map={90: 9, 70: 7, -101: 3})
-    assert actor_of(np.ones((1, 7), dtype=bool), 0, label, AccidentContext()) == 70
+        for evaluator, alarms in zip(evaluators, ([off, *right], [*right[::-1], off], [off]), strict=True):
+            evaluator.update(str(number), alarms, None, AccidentContext(truth=truth))
+    forwards, backwards, alone = (evaluator.compute() for evaluator in evaluators)
+    assert forwards == backwards
+    assert [each.tp for each in alone.within.values()] == [0, 60, 60]
 
 
 def test_parts_have_the_exact_sum() -> None:
-    given = [[[1e16, 1.0], [], [-1e16]], [[0.0]], [[math.inf, 1.0]]]
-    assert [exact_parts(each) for each in given] == [[1.0], [], [math.inf]]
+    given = [[[1e16, 1.0], [], [-1e16]], [[0.0]], [[math.inf, 1.0]], [[1e16, 1.0]]]
+    assert [exact_parts(each) for each in given] == [[1.0], [], [math.inf], [1e16, 1.0]]
