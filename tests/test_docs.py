@@ -132,16 +132,6 @@ def in_demo(small_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return tmp_path
 
 
-def test_the_code_on_motion_labels_runs(in_labels_demo: Path) -> None:
-    run_page(DOCS / "motion_labels.md")
-
-
-def test_every_switch_of_the_label_protocols_is_explained() -> None:
-    page = (DOCS / "motion_labels.md").read_text(encoding="utf-8")
-    missing = [field.name for field in fields(LabelProtocol) if f"`{field.name}`" not in page]
-    assert missing == []
-
-
 @pytest.mark.parametrize("choices", [LabelProtocol, MotionProtocol])
 def test_every_switch_is_on_the_page_of_the_released_code(choices: type[Any]) -> None:
     page = (DOCS / "released_code.md").read_text(encoding="utf-8")
