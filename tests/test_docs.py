@@ -46,7 +46,6 @@ PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema")
 RUN_ELSEWHERE = {
     "docs/clusters.md": "tests/engines/test_page.py",
     "docs/interactive_3d.md": "tests/unit/export/test_mcap_choices.py",
-    "docs/scenarios.md": "tests/unit/synth/spec/test_catalogue.py",
     "docs/synth.md": "tests/unit/synth/test_synth_page.py",
     "docs/testing.md": "tests/unit/testing/test_page.py",
     "docs/training.md": "tests/torch_extra/test_batches.py",
@@ -132,16 +131,6 @@ def in_demo(small_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return tmp_path
 
 
-def test_the_code_on_motion_labels_runs(in_labels_demo: Path) -> None:
-    run_page(DOCS / "motion_labels.md")
-
-
-def test_every_switch_of_the_label_protocols_is_explained() -> None:
-    page = (DOCS / "motion_labels.md").read_text(encoding="utf-8")
-    missing = [field.name for field in fields(LabelProtocol) if f"`{field.name}`" not in page]
-    assert missing == []
-
-
 @pytest.mark.parametrize("choices", [LabelProtocol, MotionProtocol])
 def test_every_switch_is_on_the_page_of_the_released_code(choices: type[Any]) -> None:
     page = (DOCS / "released_code.md").read_text(encoding="utf-8")
@@ -222,7 +211,7 @@ def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(in_lab
     page = re.sub(r"^    deepaccident (synth|predict|evaluate) .*$", "", there, flags=re.MULTILINE)
     now = script.with_outputs(page)
     outputs = [re.findall(r"^<!-- output -->\n(.*?)^<!-- end", text, re.MULTILINE | re.DOTALL) for text in (there, now)]
-    assert len(outputs[0]) == 8
+    assert len(outputs[0]) == 6
     for old, new in zip(*outputs, strict=True):
         if not re.search("^(prevented accidents|Twins)", old, re.MULTILINE):  # one accident has no such tables
             assert table_words(old) <= table_words(new) | {"val", "test", "…"}

@@ -98,7 +98,7 @@ class MotionLabels(FrozenArrays, Pictured):
         """The labels with every frame in the present ego frame, as in training and evaluation.
 
         `maps_to_present` says how. Labels that are not warped equal the released code's in every cell; warped
-        ones can differ in single cells, at ties of the sampling (docs/motion_labels.md, "How equal they are").
+        ones can differ in single cells, at ties of the sampling (docs/training.md, "How equal they are").
 
         Args:
             centerness: how to sample the centres' peaks: the released code trains with `nearest` and evaluates with

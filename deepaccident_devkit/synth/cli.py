@@ -71,7 +71,7 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
     multiple=True,
     callback=_designs,
     metavar="N|FILE",
-    help="Only accidents of this design; you can repeat this option. Or a scenario file of your own; docs/scenarios.md "
+    help="Only accidents of this design; you can repeat this option. Or a scenario file of your own; docs/synth.md "
     "describes its fields.  [default: all twelve in turn]",
 )
 @field_option(SynthConfig, "unplanned", option=advanced)
@@ -82,7 +82,7 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
     is_eager=True,
     expose_value=False,
     callback=_show_design,
-    help="Print the scenario file of a design, as a start for your own, and stop; docs/scenarios.md lists them.",
+    help="Print the scenario file of a design, as a start for your own, and stop; docs/synth.md lists them.",
 )
 def synth(out: Path, *, designs: dict[str, Any], **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.

@@ -70,7 +70,7 @@ class SynthConfig:
             for all in which a house can hide the two from each other).
         unplanned: share of accidents that differ from the design: with a pedestrian or a third vehicle. It is 0
             where `spec` or the view `hidden` asks for one certain accident.
-        spec: a scenario file (docs/scenarios.md) to use instead of the designs; every pair is one draw from it.
+        spec: a scenario file (docs/synth.md) to use instead of the designs; every pair is one draw from it.
         unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
         exact: whether calib files are the same at each frame, and `num_lidar_pts` is the exact number of points. If
             not, both are a little wrong, as in the real release.

@@ -248,6 +248,8 @@ def test_the_documented_training_loop_learns(da: DeepAccident, tmp_path: Path, m
             CliRunner().invoke(deepaccident, words, catch_exceptions=False, standalone_mode=False)
         else:
             exec(compile(code, str(page), "exec"), names)  # noqa: S102
+    fiery = {name: tuple(tensor.shape) for name, tensor in names["fiery_batch"].items()}
+    assert [fiery[name] for name in ("image", "flow")] == [(2, 3, 6, 3, 224, 480), (2, 7, 2, 200, 200)]
     assert names["item"]["images"].shape == (5, 1, 6, 3, 12, 32)
     assert len(names["losses"]) == 5
     assert names["losses"][-1] < 0.8 * names["losses"][0]

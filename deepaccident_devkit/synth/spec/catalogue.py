@@ -123,7 +123,7 @@ _MOST_CHARACTERS = 200_000
 
 
 def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
-    """The scenario of a YAML file (docs/scenarios.md has all fields).
+    """The scenario of a YAML file (docs/synth.md has all fields).
 
     Raises:
         ConfigError: there is no such file, or it is no possible scenario; the message names line, field and remedy.
@@ -131,7 +131,7 @@ def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
     try:
         text = read_bytes(path_of(path), "spec").decode()
     except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; give the path of a scenario file (docs/scenarios.md)") from error
+        raise ConfigError(f"{path}: no such file; give the path of a scenario file (docs/synth.md)") from error
     except (OSError, ValueError) as error:
         told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({error})"
         raise ConfigError(f"{path}: {told}; give a YAML file in UTF-8") from error

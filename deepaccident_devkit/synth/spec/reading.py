@@ -51,7 +51,7 @@ def parse_yaml(text: str, source: str) -> Node:
         loader = yaml.SafeLoader(text)
         root = loader.get_single_node()
         if root is None:
-            raise ConfigError(f"{source}: is empty; write at least the actors ego and other (docs/scenarios.md)")
+            raise ConfigError(f"{source}: is empty; write at least the actors ego and other (docs/synth.md)")
         return _Tree(source, loader).node(root, root.start_mark.line)
     except yaml.MarkedYAMLError as error:
         raise ConfigError(f"{source}:{_fault(error)}") from error

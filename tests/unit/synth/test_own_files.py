@@ -1,4 +1,4 @@
-"""The scenario files that docs/scenarios.md begins with: what happens is what the page says."""
+"""The scenario files that docs/synth.md has: what happens is what the page says."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-PAGE = (Path(__file__).parents[3] / "docs" / "scenarios.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs" / "synth.md").read_text(encoding="utf-8")
 EXAMPLES = dict(re.findall(r"^```yaml\n# (\w+)\.yaml.*?\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
 
 

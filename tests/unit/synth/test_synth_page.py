@@ -67,7 +67,7 @@ def test_a_generated_scenario_is_like_the_real_one(script):
 
 
 def test_the_page_s_code_runs(tmp_path, monkeypatch, capsys):
-    (code,) = re.findall(r"^```python\n(.*?)^```", (DOCS / "synth.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    code, _ = re.findall(r"^```python\n(.*?)^```", (DOCS / "synth.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "synth.md", "exec"), {})  # noqa: S102
     assert capsys.readouterr().out == "3\n"
