@@ -11,7 +11,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
 from deepaccident_devkit.motion.batch_names import BatchNames
-from deepaccident_devkit.motion.config import slip_names
+from deepaccident_devkit.motion.config import NO_PRESETS, slip_names
 from deepaccident_devkit.motion.label_folder import Manifest, folder_path
 from deepaccident_devkit.motion.sample_labels import Purpose
 from deepaccident_devkit.v2x import AGENT_SETS
@@ -39,7 +39,7 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
 )
 @click.option(
     "--preset",
-    type=WordChoice(PRESETS),
+    type=WordChoice(PRESETS, NO_PRESETS),
     default="deepaccident",
     show_default=True,
     help="Grid, orientation and protocol of the labels.",

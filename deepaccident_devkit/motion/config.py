@@ -183,6 +183,10 @@ LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
     }
 )
 """By name: the released code, the same without its quirks, and the two codes that it is based on."""
+NO_PRESETS: Final[Mapping[str, str]] = MappingProxyType(
+    {name: f"; {name!r} is a protocol of labels: give protocol={name!r}" for name in LABEL_PROTOCOLS}
+)
+"""What to say of a protocol's name that is given as a preset's."""
 _NAMES: Final = {rules: name for name, rules in LABEL_PROTOCOLS.items()}
 
 
@@ -270,8 +274,7 @@ class MotionLabelConfig:
             ChoiceError: no such preset.
             ConfigError: no such field, or an impossible value.
         """
-        told = {one: f"; {one!r} is a protocol of labels: give protocol={one!r}" for one in LABEL_PROTOCOLS}
-        preset = PRESETS[choice("preset", name, PRESETS, elsewhere=told)]
+        preset = PRESETS[choice("preset", name, PRESETS, elsewhere=NO_PRESETS)]
         unknown = sorted(set(changes) - set(cls.__dataclass_fields__))
         if unknown:
             raise ConfigError(
