@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, GeometryError
@@ -32,10 +33,8 @@ from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.runs.comparison import Swaps, swapped_differences
-from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionHeads
 
-Arguments = Callable[[str], Sequence[Any]]
 MOTION: dict[str, Callable[[], Evaluator[Any]]] = {
     "motion released": MotionEvaluator,
     "motion paper": lambda: MotionEvaluator("paper"),
@@ -60,47 +59,34 @@ def tokens(da_motion: DeepAccident) -> list[str]:
 
 
 class Samples:
-    """What each kind of evaluator takes of a sample: good, empty and perfect predictions with the truth."""
+    """What each kind of evaluator takes of a sample."""
 
     def __init__(self, dataset: DeepAccident, tokens: Sequence[str]) -> None:
         self.dataset = dataset
         self.labels = {token: dataset.motion_labels(token).to_present("bilinear") for token in tokens}
         self.contexts = {token: accident_context(dataset, token, 2.0) for token in tokens}
 
-    def some(self, name: str, token: str) -> Sequence[Any]:
-        """Neither right nor wrong: of another sample, or all a little off."""
+    def given(self, how: str, name: str, token: str) -> Sequence[Any]:
+        """Predictions with their truth: the truth itself (`perfect`, motion as instance maps), nothing (`empty`), or
+        `some` that are neither right nor wrong: of another sample, or all a little off."""
         if name in MOTION | ACCIDENT:
-            others = [self.labels[token], self.labels[min(self.labels)]]
-            heads = tuple(MotionHeads.from_labels(each) for each in others)
-            return self._motion(name, token, MotionOutput(grid=others[0].config.grid, heads=heads))
-        source = np.random.default_rng(list(self.labels).index(token))
-        truth = self._boxes(name, token)
-        keep = source.uniform(size=len(truth)) < 0.8
-        moved = truth.center[keep] + source.normal(0, 0.5, (keep.sum(), 3))
-        found = _detected(truth, keep, np.round(source.uniform(size=keep.sum()), 1), moved)
-        return found, truth
+            label, other = self.labels[token], self.labels[min(self.labels)]
+            output = instances_of(label.instance * (how == "perfect"), label.config.grid)
+            if how == "some":
+                output = MotionOutput(grid=label.config.grid, heads=tuple(map(MotionHeads.from_labels, (label, other))))
+            return (output, label, *([self.contexts[token]] if name in ACCIDENT else []))
+        truth = detection_truth(self.dataset, token, DETECTION[name]().protocol)
+        source, share = np.random.default_rng(int(token[-3:])), {"perfect": 1.0, "empty": 0.0, "some": 0.8}[how]
+        boxes = truth.select(source.uniform(size=len(truth)) < share)
+        off = source.normal(0, 0.5, (len(boxes), 3)) * (how == "some")
+        scores = np.round(source.uniform(size=len(boxes)), 1) if how == "some" else np.ones(len(boxes))
+        return DetectedBoxes(boxes=replace(boxes, center=boxes.center + off), scores=scores), truth
 
-    def empty(self, name: str, token: str) -> Sequence[Any]:
-        """Nothing is predicted."""
-        label = self.labels[token]
-        if name in MOTION | ACCIDENT:
-            return self._motion(name, token, instances_of(np.zeros_like(label.instance), label.config.grid))
-        truth = self._boxes(name, token)
-        return _detected(truth, np.zeros(len(truth), dtype=bool), np.zeros(0)), truth
-
-    def perfect(self, name: str, token: str) -> Sequence[Any]:
-        """The truth itself, motion as instance maps."""
-        label = self.labels[token]
-        if name in MOTION | ACCIDENT:
-            return self._motion(name, token, instances_of(label.instance, label.config.grid))
-        truth = self._boxes(name, token)
-        return _detected(truth, np.ones(len(truth), dtype=bool), np.ones(len(truth))), truth
-
-    def _motion(self, name: str, token: str, output: MotionOutput) -> Sequence[Any]:
-        return (output, self.labels[token], *([self.contexts[token]] if name in ACCIDENT else []))
-
-    def _boxes(self, name: str, token: str) -> Boxes:
-        return detection_truth(self.dataset, token, DETECTION[name]().protocol)
+    def evaluated(self, how: str, name: str, tokens: Sequence[str]) -> Evaluator[Any]:
+        evaluator = ALL[name]()
+        for token in tokens:
+            evaluator.update(token, *self.given(how, name, token))
+        return evaluator
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +97,8 @@ def samples(da_motion: DeepAccident, tokens: list[str]) -> Samples:
 @pytest.mark.slow
 @of_all
 def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str], name: str, tmp_path: Path) -> None:
-    arguments = {token: samples.some(name, token) for token in tokens}
-    whole = evaluated(name, tokens, arguments.__getitem__)
+    arguments = {token: samples.given("some", name, token) for token in tokens}
+    whole = samples.evaluated("some", name, tokens)
     expected = bits(whole.compute())
     shuffled = np.random.default_rng(1).permutation(tokens).tolist()
     for parts in (1, 3, len(tokens)):
@@ -135,10 +121,8 @@ def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str
 
 @of_all
 def test_pooled_counts_have_the_same_result(samples: Samples, tokens: list[str], name: str) -> None:
-    evaluator = ALL[name]()
-    for token in tokens:
-        evaluator.update(token, *samples.some(name, token))
-    by_scenario = evaluator.pooled([evaluator.counts[token] for token in tokens])
+    evaluator = samples.evaluated("some", name, tokens[::3])
+    by_scenario = evaluator.pooled([evaluator.counts[token] for token in tokens[::3]])
     assert bits(evaluator.result_of(by_scenario)) == bits(evaluator.compute())
 
 
@@ -146,10 +130,7 @@ def test_pooled_counts_have_the_same_result(samples: Samples, tokens: list[str],
 @of_all
 def test_two_runs_can_be_swapped(samples: Samples, tokens: list[str], name: str) -> None:
     """Where nothing is swapped they differ as observed; where all is, by the same with the other sign."""
-    runs = [
-        evaluated(name, tokens, lambda token, given=given: given(name, token))
-        for given in (samples.some, samples.perfect)
-    ]
+    runs = [samples.evaluated(how, name, tokens) for how in ("some", "perfect")]
     first, second = (numbers_of(run.compute()) for run in runs)
     names = [path for path in first if path in second]
     observed = np.array([second[path] - first[path] for path in names])
@@ -161,7 +142,7 @@ def test_two_runs_can_be_swapped(samples: Samples, tokens: list[str], name: str)
 
 @of_all
 def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: str) -> None:
-    evaluator = evaluated(name, tokens, lambda token: samples.empty(name, token))
+    evaluator = samples.evaluated("empty", name, tokens)
     result = evaluator.compute()
     if name in MOTION:
         assert [value for each in result.ranges.values() for value in (each.iou, each.pq, each.sq, each.rq)] == [0] * 8
@@ -180,7 +161,7 @@ def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: st
 @pytest.mark.slow
 @of_all
 def test_results_can_be_copied_and_written(samples: Samples, tokens: list[str], name: str) -> None:
-    evaluator = evaluated(name, tokens, lambda token: samples.some(name, token))
+    evaluator = samples.evaluated("some", name, tokens)
     attributes = sample_attributes(samples.dataset, tokens)
     whole, resampling = evaluator.compute(), Resampling(resamples=2)
     results = [whole, ALL[name]().compute(), breakdown(evaluator, attributes, "scenario_type", resampling)]
@@ -200,7 +181,7 @@ def test_results_can_be_copied_and_written(samples: Samples, tokens: list[str], 
 
 @of_all
 def test_counts_are_json_and_nobody_changes_them(samples: Samples, tokens: list[str], name: str) -> None:
-    evaluator = evaluated(name, tokens[:1], lambda token: samples.some(name, token))
+    evaluator = samples.evaluated("some", name, tokens[:1])
     [handed_out] = evaluator.counts.values()
     assert json.loads(json.dumps(handed_out, allow_nan=False)) == handed_out
     expected = bits(evaluator.compute())
@@ -216,12 +197,14 @@ def test_counts_are_json_and_nobody_changes_them(samples: Samples, tokens: list[
 @pytest.mark.parametrize("name", MOTION | DETECTION)
 @pytest.mark.parametrize("given", [None, np.zeros((2, 5, 200, 200), dtype=int)])
 def test_predictions_that_are_none(samples: Samples, tokens: list[str], name: str, given: object) -> None:
-    _, truth = samples.perfect(name, tokens[0])
-    with pytest.raises(EvaluationError, match=r"expected (a MotionOutput|DetectedBoxes).* found .*from_arrays\("):
-        ALL[name]().update(tokens[0], given, truth)
-    prediction, _ = samples.perfect(name, tokens[0])
-    with pytest.raises((EvaluationError, GeometryError), match=r"expected (MotionLabels|Boxes), found (None|nd)"):
-        ALL[name]().update(tokens[0], prediction, given)
+    prediction, truth = samples.given("perfect", name, tokens[0])
+    update, wrong = ALL[name]().update, type(given).__name__
+    kind, of_truth = ("a MotionOutput", "MotionLabels") if name in MOTION else ("DetectedBoxes", "Boxes")
+    error = EvaluationError if name in MOTION else GeometryError
+    assert_refused(
+        (lambda: update(tokens[0], given, truth), EvaluationError, (f"expected {kind}", "from_arrays(", wrong)),
+        (lambda: update(tokens[0], prediction, given), error, (f"expected {of_truth}", wrong)),
+    )
 
 
 @pytest.mark.parametrize("name", MOTION | ACCIDENT)
@@ -236,14 +219,14 @@ def test_empty_heads_score_0(samples: Samples, tokens: list[str], name: str) -> 
     )
     output = MotionOutput(grid=label.config.grid, heads=(nobody,) * 6)
     evaluator = ALL[name]()
-    evaluator.update(token, output, *samples.perfect(name, token)[1:])
+    evaluator.update(token, output, *samples.given("perfect", name, token)[1:])
     result = evaluator.compute()
     assert (result.path_accuracy if name in MOTION else result.apa) == 0
 
 
 @of_all
 def test_perfect_predictions(samples: Samples, tokens: list[str], name: str) -> None:
-    result = evaluated(name, tokens, lambda token: samples.perfect(name, token)).compute()
+    result = samples.evaluated("perfect", name, tokens).compute()
     if name in MOTION:
         assert [value for each in result.ranges.values() for value in (each.iou, each.pq, each.sq, each.rq)] == [
             100
@@ -259,13 +242,6 @@ def test_perfect_predictions(samples: Samples, tokens: list[str], name: str) -> 
         # The released curve counts what has no truth as 0, and no recall exceeds the last of its 36 points. So the mean
         # says how many classes a scene has; each class that it has says what is lost.
         assert result.average_precision[result.truths > 0].min() > 97
-
-
-def evaluated(name: str, tokens: Sequence[str], arguments: Arguments) -> Evaluator[Any]:
-    evaluator = ALL[name]()
-    for token in tokens:
-        evaluator.update(token, *arguments(token))
-    return evaluator
 
 
 def mappings_of(value: Any) -> list[Any]:
@@ -289,8 +265,3 @@ def bits(value: Any) -> Any:
     if isinstance(value, float):
         return "nan" if math.isnan(value) else value.hex()
     return value
-
-
-def _detected(truth: Boxes, keep: np.ndarray, scores: np.ndarray, center: np.ndarray | None = None) -> DetectedBoxes:
-    boxes = truth.select(keep)
-    return DetectedBoxes(boxes=boxes if center is None else replace(boxes, center=center), scores=scores)

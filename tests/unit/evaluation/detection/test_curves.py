@@ -1,7 +1,7 @@
 """The levels of recall at which curves are read, and cells of which not all rows count."""
 
 import numpy as np
-import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.detection import DetectionEvaluator, detection_protocol
@@ -46,5 +46,6 @@ def test_detections_of_groups_that_are_not_there_are_refused() -> None:
     counts = {"token": "a", "truths": [0], "scores": [0.5]} | {name: [[]] * width for name, width in COLUMNS.items()}
     assert evaluator.result_of([counts | {"detections": [[0], [0]]}]).detections.tolist() == [[1]]
     for groups in ([-1], [0, 1]):
-        with pytest.raises(EvaluationError, match=f"groups from 0 to 0, found {groups[0]} to {groups[-1]}"):
-            evaluator.result_of([counts | {"detections": [groups, [0] * len(groups)]}])
+        others = counts | {"detections": [groups, [0] * len(groups)]}
+        words = ("groups from 0 to 0", f"found {groups[0]} to {groups[-1]}")
+        assert_refused((lambda others=others: evaluator.result_of([others]), EvaluationError, words))
