@@ -63,7 +63,7 @@ def test_each_table_to_use_is_here() -> None:
 
 @pytest.mark.parametrize("name", nuscenes_names.DATASET)
 def test_the_dataset_names_the_counterpart(da: DeepAccident, name: str) -> None:
-    with pytest.raises(MissingNameError, match=rf"^DeepAccident has no '{name}': .* \(see docs/from_nuscenes\.md\)$"):
+    with pytest.raises(MissingNameError, match=rf"^DeepAccident has no '{name}': .* \(see docs/reading\.md\)$"):
         getattr(da, name)
     assert not hasattr(da, name)
 
@@ -84,7 +84,7 @@ def test_other_names_fail_as_ever(da: DeepAccident) -> None:
 
 @pytest.mark.parametrize("name", nuscenes_names.TABLES)
 def test_an_unknown_table_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
-    with pytest.raises(TableError, match=rf"no table '{name}'; .*; of nuScenes' table '{name}': .*from_nuscenes\.md"):
+    with pytest.raises(TableError, match=rf"no table '{name}'; .*; of nuScenes' table '{name}': .*reading\.md"):
         da.get(name, "x")
     with pytest.raises(TableError, match=r"category; did you mean 'sample'\?$"):
         da.get("sampel", "x")
@@ -151,7 +151,7 @@ def test_copies_and_look_ups_are_as_ever(box: Box, cloud: LidarPointCloud) -> No
 
 
 def test_the_page_has_every_name() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "from_nuscenes.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "reading.md").read_text(encoding="utf-8")
     left = " ".join(re.findall(r"^\| (.*) \| .* \|$", page, re.MULTILINE))
     every = {name for _, names in CLASSES for name in names} | set(nuscenes_names.TABLES)
     every |= nuscenes_names.KEYWORDS.keys() | nuscenes_names.FIELDS.keys()
