@@ -182,7 +182,7 @@ class Dataset(OpenTables):
         """A real path with the content of a sensor file, for other programs; arguments as of `get_sample_data`.
 
         What lies in an archive or at a URL is copied into the user's cache, whose size is bounded, so that a copy may
-        be gone later (docs/dataroots.md).
+        be gone later (docs/reading.md).
 
         Raises:
             TokenError: no such sensor file.

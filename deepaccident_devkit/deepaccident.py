@@ -101,7 +101,7 @@ class DeepAccident(Dataset):
         Args:
             version: `v1` (train, val and test, or the flat layout) or `v1-mini`.
             dataroot: the folder that the release was unpacked into; or a zip, a folder of zips, or a URL that fsspec
-                can list, such as `s3://bucket/DeepAccident` (docs/dataroots.md).
+                can list, such as `s3://bucket/DeepAccident` (docs/reading.md).
             index_dir: where to keep the index, of this release alone; by default `<dataroot>/.deepaccident`, or the
                 user's cache folder where that cannot be written.
             workers: processes to index with; None chooses by the amount of work.

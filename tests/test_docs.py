@@ -9,7 +9,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from click import Context, Group
 from click.testing import CliRunner
@@ -26,13 +25,14 @@ from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionProtoc
 from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, CleanWarnings
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
+from deepaccident_devkit.selection.fields import FIELDS, full_name
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 pytestmark = pytest.mark.slow
 
 TOP = Path(__file__).parents[1]
 DOCS = TOP / "docs"
-FROM_NUSCENES = (DOCS / "from_nuscenes.md").read_text(encoding="utf-8")
+FROM_NUSCENES = (DOCS / "reading.md").read_text(encoding="utf-8").partition("## From the nuScenes devkit")[2]
 COUNTERPARTS = sorted(
     {
         span
@@ -40,12 +40,12 @@ COUNTERPARTS = sorted(
         for span in re.findall(r"`([^`]+)`", row)
     }
 )
-"""The code in the right columns of that page's tables."""
+"""The code in the right columns of that section's tables."""
 WORDS_A_MINUTE = 200
 PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
 RUN_ELSEWHERE = {
     "docs/clusters.md": "tests/engines/test_page.py",
-    "docs/interactive_3d.md": "tests/unit/export/test_mcap_choices.py",
+    "docs/pictures.md": "tests/unit/export/test_mcap_choices.py",
     "docs/synth.md": "tests/unit/synth/test_synth_page.py",
     "docs/testing.md": "tests/unit/testing/test_page.py",
     "docs/training.md": "tests/torch_extra/test_batches.py",
@@ -80,15 +80,15 @@ NOT_RUN = {
 }
 """Command lines of pages that begin so are parsed alone, and why."""
 NO_CALLS = (
-    *("<sample>/Camera_Front", ".intensity", '"paper"', "link=", "agents=", "sweeps=5"),
+    *(".intensity", '"paper"', "link=", "agents="),
     *('.figure.savefig("a.png")', '.savefig("a.png")', "found.pixels[found.mask]", "len(cloud)"),
 )
 
 
-def run_page(page: Path) -> dict[str, Any]:
+def run_page(page: Path, languages: str = "python|bash") -> dict[str, Any]:
     """Run the page's Python and shell blocks, as they stand and in their order, in the working folder."""
     names: dict[str, Any] = {}
-    blocks = re.findall(r"^```(python|bash)\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    blocks = re.findall(rf"^```({languages})\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     assert blocks, f"{page}: no code"
     for language, code in blocks:
         if language == "python":
@@ -157,19 +157,12 @@ def test_the_code_on_evaluating_runs(in_labels_demo: Path, capsys: pytest.Captur
     assert "all numbers are equal" in capsys.readouterr().out
 
 
-def test_the_code_on_dataroots_runs(in_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "copies"))
-    names = run_page(DOCS / "dataroots.md")
-    assert names["image"].shape == (36, 64, 3)
-    assert tmp_path / "copies" in names["path"].parents
-
-
-def test_the_commands_of_the_gallery_run(da_motion: DeepAccident, in_demo: Path) -> None:
+def test_the_commands_of_the_pictures_run(da_motion: DeepAccident, in_demo: Path) -> None:
     """`docs/make_pictures.py` runs them, too, and takes minutes."""
     (in_demo / "many").symlink_to(da_motion.dataroot, target_is_directory=True)
-    run_page(DOCS / "gallery.md")
+    run_page(DOCS / "pictures.md", "bash")
     script = loaded_script("docs/make_pictures.py")
-    for picture in script.PICTURE.findall(script.PAGE.read_text(encoding="utf-8")):
+    for picture in script.PICTURE.findall((DOCS / "pictures.md").read_text(encoding="utf-8")):
         page = f"{Path(picture).stem}.html"  # which a browser shows
         assert picture in script.MADE_ELSEWHERE or [*in_demo.rglob(picture), *in_demo.rglob(page)], picture
 
@@ -245,29 +238,37 @@ def test_the_code_on_baselines_runs(in_labels_demo: Path) -> None:
     assert names["boxes"].boxes.frame == "world"
 
 
-def test_the_code_on_from_nuscenes_runs(in_demo: Path) -> None:
+def test_the_code_on_reading_runs(in_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """That of its tables, too, but for the pictures."""
-    names = run_page(DOCS / "from_nuscenes.md")
+    monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "copies"))
+    names = run_page(DOCS / "reading.md")
+    assert names["image"].shape == (36, 64, 3)
+    assert tmp_path / "copies" in names["path"].parents
     assert isinstance(names["box"], Box)
     assert names["each"]["token"].endswith("/ego_vehicle/032")  # the loop has come to the last sample
     assert len(names["visible"]) > 0
     assert names["camera"].in_image(names["pixels"]).all()
-    short = names["da"].world_from(names["sample"], "lidar01")
-    np.testing.assert_allclose(names["world_from_lidar"].matrix, short.matrix, atol=1e-3)
     objects = re.compile(r"(da|box|boxes|camera|cloud|found)\.|len\(")
     codes = [code for code in COUNTERPARTS if objects.match(code) and not code.startswith("da.render_")]
     assert len(codes) > 60
     for code in codes:
-        eval(compile(code, "from_nuscenes.md", "eval"), names)  # noqa: S307
+        eval(compile(code, "reading.md", "eval"), names)  # noqa: S307
+
+
+def test_every_field_that_finds_scenarios_is_on_the_page() -> None:
+    table = (DOCS / "reading.md").read_text(encoding="utf-8").partition("### The fields of find")[2].partition("## ")[0]
+    told = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)))
+    assert sorted(told) == sorted([*FIELDS, "length", "type"])
+    for name in told:
+        values = [str(value) for value in FIELDS[full_name(name)].known if not isinstance(value, int)]
+        assert [value for value in values if value.removeprefix("Town") not in table] == [], name
 
 
 def test_the_code_on_the_format_runs(in_demo: Path) -> None:
     assert run_page(DOCS / "format.md")["meta"].collision is not None
 
 
-@pytest.mark.parametrize(
-    "page", ["README.md", "docs/exports.md", "docs/index.md", "docs/queries.md", "docs/validation.md"]
-)
+@pytest.mark.parametrize("page", ["README.md", "docs/exports.md", "docs/index.md", "docs/validation.md"])
 def test_the_code_on_other_pages_runs(page: str, in_demo: Path) -> None:
     run_page(TOP / page)
 

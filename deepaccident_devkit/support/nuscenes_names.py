@@ -1,4 +1,4 @@
-"""Names of the nuScenes devkit that this devkit does not have, and what to use here; docs/from_nuscenes.md has all."""
+"""Names of the nuScenes devkit that this devkit does not have, and what to use here; docs/reading.md has all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from deepaccident_devkit.errors import KeywordError, MissingNameError
 
 T = TypeVar("T")
 P = ParamSpec("P")
-_PAGE: Final = "docs/from_nuscenes.md"
+_PAGE: Final = "docs/reading.md"
 _SCENARIO_FIELDS: Final = "town, weather and time of day are fields of da.scenario"
 _NO_MAPS: Final = "there are no maps; da.load_bev(sample) shows the road from above"
 _NO_LIDARSEG: Final = "LiDAR points have no classes"

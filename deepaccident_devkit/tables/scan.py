@@ -31,7 +31,7 @@ class Finding(ShortRepr):
     """One thing that is wrong, odd or missing.
 
     Attributes:
-        code: its kind, such as `label-unreadable`; docs/validation.md lists them.
+        code: its kind, such as `label-unreadable`; `validation.CODES` has all.
         severity: how bad it is.
         scenario: token of the scenario; None where the release as a whole is meant.
         where: the file (with the line), the folder, or the agents and actors.

@@ -1,4 +1,4 @@
-"""Every kind of finding: its severity, its meaning and the remedy. docs/validation.md is made from this table."""
+"""Every kind of finding: its severity, its meaning and the remedy (docs/validation.md)."""
 
 from dataclasses import dataclass
 

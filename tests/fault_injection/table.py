@@ -1,4 +1,4 @@
-"""The table of found and missed faults, as Markdown: made from a run, and read by a test."""
+"""The table of found and missed faults, as Markdown: made from a run."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -8,14 +8,12 @@ from fault_injection.run import Outcome
 
 _HEAD = """# What `deepaccident validate` finds
 
-For everybody who asks how much `deepaccident validate` finds: each planted fault, and the findings for it. 29 minutes.
+*Needs* is the option that `validate` needs.
 
-A synthetic release was damaged {count} times, with {kinds} kinds of damage (mutations), each in one healthy scenario.
-*Found* means that `validate` reports an error or a warning; for the healthy release it reports neither. Of these
-mutations {found} are found, {harmless} are *harmless* (they cannot be found, or need not be) and {missed} are missed.
-{beyond} more kinds are applied too, but not counted among the {count}: `validate` need not find them, for the reason
-that the table gives. *Needs* is the option that `validate` needs. `python docs/make_fault_table.py` makes this page; a
-test compares its kinds and verdicts with a new run.
+"""
+_SUMMARY = """{count} faults of {kinds} kinds: {found} found, {harmless} harmless, {missed} missed. `validate` need not
+find {beyond} more kinds; the table that the command prints says why.
+
 """
 _COLUMNS = ("kind", "what is done", "needs", "applied", "found", "verdict", "found by, or why not")
 
@@ -66,19 +64,19 @@ def rows_of(outcomes: Iterable[Outcome]) -> list[Row]:
 
 
 def to_markdown(outcomes: Sequence[Outcome]) -> str:
-    """The whole page."""
+    """All kinds, with the findings for each."""
     rows = rows_of(outcomes)
-    parts = [_HEAD.format(**_counts(rows)), _summary(rows)]
+    parts = [_HEAD + summary(outcomes)]
     for group in dict.fromkeys(row.mutation.group for row in rows):
         lines = [_line(row.cells()) for row in rows if row.mutation.group == group]
         parts.append("\n".join([f"## {group[0].upper()}{group[1:]}", "", *_header(_COLUMNS), *lines, ""]))
     return "\n".join(parts)
 
 
-def verdicts_of(markdown: str) -> dict[str, str]:
-    """Kind → verdict, as a page says."""
-    lines = [line.strip("| \n").split(" | ") for line in markdown.splitlines() if line.startswith("| `")]
-    return {cells[0].strip("`"): cells[_COLUMNS.index("verdict")].strip() for cells in lines}
+def summary(outcomes: Sequence[Outcome]) -> str:
+    """What docs/validation.md says of a run."""
+    rows = rows_of(outcomes)
+    return _SUMMARY.format(**_counts(rows)) + _groups(rows)
 
 
 def _counts(rows: Sequence[Row]) -> dict[str, int]:
@@ -95,7 +93,7 @@ def _counts(rows: Sequence[Row]) -> dict[str, int]:
     }
 
 
-def _summary(rows: Sequence[Row]) -> str:
+def _groups(rows: Sequence[Row]) -> str:
     lines = []
     rows = [row for row in rows if row.mutation.beyond is None]
     for group in dict.fromkeys(row.mutation.group for row in rows):

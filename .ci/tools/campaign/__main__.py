@@ -1,4 +1,4 @@
-"""`PYTHONPATH=.ci/tools python -m campaign`: all cases and stops; prints what fails and writes docs/reliability.md."""
+"""`PYTHONPATH=.ci/tools python -m campaign`: all cases and stops; its numbers go into docs/validation.md."""
 
 import sys
 import tempfile
@@ -13,20 +13,17 @@ sys.path.insert(0, str(_TOP / "tests"))  # for what it shares with the tests
 
 @click.command()
 @click.option("--count", default=EACH, show_default=True, help="How many changed files of each kind.")
-@click.option("--kinds", metavar="NAME[,NAME…]", help="Only these kinds of files; the page is not written.")
+@click.option("--kinds", metavar="NAME[,NAME…]", help="Only these kinds of files; the page stays.")
 @click.option("--kills", default=100, show_default=True, help="How many killed processes; 0: no full disks either.")
 @click.option("--seed", default=0, show_default=True)
-@click.option(
-    "--out", type=click.Path(path_type=Path), default=_TOP / "docs" / "reliability.md", help="The page to write."
-)
-def main(count: int, kinds: str | None, kills: int, seed: int, out: Path) -> None:
+def main(count: int, kinds: str | None, kills: int, seed: int) -> None:
     """Change files, kill processes and fill disks; exit status 1 if anything failed.
 
-    With --kinds nothing is killed, and no page is written.
+    With --kinds nothing is killed, and the page stays.
     """
     from campaign.healthy import make_healthy
     from campaign.kinds import KINDS
-    from campaign.page import page
+    from campaign.page import put, summary, tables
     from campaign.pool import drawn, left_out, run
     from campaign.stops import Stopped, drawn_stops, run_stops
     from campaign.worker import Outcome
@@ -51,10 +48,10 @@ def main(count: int, kinds: str | None, kills: int, seed: int, out: Path) -> Non
         with click.progressbar(length=len(stops), label="kills and full disks") as bar:
             stopped = run_stops(stops, healthy, folder / "out", tell)
     failed = sum(each.failed for each in (*outcomes, *stopped))
-    command = f"--count {count} --kills {kills} --seed {seed}"
+    click.echo(tables(outcomes, stopped))
     if not kinds:
-        out.write_text(page(outcomes, stopped, f"`{command}`"), encoding="utf-8")
-    click.echo(f"{failed} failed" if kinds else f"{failed} failed; written: {out}")
+        put(summary(outcomes, stopped, f"--count {count} --kills {kills} --seed {seed}"))
+    click.echo(f"{failed} failed")
     sys.exit(1 if failed else 0)
 
 

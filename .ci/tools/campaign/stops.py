@@ -43,7 +43,7 @@ VERBS = (
     Verb("labels", f"labels {_RELEASE} --split train --out {{out}}/labels", progress="labels/manifest.json"),
     Verb("synth", "synth {out}/made --scenarios 2 --frames 3 --sensors none --seed 1 --workers 1"),
     Verb("split", f"split {_RELEASE} --out {{out}} --overwrite"),
-    Verb("split", f"split {_RELEASE} --out {{out}}/mine.txt --overwrite"),
+    Verb("split to a file", f"split {_RELEASE} --out {{out}}/mine.txt --overwrite"),
     Verb("info --statistics", f"info {_RELEASE} --statistics --out {{out}}/statistics"),
     Verb(
         "evaluate",

@@ -6,7 +6,7 @@
     da = DeepAccident(dataroot="data/DeepAccident")
     export_mcap(da, da.scenario[0], "accident.mcap")
 
-docs/interactive_3d.md lists the topics and says how to view them. Only this package imports mcap, and only when
+docs/pictures.md lists the topics and says how to view them. Only this package imports mcap, and only when
 `export_mcap` is called.
 """
 

@@ -172,7 +172,7 @@ def checked_url(url: str) -> str:
     if parts.query or parts.password is not None or "@" in parts.netloc:
         raise DatarootError(
             f"{parts.scheme}://{parts.hostname or ''}…: holds a name, a password or a signature, which the index and "
-            "messages would show; give it by fsspec's settings or the environment (docs/dataroots.md)"
+            "messages would show; give it by fsspec's settings or the environment (docs/reading.md)"
         )
     return url.rstrip("/")
 

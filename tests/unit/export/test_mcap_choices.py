@@ -89,16 +89,16 @@ def test_a_normal_scenario_has_no_countdown(da: DeepAccident, tmp_path: Path) ->
 
 
 def test_the_code_on_the_page_runs(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (DOCS / "interactive_3d.md").read_text(encoding="utf-8")
+    page = (DOCS / "pictures.md").read_text(encoding="utf-8")
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE))
     assert "deepaccident_demo/release" in code
     monkeypatch.chdir(tmp_path)
-    exec(compile(code.replace("deepaccident_demo/release", str(da.dataroot)), "interactive_3d.md", "exec"), {})  # noqa: S102
+    exec(compile(code.replace("deepaccident_demo/release", str(da.dataroot)), "pictures.md", "exec"), {})  # noqa: S102
     assert len(read_mcap(tmp_path / "accident.mcap").only("/actors")) == 6
 
 
 def test_the_page_lists_every_topic(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
-    page = (DOCS / "interactive_3d.md").read_text(encoding="utf-8")
+    page = (DOCS / "pictures.md").read_text(encoding="utf-8")
     file = exported(da, scenario, tmp_path, channels=None, motion_labels="deepaccident")
     for topic in file.messages:
         general = re.sub("Camera_[A-Za-z]+", "<camera>", topic.replace("ego_vehicle", "<agent>"))

@@ -70,7 +70,7 @@ def test_a_name_of_nuscenes_names_the_counterpart(request: pytest.FixtureRequest
     assert issubclass(MissingNameError, AttributeError)
     named = (
         f"{kind.__name__} has no '{name}': ",
-        "use " if kind is not DeepAccident else "(see docs/from_nuscenes.md)",
+        "use " if kind is not DeepAccident else "(see docs/reading.md)",
     )
     assert_refused((lambda: getattr(owner, name), MissingNameError, named))
     if kind is LidarPointCloud:
@@ -90,7 +90,7 @@ def test_other_names_fail_as_ever(da: DeepAccident) -> None:
 
 @pytest.mark.parametrize("name", nuscenes_names.TABLES)
 def test_an_unknown_table_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
-    named = (f"no table '{name}'; ", f"; of nuScenes' table '{name}': ", "from_nuscenes.md")
+    named = (f"no table '{name}'; ", f"; of nuScenes' table '{name}': ", "reading.md")
     assert_refused((lambda: da.get(name, "x"), TableError, named))
 
 
@@ -144,7 +144,7 @@ def test_copies_and_look_ups_are_as_ever(box: Box, cloud: LidarPointCloud) -> No
 
 
 def test_the_page_has_every_name() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "from_nuscenes.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "reading.md").read_text(encoding="utf-8")
     left = " ".join(re.findall(r"^\| (.*) \| .* \|$", page, re.MULTILINE))
     every = {name for _, names in CLASSES for name in names} | set(nuscenes_names.TABLES)
     every |= nuscenes_names.KEYWORDS.keys() | nuscenes_names.FIELDS.keys()

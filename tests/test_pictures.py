@@ -1,4 +1,4 @@
-"""docs/gallery.md shows every view; its pictures are there, small, and the only ones beside those of other pages."""
+"""docs/pictures.md shows every view; its pictures are there, small, and the only ones beside those of other pages."""
 
 from types import ModuleType
 
@@ -8,6 +8,7 @@ from scripts import TOP, loaded_script
 from deepaccident_devkit.cli.render import render
 
 IMAGES = TOP / "docs" / "images"
+PAGE = TOP / "docs" / "pictures.md"
 MOST_BYTES = 250_000
 
 
@@ -17,7 +18,7 @@ def script() -> ModuleType:
 
 
 def test_every_view_is_shown_by_its_command(script: ModuleType) -> None:
-    commands = script.COMMAND.findall(script.PAGE.read_text(encoding="utf-8"))
+    commands = script.COMMAND.findall(PAGE.read_text(encoding="utf-8"))
     views = {line.split()[1] for line in commands if line.startswith("render ")}
     assert views == set(render.commands)
     for others in ("export mcap ", "evaluate compare ", "info "):
@@ -25,7 +26,7 @@ def test_every_view_is_shown_by_its_command(script: ModuleType) -> None:
 
 
 def test_the_pictures_are_there_and_small(script: ModuleType) -> None:
-    pictures = script.PICTURE.findall(script.PAGE.read_text(encoding="utf-8"))
+    pictures = script.PICTURE.findall(PAGE.read_text(encoding="utf-8"))
     assert len(pictures) > 20
     sizes = {name: (IMAGES / name).stat().st_size for name in pictures}
     assert [name for name, size in sizes.items() if size > MOST_BYTES] == ["video.webp"]
