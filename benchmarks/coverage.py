@@ -1,6 +1,6 @@
 """How often intervals hold the truth, and how often `compare` finds a difference, there is one or not.
 
-`docs/make_statistics_page.py` writes the tables into docs/statistics.md.
+`docs/make_statistics_page.py` prints the tables.
 """
 
 from collections.abc import Callable, Iterator

@@ -127,7 +127,7 @@ release's names of weights and its choices, and `tiny`, which a laptop trains.
 
 `tiny` has cells of 1 m and learns the labels `clean`. So all numbers here are **clean, 1 m**: limits that the metrics
 count in cells are twice as long in metres as the released ones, and the labels are others. They never stand beside
-numbers of the released protocol, nor beside the paper's ([which numbers compare](comparable_numbers.md)).
+numbers of the released protocol, nor beside the paper's ([which numbers compare](numbers.md)).
 
 ## Does cooperation help?
 
@@ -143,7 +143,7 @@ MEASURED = """
   all else. The last weights are tested; nothing is chosen among them.
 - The test has {samples} samples of `ego_vehicle`, within the last two seconds of {pairs} pairs of an accident and its
   twin; in {positives} of them an accident comes. In brackets are intervals of 95 % over these pairs
-  ([how](statistics.md)); there is none where too few of them change a number. The model seeds are pooled: the intervals
+  ([how](numbers.md)); there is none where too few of them change a number. The model seeds are pooled: the intervals
   say how a number varies from scene to scene, not from training to training.
 - Actors within 50 m that only a partner sees, by the released rule of visibility ({hidden}, beside {seen} that the ego
   sees), are counted apart. One is on the map if the cell of its centre is foreground at the present, and detected if a

@@ -1,8 +1,8 @@
 """Intervals of any evaluator's numbers, from how much each changes when one cluster is left out (the jackknife).
 
 A cluster is an accident with its twin (`breakdowns.cluster_of`): its samples show the same junction and traffic, so
-the number of clusters, not of samples, says how sure a number is. docs/statistics.md has the formulas and
-their measured coverage.
+the number of clusters, not of samples, says how sure a number is. docs/numbers.md, Intervals, has the formulas;
+`python -m benchmarks coverage` measures their coverage.
 """
 
 from __future__ import annotations

@@ -274,7 +274,7 @@ def _frames(form: Json, horizon: float) -> Iterator[str]:
 
 def _predictions(form: Json) -> Iterator[str]:
     if form["stored"] == "instances":
-        yield "instance maps: cannot be compared with published APA, which is of heads (docs/comparable_numbers.md)"
+        yield "instance maps: cannot be compared with published APA, which is of heads (docs/numbers.md)"
     if form["predictions"] < _PUBLISHED_PREDICTIONS:
         yield (
             f"predictions of a sample: {form['predictions']}; published numbers are of {_PUBLISHED_PREDICTIONS}, five "
