@@ -1,6 +1,6 @@
 """How often intervals hold the truth, and how often `compare` finds a difference, there is one or not.
 
-`docs/make_statistics_page.py` prints the tables.
+`python -m benchmarks.coverage` prints the tables.
 """
 
 from collections.abc import Callable, Iterator
@@ -209,3 +209,14 @@ def old_real(first: FloatArray, second: FloatArray, samples: FloatArray, source:
 
 def mean(values: list[float]) -> float:
     return sum(values) / len(values)
+
+
+def main() -> None:
+    """Print both tables, and how often differences that are alike in all clusters are called real."""
+    print(f"Intervals of 95 %, {DRAWS:,} draws for each setting:\n\n{coverage_table()}\n")
+    print(f"How often a difference is called real:\n\n{power_table()}\n")
+    print(f"Of differences that are alike in all clusters: {percent(alike())}")
+
+
+if __name__ == "__main__":
+    main()

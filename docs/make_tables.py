@@ -12,11 +12,9 @@ import click
 
 TOP = Path(__file__).parents[1]
 NAMES = {
-    "accident": "accident protocols",
     "baselines": "what constant velocity foresees, by who cooperates",
     "labels": "cells in which label protocols differ",
     "model": "cooperation of the small model, from benchmarks/cooperation/study.json",
-    "protocols": "motion and detection protocols",
     "real": "the real scenario; needs --release",
     "safety": "outputs of the commands on the page",
     "synth": "what the generator makes; with --release, the real scenario beside it",

@@ -1,6 +1,7 @@
 """The repository's scripts as modules: those of docs/ and schema/ lie in no package."""
 
 import importlib.util
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -15,3 +16,12 @@ def loaded_script(path: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def of_checkout(name: str) -> ModuleType:
+    """A module of the checkout that is not installed, such as `benchmarks.coverage`."""
+    sys.path.append(str(TOP))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(TOP))

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from click import Context, Group
 from click.testing import CliRunner
-from scripts import loaded_script
+from scripts import loaded_script, of_checkout
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -71,7 +71,7 @@ NOT_RUN = {
     "evaluate motion training_data": "of what predict makes; likewise",
     "evaluate motion DATAROOT --results results/motion ": "likewise",
     "predict constant_velocity DATAROOT --split": "tests/test_cli_predict.py has their like",
-    "predict constant_velocity hidden_release": "docs/make_baseline_tables.py has it and the next one",
+    "predict constant_velocity hidden_release": "benchmarks/pages/baselines.py does that and the next one",
     "evaluate motion hidden_release": "likewise",
     "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
     "results ": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
@@ -197,8 +197,8 @@ def test_the_code_on_safety_runs(in_labels_demo: Path) -> None:
 
 
 def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(in_labels_demo: Path) -> None:
-    """Their headings and rows' names are compared: `python docs/make_safety_page.py` measures on a larger release."""
-    script = loaded_script("docs/make_safety_page.py")
+    """Their headings and rows' names are compared: `python docs/make_tables.py safety` measures on a larger release."""
+    script = of_checkout("benchmarks.pages.safety")
     (in_labels_demo / script.RELEASE).symlink_to(in_labels_demo / "deepaccident_demo" / "release")
     there = (DOCS / "safety.md").read_text(encoding="utf-8")
     page = re.sub(r"^    deepaccident (synth|predict|evaluate) .*$", "", there, flags=re.MULTILINE)

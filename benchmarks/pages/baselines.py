@@ -1,4 +1,4 @@
-"""What the baselines foresee, by who cooperates and over which link; by the functions of the commands."""
+"""What the baselines foresee, by who cooperates; by the functions of the commands."""
 
 import tempfile
 from collections.abc import Iterable, Mapping
@@ -13,7 +13,7 @@ from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.runs import SampleSelection, compare_bundles, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.v2x import AGENT_CONFIGS, Link
+from deepaccident_devkit.v2x import AGENT_CONFIGS
 
 RELEASES = {
     "ordinary": SynthConfig(scenarios=24, frames=40, seed=12, sensors=False),
@@ -37,14 +37,6 @@ NUMBERS = {
 }
 """Name → its evaluation and its path in the result."""
 SHOWN = ("VPQ 100x100", "APA", "APA boxes", "mAP")
-LINK_SHOWN = ("VPQ 100x100", "APA boxes")
-LINKED = ("+infrastructure", "all")
-LINKS = {
-    "0.2 m of noise": Link(pose_noise=0.2),
-    "0.5 m of noise": Link(pose_noise=0.5),
-    "0.2 s late": Link(latency=0.2),
-    "0.5 s late": Link(latency=0.5),
-}
 
 
 @dataclass(frozen=True)
@@ -64,7 +56,7 @@ class Evaluated:
 
 
 Views = Mapping[str, Mapping[str, Evaluated]]
-"""View → agents, or agents and link → evaluations."""
+"""View → agents → evaluations."""
 
 
 def main(_release: Path | None = None) -> None:
@@ -72,24 +64,18 @@ def main(_release: Path | None = None) -> None:
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         views = {name: evaluated_view(folder / name, config) for name, config in RELEASES.items()}
-        linked = [f"{agents}, {link}" for agents in LINKED for link in LINKS]
         put("size", size_text(views))
         put("configurations", numbers_table(views, SHOWN, list(AGENT_CONFIGS)))
         put("decided", decided_table(views, {name: "single" for name in AGENT_CONFIGS if name != "single"}))
-        put("link", numbers_table(views, LINK_SHOWN, linked))
-        put("decided-link", decided_table(views, {name: name.split(", ")[0] for name in linked}))
 
 
 def evaluated_view(folder: Path, config: SynthConfig) -> dict[str, Evaluated]:
-    """What all sets of agents, and some with all links, foresee in a release."""
+    """What all sets of agents foresee in a release."""
     root = folder / "release"
     if not root.exists():
         make_release(root, config)
     dataset = DeepAccident("v1", root, verbose=False)
     baselines = {name: Baseline(agents=name) for name in AGENT_CONFIGS}
-    baselines |= {
-        f"{name}, {text}": Baseline(agents=name, link=link) for name in LINKED for text, link in LINKS.items()
-    }
     return {name: evaluated(dataset, baseline, folder / name) for name, baseline in baselines.items()}
 
 

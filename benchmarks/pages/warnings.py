@@ -1,4 +1,4 @@
-"""Warnings through the protocols: of baselines, of the truth, and of sirens."""
+"""Warnings by the protocol `clean`: of baselines, of the truth, and of sirens."""
 
 import tempfile
 from collections.abc import Callable, Mapping
@@ -21,26 +21,21 @@ Predictor = Callable[[DeepAccident, str, AccidentContext], list[Accident]]
 
 
 def main(release: Path | None = None) -> None:
-    """Write all tables."""
+    """Write the table."""
     with tempfile.TemporaryDirectory() as folder:
         root = release or make_release(Path(folder) / "release", RELEASE)
         measure(DeepAccident("v1", root, verbose=False))
 
 
 def measure(dataset: DeepAccident) -> None:
-    """Of all samples of the split, two a second, each predictor through each protocol."""
-    warned = {name: {kind: WarningEvaluator(kind) for kind in ("clean", "field")} for name in PREDICTORS}
+    """Of all samples of the split, two a second, each predictor through the protocol `clean`."""
+    warned = {name: WarningEvaluator("clean") for name in PREDICTORS}
     for token in dataset.samples(SPLIT, "all"):
         context = accident_context(dataset, token, HORIZON, references=True)
         for name, predict in PREDICTORS.items():
             alarms = predict(dataset, token, context)
-            for evaluator in warned[name].values():
-                evaluator.update(token, alarms, None, context)
-    results = {name: {kind: each.compute() for kind, each in those.items()} for name, those in warned.items()}
-    put("warning-clean", beside({name: each["clean"].as_dict() for name, each in results.items()}, GROUP))
-    for code in ("drive", "dad"):
-        fields = {name: each["field"].as_dict() for name, each in results.items()}
-        put(f"warning-{code}", beside(fields, f"{code} {GROUP}"))
+            warned[name].update(token, alarms, None, context)
+    put("warning-clean", beside({name: each.compute().as_dict() for name, each in warned.items()}, GROUP))
 
 
 def siren(_dataset: DeepAccident, _token: str, context: AccidentContext) -> list[Accident]:

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from scripts import loaded_script
+from scripts import of_checkout
 
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS
 
@@ -15,22 +15,20 @@ DOCS = Path(__file__).parents[3] / "docs"
 
 @pytest.fixture(scope="module")
 def script():
-    """The module that writes the page; another module of its folder measures what stands beside the real scenario."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(DOCS)
-        return loaded_script("docs/make_synth_page.py")
+    return of_checkout("benchmarks.pages.synth")
 
 
 def test_the_tables_are_made_of_what_was_measured(script):
-    page = script.PAGE.read_text(encoding="utf-8")
-    assert page == script.with_tables(page, script.measured()), "run: python docs/make_synth_page.py --tables"
+    page = (DOCS / "synth.md").read_text(encoding="utf-8")
+    for name, text in script.tables(script.measured()).items():
+        assert f"<!-- {name} -->\n\n{text}\n\n<!-- end of {name} -->" in page, "run: python docs/make_tables.py synth"
 
 
 @pytest.mark.parametrize("number", [0, 4, 19, 34])
 def test_what_was_measured_is_still_so(script, number):
     """Of a few pairs, what needs no sensors; numbers may differ a little between machines."""
     stored, now = script.measured()["pairs"][number], script.measure(number, views=False)
-    message = "the generator has changed; run: python docs/make_synth_page.py"
+    message = "the generator has changed; run: python docs/make_tables.py synth"
     for key in ("design", "type", "draws", "frames", "twin_frames", "twin_touches"):
         assert now[key] == stored[key], message
     assert now["angle"] == pytest.approx(stored["angle"], abs=1.0), message

@@ -1,29 +1,19 @@
 """Intervals hold the truth as often as they say, and differences are not called real by chance: a quick look.
 
-`python docs/make_statistics_page.py` measures the whole tables.
+`python -m benchmarks.coverage` measures the whole tables.
 """
 
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 from types import ModuleType
 
 import pytest
+from scripts import of_checkout
 
-TOP = Path(__file__).parents[1]
 DRAWS = 400
 
 
 @pytest.fixture(scope="module")
-def benchmark() -> Iterator[ModuleType]:
-    """The checkout's `benchmarks.coverage`."""
-    sys.path.insert(0, str(TOP))
-    try:
-        from benchmarks import coverage
-
-        yield coverage
-    finally:
-        sys.path.remove(str(TOP))
+def benchmark() -> ModuleType:
+    return of_checkout("benchmarks.coverage")
 
 
 @pytest.mark.slow
