@@ -7,17 +7,18 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 from refusals import assert_refused
 from report_page import page_of
+from verbs import called, ran
 
 from deepaccident_devkit import DeepAccident, taxonomy
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, accident_context, instances_of
 from deepaccident_devkit.evaluation.results import ResultsWriter
@@ -31,19 +32,7 @@ LISTED = ("--samples", "evaluate", "--scope", "all", "--resamples", "0")
 LIST = ("--split", "train", "--agents", ",".join(AGENTS), "--resamples", "0")
 
 
-def evaluate(*arguments: object, status: int = 0) -> Result:
-    """Run the verb in this process; errors of the library come through."""
-    words = ["evaluate", *map(str, arguments)]
-    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
-    assert result.exit_code == status, result.output
-    return result
-
-
-def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "deepaccident_devkit.cli", "evaluate", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == status, done.stderr
-    return done
+evaluate, run = (partial(each, "evaluate") for each in (called, ran))
 
 
 def summary_of(result: Result) -> Any:
