@@ -1,11 +1,10 @@
 """From nothing to checked numbers by the command line alone: each step is a process of its own, as a user has it."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from verbs import ran
 
 pytestmark = pytest.mark.slow
 
@@ -18,17 +17,14 @@ TASKS = {
 """Task and results → protocols."""
 
 
-def deepaccident(*arguments: object) -> str:
-    command = [sys.executable, "-m", "deepaccident_devkit.cli", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+def told(*words: object) -> str:
+    return ran(*words).stdout
 
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("chain") / "release"
-    deepaccident("synth", root, "--scenarios", 2, "--frames", 25, "--sensors", "none", "--seed", 12)
+    told("synth", root, "--scenarios", 2, "--frames", 25, "--sensors", "none", "--seed", 12)
     return root
 
 
@@ -36,18 +32,16 @@ def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(release: Path) -> Path:
     """Where a single vehicle's and five agents' predictions are, and what comes of them."""
     folder = release.parent
-    deepaccident("labels", release, "--split", "train", "--samples", "evaluate", "--out", folder / "labels")
+    told("labels", release, "--split", "train", "--samples", "evaluate", "--out", folder / "labels")
     for agents in ("single", "all"):
-        deepaccident(
-            "predict", "constant_velocity", release, "--split", "train", "--agents", agents, "--out", folder / agents
-        )
+        told("predict", "constant_velocity", release, "--split", "train", "--agents", agents, "--out", folder / agents)
     return folder
 
 
 @pytest.mark.parametrize("name", ["motion", "accident.json", "detection.json"])
 def test_results_are_valid_and_of_the_split(release: Path, folder: Path, name: str) -> None:
-    told = deepaccident("evaluate", "check", folder / "all" / name, "--dataroot", release, "--split", "train")
-    assert "all 20 samples have a prediction, and nothing else has" in told
+    valid = told("evaluate", "check", folder / "all" / name, "--dataroot", release, "--split", "train")
+    assert "all 20 samples have a prediction, and nothing else has" in valid
 
 
 @pytest.mark.parametrize(
@@ -57,11 +51,11 @@ def test_results_are_valid_and_of_the_split(release: Path, folder: Path, name: s
 def test_each_evaluation_is_verified(release: Path, folder: Path, task: str, name: str, protocol: str) -> None:
     out, results = folder / f"{task}_{name}_{protocol}", ("--results", folder / "all" / name)
     options = ("--split", "train", "--protocol", protocol, "--out", out, "--resamples", 0)
-    assert f"{task}, protocol {protocol}" in deepaccident("evaluate", task, release, *results, *options)
+    assert f"{task}, protocol {protocol}" in told("evaluate", task, release, *results, *options)
     summary = json.loads((out / "metrics_summary.json").read_text())
     assert (summary["task"], summary["protocol"], summary["counts"]["samples"]) == (task, protocol, 20)
     assert (out / "report.html").stat().st_size > 50_000
-    verified = deepaccident("evaluate", "verify", out, "--dataroot", release, *results)
+    verified = told("evaluate", "verify", out, "--dataroot", release, *results)
     assert "all numbers are equal" in verified
 
 
@@ -69,8 +63,8 @@ def test_five_agents_are_compared_with_one(release: Path, folder: Path) -> None:
     bundles = [folder / f"compared_{agents}" for agents in ("single", "all")]
     for agents, bundle in zip(("single", "all"), bundles, strict=True):
         options = ("--results", folder / agents / "motion", "--split", "train", "--out", bundle, "--resamples", 0)
-        deepaccident("evaluate", "motion", release, *options)
-    text = deepaccident("evaluate", "compare", *bundles, "--out", folder / "compared.json")
+        told("evaluate", "motion", release, *options)
+    text = told("evaluate", "compare", *bundles, "--out", folder / "compared.json")
     assert "motion, protocol released: 20 samples of 1 scenarios" in text
     numbers = {each["number"]: each for each in json.loads((folder / "compared.json").read_text())["numbers"]}
     assert numbers["ranges/100x100/pq"]["b"] > numbers["ranges/100x100/pq"]["a"]

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from refusals import assert_refused
 from report_page import page_of
+from verbs import called
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import make_release
 
@@ -23,8 +22,7 @@ demo: Any = importlib.import_module("deepaccident_devkit.synth.demo")
 
 
 def run(*words: str) -> str:
-    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    result = called(*words)
     assert result.stderr == "" or words[0] != "demo"  # no bar where nobody sees it
     return result.output
 

@@ -4,12 +4,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from refusals import assert_refused
+from verbs import called
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import NotAvailableError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.splits import save_selection
@@ -18,10 +17,8 @@ from deepaccident_devkit.v2x import Link
 pytestmark = pytest.mark.slow
 
 
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(deepaccident, ["predict", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+def run(*words: object) -> str:
+    return called("predict", *words).output
 
 
 def test_predict_writes_all_tasks_of_the_samples_that_are_evaluated(da_motion: DeepAccident, tmp_path: Path) -> None:

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from matplotlib import pyplot as plt
 from PIL import Image
+from verbs import called
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_results
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.render import render
 from deepaccident_devkit.cli.render_targets import rows_to_draw
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
@@ -25,10 +24,8 @@ SIZE = (480, 480)
 VIEWS = sorted(set(render.commands) - {"evaluation", "video", "replay"})
 
 
-def run(*arguments: object, status: int = 0) -> str:
-    result = CliRunner().invoke(deepaccident, ["render", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == status, result.output
-    return result.output
+def run(*words: object) -> str:
+    return called("render", *words).output
 
 
 def pixels(path: Path) -> Any:

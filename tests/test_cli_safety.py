@@ -1,24 +1,21 @@
 """`deepaccident safety`: text, JSON, pages and files of its topics."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 from damaged_releases import damaged_release
 from report_page import page_of
+from verbs import called
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.safety import avoidability_report
 
 pytestmark = pytest.mark.slow
 
 
-def run(*arguments: object) -> Result:
-    result = CliRunner().invoke(deepaccident, ["safety", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result
+run = partial(called, "safety")
 
 
 def test_from_a_damaged_release_to_a_page(own_release: Path, tmp_path: Path) -> None:

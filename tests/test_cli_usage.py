@@ -109,6 +109,7 @@ WRONG = [
     (f"{RENDER.format('link')} --latency 0.25", "latency"),
     (f"{RENDER.format('accident')} --seconds 9", "seconds: expected some from 0 to 0.5"),
     ("predict constant_velocty release --out out", "did you mean 'constant_velocity'"),
+    ("evaluate compare RELEASE RELEASE --out numbers.txt", "--out: expected a file that ends in .csv, .json, .png"),
     ("safety report release", "Missing option '--out'"),
     ("safety raport release", "'raport' is not one of"),
     ("safety lead-time release a/b", "SCENARIO changes nothing with lead-time"),

@@ -1,13 +1,13 @@
 """What a mutation is."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from deepaccident_devkit.taxonomy import CAMERAS
-from fault_injection.place import Place
+from fault_injection.place import Frames, Place
 
 Apply = Callable[[Place, np.random.Generator], None]
 Matrix = Callable[[np.ndarray], np.ndarray]
@@ -85,6 +85,22 @@ def in_calib(
         agent, frames = place.any_agent(rng), place.frames if always else [place.any_frame(rng)]
         matrix = key.format(rng.choice(CAMERAS)) if "{}" in key else key
         place.edit_calib(agent, frames, matrix, edit or drawn(rng))
+
+    return apply
+
+
+def of_actor(
+    damage: Callable[[Place, np.random.Generator, str, Sequence[int], int], object],
+    when: Frames,
+    *,
+    lone: bool = False,
+    **which: Any,
+) -> Apply:
+    """Damage what an agent says of an actor that others see too, or `lone` of one that nobody else sees."""
+
+    def apply(place: Place, rng: np.random.Generator) -> None:
+        agent, actor = (place.lone_actor if lone else place.shared_actor)(rng, **which)
+        damage(place, rng, agent, when(place, rng), actor)
 
     return apply
 

@@ -228,6 +228,24 @@ class Place(ScenarioEditor):
         return others[rng.integers(len(others))]
 
 
+Frames = Callable[[Place, np.random.Generator], Sequence[int]]
+
+
+def always(place: Place, _: np.random.Generator) -> Sequence[int]:
+    """All frames."""
+    return place.frames
+
+
+def once(place: Place, rng: np.random.Generator) -> Sequence[int]:
+    """Any frame."""
+    return [place.any_frame(rng)]
+
+
+def in_the_middle(place: Place, rng: np.random.Generator) -> Sequence[int]:
+    """A frame in the middle (`Place.middle_frame`)."""
+    return [place.middle_frame(rng)]
+
+
 def one_of(candidates: Sequence[Candidate], rng: np.random.Generator) -> Candidate:
     """Any of the candidates. Raises NoVictimError if there is none."""
     if not candidates:

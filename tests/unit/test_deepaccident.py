@@ -18,7 +18,7 @@ LATE = {
 
 
 def run(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True).stdout
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True).stdout
 
 
 PARTS = ("motion", "render", "safety", "interactions", "maps", "validation", "evaluation", "synth")

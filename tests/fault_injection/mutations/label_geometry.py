@@ -1,12 +1,13 @@
 """Label files whose positions, angles, sizes or speeds are wrong."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
-from fault_injection.kinds import Apply, Group
-from fault_injection.place import FIELD, Place
+from fault_injection.kinds import Apply, Group, of_actor
+from fault_injection.place import FIELD, Frames, Place, always, in_the_middle, once
 
 GROUP = Group("label, geometry")
 Edit = Callable[[list[str]], None]
@@ -51,24 +52,13 @@ def _turn_velocity(row: list[str]) -> None:
     row[vx], row[vy] = repr(-float(row[vy])), row[vx]
 
 
-def _of_box(edit_by: Callable[[np.random.Generator], Edit]) -> Apply:
-    """Edit an actor's box in one agent's label of one frame."""
-
-    def apply(place: Place, rng: np.random.Generator) -> None:
-        (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
-        place.edit_rows(agent, [frame], edit_by(rng), actor=actor)
-
-    return apply
-
-
-def _of_actor(edit: Edit, *, moving: bool = False) -> Apply:
-    """Edit an actor's boxes in all labels of one agent."""
-
-    def apply(place: Place, rng: np.random.Generator) -> None:
-        agent, actor = place.shared_actor(rng, moving=moving)
-        place.edit_rows(agent, place.frames, edit, actor=actor)
-
-    return apply
+def _of_box(edit_by: Callable[[np.random.Generator], Edit], when: Frames = once, **which: Any) -> Apply:
+    """Edit an actor's box in one agent's label of one frame, or of others."""
+    return of_actor(
+        lambda place, rng, agent, frames, actor: place.edit_rows(agent, frames, edit_by(rng), actor=actor),
+        when,
+        **which,
+    )
 
 
 def _of_agent(edit: Edit) -> Apply:
@@ -84,15 +74,6 @@ def _of_all(edit: Edit) -> Apply:
             place.edit_rows(agent, place.frames, edit)
 
     return apply
-
-
-def _of_lone(place: Place, frame: int, edit: Edit, lone: tuple[str, int]) -> None:
-    place.edit_rows(lone[0], [frame], edit, actor=lone[1])
-
-
-def _yaw_turned_lone(place: Place, rng: np.random.Generator) -> None:
-    lone, frame = place.lone_actor(rng, vehicle=True), place.middle_frame(rng)
-    _of_lone(place, frame, _add(["yaw"], [np.pi / 2]), lone)
 
 
 def _swap_a_vehicles_axes(place: Place, rng: np.random.Generator) -> None:
@@ -131,7 +112,7 @@ GROUP.add(
         ),
         "yaw_turned_lone": (
             "A vehicle is turned by 90° at one frame, and no other agent is there.",
-            _yaw_turned_lone,
+            _of_box(lambda _: _add(["yaw"], [np.pi / 2]), in_the_middle, lone=True, vehicle=True),
         ),
         "size_axes_swapped": (
             "A vehicle's length and width are exchanged in one agent.",
@@ -141,7 +122,10 @@ GROUP.add(
             "Length and width are exchanged in all labels of all agents.",
             _of_all(_swap_axes),
         ),
-        "size_scaled": ("An actor is a quarter larger in one agent.", _of_actor(_scale("l", "w", "h", by=1.25))),
+        "size_scaled": (
+            "An actor is a quarter larger in one agent.",
+            _of_box(lambda _: _scale("l", "w", "h", by=1.25), always),
+        ),
         "size_halved_in_a_frame": (
             "A box has half its size (as if the file had half lengths) at one frame.",
             _of_box(lambda _: _scale("l", "w", "h", by=0.5)),
@@ -160,13 +144,7 @@ def _offset(length: float) -> Apply:
 
 def _lone_moved(place: Place, rng: np.random.Generator) -> None:
     frame = place.middle_frame(rng)
-    lone = place.lone_actor(rng)
-    _of_lone(place, frame, _move(rng, 2.0), lone)
-
-
-def _lone_moved_at_the_end(place: Place, rng: np.random.Generator) -> None:
-    lone = place.lone_actor(rng)
-    _of_lone(place, place.frames[-1], _move(rng, 2.0), lone)
+    _of_box(lambda rng: _move(rng, 2.0), lambda *_: [frame], lone=True)(place, rng)
 
 
 GROUP.add(
@@ -191,7 +169,7 @@ GROUP.add(
     {
         "box_moved_lone_at_the_end": (
             "A box is 2 m too far to one side at the last frame, and no other agent is there.",
-            _lone_moved_at_the_end,
+            _of_box(lambda rng: _move(rng, 2.0), lambda place, _: [place.frames[-1]], lone=True),
         ),
     },
     beyond="a collision may move actors suddenly in the last frames, and no other agent saw them",
@@ -236,7 +214,7 @@ GROUP.add(
         ),
         "velocity_reversed": (
             "A moving actor's velocity has the other sign in one agent.",
-            _of_actor(_scale("vx", "vy"), moving=True),
+            _of_box(lambda _: _scale("vx", "vy"), always, moving=True),
         ),
         "velocities_in_another_frame": ("All velocities of an agent are turned by 90°.", _of_agent(_turn_velocity)),
         "track_frozen": (

@@ -1,42 +1,44 @@
 """Label files whose lines, ids or numbers of lines are wrong, though each line can be read."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
-from fault_injection.kinds import Group
-from fault_injection.place import FIELD, NEAR, Place, one_of
+from fault_injection.kinds import Group, of_actor
+from fault_injection.place import FIELD, NEAR, Place, always, in_the_middle, once, one_of
 
 GROUP = Group("label, lines and ids")
 _ID, _POINTS, _VISIBLE = FIELD["id"], FIELD["num_lidar_pts"], FIELD["camera_visible"]
+Damage = Callable[[Place, np.random.Generator, str, Sequence[int], int], None]
 _EXCHANGED = {"car": "truck", "truck": "van", "van": "car", "cyclist": "motorcycle"}
 
 
-def _set_id(place: Place, agent: str, frames: Sequence[int], actor: int, new: int | None = None) -> None:
-    """Give an actor another id in an agent's labels: one that is new, if none is given."""
-    word = str(1 + max(actor for seen in place.sightings.values() for actor in seen) if new is None else new)
-    place.edit_rows(agent, frames, lambda row: row.__setitem__(_ID, word), actor=actor)
+def _set_id(place: Place, agent: str, frames: Sequence[int], actor: int, new: int) -> None:
+    place.edit_rows(agent, frames, lambda row: row.__setitem__(_ID, str(new)), actor=actor)
 
 
-def _remove_near(place: Place, rng: np.random.Generator) -> None:
-    (agent, actor), frame = place.shared_actor(rng, within=NEAR), place.middle_frame(rng)
-    place.remove_row(agent, [frame], actor)
+def _renew_id(place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int) -> None:
+    """Give an actor an id that nobody has."""
+    _set_id(place, agent, frames, actor, 1 + max(actor for seen in place.sightings.values() for actor in seen))
 
 
-def _remove_at_an_end(place: Place, rng: np.random.Generator) -> None:
-    (agent, actor), frame = place.shared_actor(rng, within=NEAR), int(rng.choice([1, place.frames[-1]]))
-    place.remove_row(agent, [frame], actor)
+def _lose_id(place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int) -> None:
+    _set_id(place, agent, frames, actor, -1)
 
 
-def _remove_lone(place: Place, rng: np.random.Generator) -> None:
-    (agent, actor), frame = place.lone_actor(rng), place.middle_frame(rng)
-    place.remove_row(agent, [frame], actor)
+def _remove(place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int) -> None:
+    place.remove_row(agent, frames, actor)
 
 
-def _remove_always(place: Place, rng: np.random.Generator) -> None:
-    agent, actor = place.shared_actor(rng, within=NEAR)
-    place.remove_row(agent, place.frames, actor)
+def _set_class(new: Callable[[str], str]) -> Damage:
+    return lambda place, _, agent, frames, actor: place.edit_rows(
+        agent, frames, lambda row: row.__setitem__(0, new(row[0])), actor=actor
+    )
+
+
+def _at_an_end(place: Place, rng: np.random.Generator) -> Sequence[int]:
+    return [int(rng.choice([1, place.frames[-1]]))]
 
 
 def _duplicate(place: Place, rng: np.random.Generator) -> None:
@@ -57,11 +59,6 @@ def _exchange_ids(place: Place, rng: np.random.Generator, frames: Sequence[int])
     place.edit_rows(agent, frames, lambda row: row.__setitem__(_ID, new.get(row[_ID], row[_ID])))
 
 
-def _change_id_in_a_frame(place: Place, rng: np.random.Generator) -> None:
-    (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
-    _set_id(place, agent, [frame], actor)
-
-
 GROUP.add(
     {
         "line_removed": (
@@ -69,19 +66,19 @@ GROUP.add(
                 "A near actor that others see too is missing from one agent's label at one frame in the middle of the "
                 "scenario."
             ),
-            _remove_near,
+            of_actor(_remove, in_the_middle, within=NEAR),
         ),
         "line_removed_at_an_end": (
             "A near actor that others see too is missing from one agent's label at the first or last frame.",
-            _remove_at_an_end,
+            of_actor(_remove, _at_an_end, within=NEAR),
         ),
         "line_removed_lone": (
             "A near actor is missing at one frame in the middle of the scenario, and no other agent is there.",
-            _remove_lone,
+            of_actor(_remove, in_the_middle, lone=True),
         ),
         "actor_removed": (
             "A near actor that others see too is missing from all labels of one agent.",
-            _remove_always,
+            of_actor(_remove, always, within=NEAR),
         ),
         "line_duplicated": ("A line is there twice.", _duplicate),
         "boxes_removed": ("One label file has lost all boxes, but not its header.", _remove_boxes),
@@ -95,11 +92,11 @@ GROUP.add(
         ),
         "id_changed": (
             "An actor that others see too has a new id in one agent, at all frames.",
-            lambda place, rng: _change_always(place, place.shared_actor(rng)),
+            of_actor(_renew_id, always),
         ),
         "id_changed_in_a_frame": (
             "An actor that others see too has a new id in one agent, at one frame.",
-            _change_id_in_a_frame,
+            of_actor(_renew_id, once),
         ),
     },
 )
@@ -107,15 +104,11 @@ GROUP.add(
     {
         "id_changed_lone": (
             "An actor has a new id at all frames, and no other agent is there.",
-            lambda place, rng: _change_always(place, place.lone_actor(rng)),
+            of_actor(_renew_id, always, lone=True),
         ),
     },
     harmless="nothing else names that actor, so nothing contradicts the new id",
 )
-
-
-def _change_always(place: Place, seen: tuple[str, int]) -> None:
-    _set_id(place, seen[0], place.frames, seen[1])
 
 
 def _give_id_twice(place: Place, rng: np.random.Generator) -> None:
@@ -127,11 +120,6 @@ def _give_odd_id(place: Place, rng: np.random.Generator) -> None:
     (_, actor), new = place.shared_actor(rng), int(rng.choice([-7, 0x7FFFFFFF]))
     for agent in place.agents:
         _set_id(place, agent, place.frames, actor, new)
-
-
-def _lose_id(place: Place, rng: np.random.Generator) -> None:
-    (agent, actor), frame = place.shared_actor(rng, within=NEAR), place.middle_frame(rng)
-    _set_id(place, agent, [frame], actor, -1)
 
 
 def _lose_ids(place: Place, agent: str, frames: Sequence[int]) -> None:
@@ -146,7 +134,12 @@ GROUP.add(
     },
 )
 GROUP.add(
-    {"id_lost": ("A near actor that others track has the id of an untracked one (−1) at one frame.", _lose_id)},
+    {
+        "id_lost": (
+            "A near actor that others track has the id of an untracked one (−1) at one frame.",
+            of_actor(_lose_id, in_the_middle, within=NEAR),
+        )
+    },
     harmless="real labels are not always tracked either: one has an untracked row at 22 m",
 )
 
@@ -165,16 +158,6 @@ def _tell_own_id(place: Place, rng: np.random.Generator) -> None:
 def _give_the_pole_an_own_row(place: Place, rng: np.random.Generator) -> None:
     frame = place.any_frame(rng)
     _set_id(place, "infrastructure", [frame], one_of(sorted(place.steady("infrastructure")), rng), OWN_ACTOR_ID)
-
-
-def _exchange_class(place: Place, rng: np.random.Generator) -> None:
-    (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
-    place.edit_rows(agent, [frame], lambda row: row.__setitem__(0, _EXCHANGED.get(row[0], "cyclist")), actor=actor)
-
-
-def _exchange_lone_class(place: Place, rng: np.random.Generator) -> None:
-    (agent, actor), frame = place.lone_actor(rng), place.any_frame(rng)
-    place.edit_rows(agent, [frame], lambda row: row.__setitem__(0, "truck" if row[0] == "car" else "car"), actor=actor)
 
 
 def _contradict_size(place: Place, rng: np.random.Generator) -> None:
@@ -215,10 +198,13 @@ GROUP.add(
             _tell_own_id,
         ),
         "own_row_on_the_pole": ("The infrastructure's label has an own line (−100).", _give_the_pole_an_own_row),
-        "class_exchanged": ("One line has another class of the same kind, such as truck for car.", _exchange_class),
+        "class_exchanged": (
+            "One line has another class of the same kind, such as truck for car.",
+            of_actor(_set_class(lambda old: _EXCHANGED.get(old, "cyclist")), once),
+        ),
         "class_exchanged_lone": (
             "An actor has another class at one frame, and no other agent is there.",
-            _exchange_lone_class,
+            of_actor(_set_class(lambda old: "truck" if old == "car" else "car"), once, lone=True),
         ),
         "class_against_size": (
             "Cars are pedestrians and pedestrians are cars in all labels of all agents; sizes do not change.",

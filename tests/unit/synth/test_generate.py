@@ -12,11 +12,11 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import find_release, read_calib, read_image, read_label, read_meta, read_split_file
-from deepaccident_devkit.support.files import temporary_path
+from deepaccident_devkit.support.files import temporary_path, write_bytes
 from deepaccident_devkit.synth import SynthConfig, generate, make_release
 from deepaccident_devkit.synth.generate import Unfinished
 from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.scenario import build_scenario, parts_of, record_scenario
+from deepaccident_devkit.synth.scenario import build_scenario, parts_of
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CHANNELS, LIDAR, MINI_SPLITS, SPLITS
 from deepaccident_devkit.validation import release_completeness, validate_release
 
@@ -98,47 +98,18 @@ def test_one_scenario_gives_work_to_several_processes():
     assert (natural, short, bare, usual >= 4) == (usual, 2, 1, True)
 
 
-@pytest.fixture
-def break_off(monkeypatch):
-    """Makes a release until the disk is full, in the last part of the last scenario but one."""
-
-    def make(out: Path, config: SynthConfig) -> None:
-        record, parts = generate.record_scenario, parts_of(config)
-        left = iter(range((config.scenarios - 1) * parts + parts // 2))
-
-        def record_until_full(job):
-            if next(left, None) is None:
-                raise OSError("disk full")
-            return record(job)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(generate, "record_scenario", record_until_full)
-            told = ("cannot be written (disk full); make room there",)
-            assert_refused((lambda: make_release(out, config, workers=1), ConfigError, told))
-
-    return make
-
-
 @pytest.mark.slow
-def test_a_broken_off_release_is_gone_on_with(tmp_path, break_off, digests, monkeypatch):
+def test_a_release_of_images_is_gone_on_with_when_the_disk_has_room_again(tmp_path, stop_at, digests, recorded):
     """The parts that are whole are not made again, and no byte tells."""
     config = SynthConfig(scenarios=2, frames=3, image_size=(32, 18), seed=7)
-    whole = digests(make_release(tmp_path / "whole", config, workers=1))
-    out, recorded = tmp_path / "broken", []
-    break_off(out, config)
-    assert not out.exists()
-    (part,) = (tmp_path / ".broken.unfinished" / "parts").glob("*_normal_*")
-    (half_made := part.with_name(part.name.replace("1of3", "2of3"))).mkdir()
-    (half_made / "half.tmp").write_text("left by the break")
-
-    def record(job):
-        recorded.append((job.plan.token, job.first))
-        return record_scenario(job)
-
-    monkeypatch.setattr(generate, "record_scenario", record)
-    assert make_release(out, config, workers=1) == out
-    assert recorded == [(plan_scenarios(config)[1].token, first) for first in (2, 3)]
-    assert digests(out) == whole
+    whole, out = digests(make(tmp_path / "whole", config)), tmp_path / "broken"
+    stop_at(out, 4, config, OSError("disk full"))
+    parts = tmp_path / ".broken.unfinished" / "parts"
+    (part,) = parts.glob("*_normal_*")
+    write_bytes(part.with_name(part.name.replace("1of3", "2of3")) / "half.tmp", b"left by the break")
+    del recorded[:]
+    assert digests(make(out, config)) == whole
+    assert [name[-4:] for name in recorded] == ["2of3", "3of3"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken", "whole"]
 
 
@@ -172,9 +143,9 @@ def test_gathering_goes_on_after_a_break(tmp_path):
 
 
 @pytest.mark.slow
-def test_another_configuration_does_not_go_on_with_it(tmp_path, break_off):
+def test_another_configuration_does_not_go_on_with_it(tmp_path, stop_at):
     out, config = tmp_path / "out", SynthConfig(scenarios=2, frames=2, sensors=False)
-    break_off(out, config)
+    stop_at(out, 1, config)
     told = "another configuration ({}: {} there, {} asked for)"
     assert_refused(
         (
@@ -298,20 +269,20 @@ def recorded(monkeypatch) -> list[str]:
 
 @pytest.fixture
 def stop_at(monkeypatch):
-    """Stop as Ctrl-C does, once so many parts are recorded."""
+    """Stop as Ctrl-C does, once so many parts are recorded; or for another reason."""
     record = generate.record_scenario
 
-    def stop(out: Path, count: int) -> None:
-        left = iter(range(count))
+    def stop(out: Path, count: int, config: SynthConfig = LABELS, why: BaseException | None = None) -> None:
+        left, told = iter(range(count)), f"({why})" if why else ""
 
         def record_or_stop(job):
             if next(left, None) is None:
-                raise KeyboardInterrupt
+                raise why or KeyboardInterrupt
             record(job)
 
         with monkeypatch.context() as patch:
             patch.setattr(generate, "record_scenario", record_or_stop)
-            assert_refused((lambda: make(out), KeyboardInterrupt, ()))
+            assert_refused((lambda: make(out, config), ConfigError if why else KeyboardInterrupt, (told,)))
 
     return stop
 

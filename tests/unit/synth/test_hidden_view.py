@@ -62,11 +62,3 @@ def test_nobody_walks_or_parks_in_the_house(side, number):
         x, y = scenario.actors.at(time).poses[:, :2].T
         edge = scenario.spec.road.road_edge + 0.5
         assert not ((x < -edge) & (x > -27) & (sign * y > edge) & (sign * y < 27)).any()
-
-
-def test_another_view_gives_other_files(tmp_path, digests):
-    config = SynthConfig(scenarios=1, frames=1, sensors=False)
-    hidden, wide = (
-        digests(make_release(tmp_path / view, replace(config, view=view), workers=1)) for view in ("hidden", "open")
-    )
-    assert hidden != wide

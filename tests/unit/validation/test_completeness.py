@@ -11,12 +11,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 from hypothesis import given
 from hypothesis import strategies as st
 from refusals import assert_refused
+from verbs import called
 
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import SplitFileError, TokenError
 from deepaccident_devkit.release import ScenarioFolder, find_release, write_split_file
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CHANNEL_FORMAT, CHANNELS
@@ -30,9 +30,7 @@ SIZES = dict(zip(ENDINGS, range(10, 20), strict=True))
 
 
 def run(*words: object) -> Result:
-    result = CliRunner().invoke(deepaccident, ["validate", *map(str, words), "--files"], catch_exceptions=False)
-    assert result.exit_code == 0
-    return result
+    return called("validate", *words, "--files")
 
 
 def files_of(root: Path, token: str, frames: int) -> Iterator[tuple[str, str, Path]]:

@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-from click.testing import CliRunner
 from PIL import Image
+from verbs import called
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import LabelError, TokenError
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.release import read_labels
@@ -84,11 +83,9 @@ def test_all_findings_are_listed_if_asked_for(own_release: Path) -> None:
     scenario = DeepAccident(dataroot=own_release, verbose=False).scenario[0]["token"]
     for path in own_release.glob(f"*/{scenario.replace('/', '/*/label/')}/*_00[13].txt"):
         path.write_text("nothing")
-    runner = CliRunner()
-    short, whole = (runner.invoke(deepaccident, ["validate", str(own_release), *more]) for more in ([], ["--all"]))
-    assert "  … and 2 more (--all lists all)" in short.stdout
-    assert whole.stdout.count("label-unreadable: ") == 10
-    assert "lists all)" not in whole.stdout
+    short, whole = (called("validate", own_release, *more, status=1).stdout for more in ((), ("--all",)))
+    assert ("  … and 2 more (--all lists all)" in short, "lists all)" in whole) == (True, False)
+    assert whole.count("label-unreadable: ") == 10
 
 
 def write_velocities(root: Path, angle: Callable[[float, float], float]) -> dict[str, np.ndarray]:
@@ -280,9 +277,7 @@ def test_at_the_impact_another_car_may_fill_the_view(
 
 def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
     def run(*words: str, status: int) -> str:
-        result = CliRunner().invoke(deepaccident, ["validate", str(own_release), *words], catch_exceptions=False)
-        assert result.exit_code == status
-        return result.stdout
+        return called("validate", own_release, *words, status=status).stdout
 
     content = json.loads(run("--json", status=0))
     assert content["counts"] == {"error": 0, "warning": 0, "note": 0}

@@ -22,12 +22,6 @@ def test_turns_are_driven_along_the_path_to_its_end(turning):
         assert abs(left[-1]) < 0.1
 
 
-def test_velocities_are_the_poses_slopes(turning):
-    _, run = turning
-    slope = (run.poses[2:, :, :2] - run.poses[:-2, :, :2]) / (2 * PERIOD)
-    np.testing.assert_allclose(run.velocities[1:-1], slope, atol=0.08)
-
-
 def test_the_wheels_are_turned_no_farther_nor_faster_than_they_can_be(turning):
     _, run = turning
     steer = run.states[..., 4]
