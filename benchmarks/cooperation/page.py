@@ -18,6 +18,7 @@ NAMES = {name: said for name, (_, _, said) in PATHS.items()}
 PERCENT = ("iou_30", "vpq_30", "iou_100", "vpq_100", "map")
 MAIN = ("iou_30", "vpq_30", "iou_100", "vpq_100", "map", "apa", "precision", "recall")
 SHORT = ("iou_100", "vpq_100", "map", "apa", "hidden_foreground", "false_foreground")
+COMPARED = ("iou_100", "hidden_foreground", "false_foreground")
 FOUND = ("hidden_foreground", "seen_foreground", "false_foreground", "hidden_detected", "seen_detected", "false_boxes")
 TRAINED = ("single", "all", "all, alone", "all, blanked", "all, strangers")
 """Rows of all models' seeds; the other models' rows are of the first seed alone."""
@@ -114,20 +115,16 @@ def rows_table(rows: Mapping[str, Numbers], names: Sequence[str]) -> str:
 
 INTRO = """# The model, and whether cooperation helps it
 
-For everybody who wants to train V2XFormer, or to know what partners are worth to a small model. READING_TIME.
+For everybody who wants to know what partners are worth to a small camera model: what was measured, and how to repeat
+it. READING_TIME.
 
-V2XFormer is the model that was published with DeepAccident. It lifts the images of six cameras to a map seen from
-above, joins an agent's own past with its present, joins the maps of up to five agents, and predicts motion and boxes.
-`deepaccident_devkit.model` has it in plain PyTorch (`pip install '.[torch]'`) in two sizes: `released`, with the
-release's names of weights and its choices, and `tiny`, which a laptop trains.
-
-    deepaccident train DATAROOT --preset tiny --agents all --out runs/all
-    deepaccident predict runs/all DATAROOT --split val --agents all --out results
-    deepaccident evaluate motion DATAROOT --results results/motion --protocol paper --switch labels=clean
+V2XFormer, the model that was published with DeepAccident, lifts the images of six cameras to a map seen from above,
+joins an agent's own past with its present, joins the maps of up to five agents, and predicts motion and boxes.
+[Training](training.md#the-papers-model) says how to train it; here it is the preset `tiny`.
 
 `tiny` has cells of 1 m and learns the labels `clean`. So all numbers here are **clean, 1 m**: limits that the metrics
 count in cells are twice as long in metres as the released ones, and the labels are others. They never stand beside
-numbers of the released protocol, nor beside the paper's ([which numbers compare](numbers.md)).
+numbers of the released protocol, nor beside the paper's ([which numbers compare](comparable_numbers.md)).
 
 ## Does cooperation help?
 
@@ -135,19 +132,18 @@ Fixed before the first test run:
 """
 MEASURED = """
 - Three synthetic releases with images alone: training (seed {training[seed]}, {training[scenarios]} scenarios), tuning
-  (seed {tuning[seed]}, {tuning[scenarios]}) and test (seed {test[seed]}, {test[scenarios]}). Half of each are normal
-  twins. A house hides those who will collide from each other. The test also has the design {held}, which no model saw
-  before.
+  (seed {tuning[seed]}, {tuning[scenarios]}) and test (seed {test[seed]}, {test[scenarios]}), half of them normal twins.
+  A house hides those who will collide from each other. The test also has the design {held}, which no model saw before.
 - For each model seed ({seeds}) a model is trained alone for {first_steps:,} steps. From its weights two arms go on for
-  {arm_steps:,} steps: `single` alone, and `all` with all agents, some of whom drop out at random. The arms are equal in
-  all else. The last weights are tested; nothing is chosen among them.
+  {arm_steps:,} steps: `single` alone, and `all` with all agents, some of whom drop out at random. The last weights are
+  tested; nothing is chosen among them.
 - The test has {samples} samples of `ego_vehicle`, within the last two seconds of {pairs} pairs of an accident and its
   twin; in {positives} of them an accident comes. In brackets are intervals of 95 % over these pairs
-  ([how](numbers.md)); there is none where too few of them change a number. The model seeds are pooled: the intervals
-  say how a number varies from scene to scene, not from training to training.
+  ([how](statistics.md)), none where too few of them change a number. The model seeds are pooled: the intervals say how
+  a number varies from scene to scene, not from training to training.
 - Actors within 50 m that only a partner sees, by the released rule of visibility ({hidden}, beside {seen} that the ego
   sees), are counted apart. One is on the map if the cell of its centre is foreground at the present, and detected if a
-  box is within 2 m. The false share beside it is of the foreground cells, so that covering everything does not win.
+  box is within 2 m. The false share is of the foreground cells.
 """
 REPEAT = """
 ## How to repeat it
@@ -170,11 +166,8 @@ One set of weights serves all configurations of agents and links:
     deepaccident predict runs/all DATAROOT --latency 0.5 --out results_late
 """
 OTHERS = """
-Other ways to join agents, and other horizons, were not trained. Each is a command that goes on from a model that was
-trained alone:
-
-    deepaccident train DATAROOT --from runs/single --fusion cobevt --out runs/cobevt
-    deepaccident train DATAROOT --from runs/single --horizon 4 --out runs/far
+Other ways to join agents (`train --from runs/single --fusion cobevt`) and other horizons (`--horizon 4`) were not
+trained.
 """
 
 
@@ -205,7 +198,6 @@ def _tables(summary: Summary) -> list[str]:
     rows = summary["rows"]
     every = {name: rows[name]["numbers"] for name in (*TRAINED, *UNTRAINED)}
     says = [f"- `{name}`: {rows[name]['says']}." for name in every]
-    seeds = {f"{name}, seed {seed}": each for name in TRAINED for seed, each in rows[name]["seeds"].items()}
     return [
         "## All numbers",
         "",
@@ -227,10 +219,6 @@ def _tables(summary: Summary) -> list[str]:
         "By design, those of the training and the one that was held out:",
         "",
         _designs(summary),
-        "",
-        "Seed by seed:",
-        "",
-        rows_table(seeds, SHORT),
     ]
 
 
@@ -240,7 +228,7 @@ def _compared(summary: Summary) -> str:
         [f"`{each['second']}` less `{each['first']}`", NAMES[name], _difference(numbers, name), verdict(numbers)]
         for each in summary["differences"]
         for name, numbers in sorted(each["numbers"].items(), key=lambda item: item[0] != summary["headline_number"])
-        if name in SHORT
+        if name in COMPARED
     ]
     return table(["difference", "number", "value", "verdict"], lines)
 
@@ -250,40 +238,30 @@ def _designs(summary: Summary) -> str:
     columns = [(name, group) for name in (summary["headline_number"], "hidden_foreground") for group in GROUPS]
     lines = [
         [f"`{row}`", *(_sure(summary["rows"][row]["designs"][group][name], name) for name, group in columns)]
-        for row in (*TRAINED, *UNTRAINED)
+        for row in TRAINED
     ]
     return table(["row", *(f"{NAMES[name]}, {group}" for name, group in columns)], lines)
 
 
 def _how(summary: Summary) -> list[str]:
     machine, tuning, seconds = summary["machine"], summary["tuning"], summary["seconds"]
-    lines = [
-        [str(number), rate, *(f"{scores[name]:.3f}" for name in ("iou", "vpq", "map", "score", "loss"))]
-        for number, each in enumerate(tuning["rounds"], start=1)
-        for rate, scores in each.items()
-    ]
     gpu = f"The models ran on {machine['gpu']}." if machine["gpu"] else "No GPU was used: nothing was measured on one."
     took = (
         f"It took {sum(seconds.values()) / 3600:.1f} hours on {machine['processor']} ({machine['cores']} cores, "
         f"{machine['processes']} processes at a time, Python {machine['python']}, torch {machine['torch']}, devkit "
-        f"{machine['devkit']}). {gpu} Seconds of the stages: "
-        f"{', '.join(f'{name} {each:,.0f}' for name, each in seconds.items())}."
+        f"{machine['devkit']}). {gpu}"
     )
-    seed = summary["protocol"]["seeds"][0]
+    rates = [f"{float(rate):g}" for each in tuning["rounds"] for rate in each]
     trials = (
-        f"The run of the chosen rate is also the first part of seed {seed}. Before all this was fixed, shorter trials "
-        "on parts of the training release, without a tuning or test scene, led to what `tiny` has beside the release: "
-        "only points near the road count, a cell has their mean, and foreground weighs more. They were too few and too "
-        "short to say what each is worth."
+        f"On the tuning release the learning rates {' and '.join(rates)} were tried, and "
+        f"{tuning['learning_rate']:g} was chosen. Before all this was fixed, shorter trials on parts of the training "
+        "release led to what `tiny` has beside the release: only points near the road count, a cell has their mean, "
+        "and foreground weighs more."
     )
     prints = ", ".join(f"{name} `{each['fingerprint']}`" for name, each in summary["releases"].items())
     return [
         REPEAT,
         fill(took, 120),
-        "",
-        f"All that was tried on the tuning release; the learning rate {tuning['learning_rate']:g} was chosen:",
-        "",
-        table(["round", "learning rate", "IoU", "VPQ", "mAP", "score", "loss"], lines),
         "",
         fill(trials, 120),
         "",
@@ -309,20 +287,16 @@ def _weights(summary: Summary) -> list[str]:
 
 
 def _paper(summary: Summary) -> list[str]:
-    rows, steps = summary["rows"], summary["protocol"]["arm_steps"]
+    rows = summary["rows"]
     seed = str(summary["protocol"]["seeds"][0])
     once = {name: rows[name]["seeds"][seed] for name in rows if name not in UNTRAINED}
     shown = {name: each for name, each in once.items() if name not in TRAINED or name in ("all", "all, alone")}
-    lines = [[f"`{name}`", f"{each:.2f}", f"{each * steps / 60:.0f}"] for name, each in summary["costs"].items()]
     return [
         PAPER,
         f"Those that were run, with the weights `all` of seed {seed}:",
         "",
         rows_table(shown, SHORT),
-        OTHERS,
-        f"What a step of `tiny` costs, and an arm of {steps:,} steps would:",
-        "",
-        table(["fusion or horizon", "seconds a step", "minutes"], lines),
+        OTHERS.rstrip(),
     ]
 
 
