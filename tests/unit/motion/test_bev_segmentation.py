@@ -104,23 +104,23 @@ def test_of_a_sample_the_ground_is_augmented_too(da: DeepAccident) -> None:
     assert (mine.mask("road") != bev_segmentation(da, sample).mask("road")).any()
 
 
-def test_oblong_cells_count_their_own_pixels() -> None:
-    """Cells of 5 × 4 pixels, each looked at by itself; where half of a cell is enough, 10 of 20 are."""
+@pytest.mark.parametrize("augmentation", [None, Augmentation(rotation=0.3, scale=1.1, flip=True)])
+def test_cells_count_the_pixels_at_their_points(augmentation: Augmentation | None) -> None:
+    """Cells of 5 × 4 points, each looked at by itself; where half of a cell is enough, 10 of 20 are."""
     tags = {"road": 7, "lane_line": 6, "sidewalk": 8, "vehicle": 10, "pedestrian": 4}
     assert (dict(COVERAGE), BEV_CLASSES) == ({name: 0.5 * (name[0] in "rsv") for name in tags}, tuple(tags))
-    generator, image = np.random.default_rng(3), _image()
+    generator, image, halves = np.random.default_rng(3), _image(), 0
     semantic = generator.choice([0, *tags.values()], BEV_SHAPE, p=[0.02, 0.48, 0.04, 0.42, 0.02, 0.02]).astype(np.uint8)
-    targets = segmentation_of(BevImage(semantic, image.instance), BevGrid((-3, 3, 0.5), (-2, 2, 0.4)))
-    halves = 0
+    grid = BevGrid((-3, 3, 0.5), (-2, 2, 0.4))
+    targets = segmentation_of(BevImage(semantic, image.instance), grid, augmentation=augmentation)
+    back = np.linalg.inv(np.eye(4) if augmentation is None else augmentation.matrix)
     for row, column in np.ndindex(10, 12):  # y to the left by rows, x ahead by columns
-        first_row, first_column = (
-            600 - round((-3 + 0.5 * (column + 1)) / 0.1),
-            600 - round((-2 + 0.4 * (row + 1)) / 0.1),
-        )
-        cell = semantic[first_row : first_row + 5, first_column : first_column + 4]
-        counts = {name: np.count_nonzero(cell == tag) for name, tag in tags.items()}
-        halves += counts["road"] == 10
+        counts = dict.fromkeys((0, *tags.values()), 0)
+        for along, across in np.ndindex(5, 4):
+            x, y, *_ = back @ (-3 + column / 2 + 0.1 * (along + 0.5), -2 + row / 2.5 + 0.1 * (across + 0.5), 0, 1)
+            counts[semantic.item(round(599.5 - x / 0.1), round(599.5 - y / 0.1))] += 1
+        halves += counts[7] == 10
         assert targets.masks[:, row, column].tolist() == [
-            counts[name] >= (10 if COVERAGE[name] else 1) for name in BEV_CLASSES
+            counts[tag] >= (10 if COVERAGE[name] else 1) for name, tag in tags.items()
         ]
     assert halves > 3

@@ -265,6 +265,62 @@ def test_long_boxes_beside_each_other_face_with_their_sides(tmp_path: Path) -> N
     assert found.closing_speed == pytest.approx(0, abs=1e-6)
 
 
+def outline(x: float, y: float, yaw: float, length: float, width: float) -> list[np.ndarray]:
+    ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    return [(x, y) + ahead * length / 2 * a + left * width / 2 * b for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+
+
+def nearest_line(corners: list[np.ndarray], others: list[np.ndarray]) -> np.ndarray:
+    """The shortest way from one of the corners to a side of the other outline."""
+    ways = []
+    for corner in corners:
+        for start, end in zip(others, others[1:] + others[:1], strict=True):
+            share = np.clip((corner - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+            ways.append(start + share * (end - start) - corner)
+    return min(ways, key=np.linalg.norm)
+
+
+@pytest.mark.usefixtures("origin")
+def test_pairs_in_any_pose_by_plain_steps(tmp_path: Path) -> None:
+    """They face each other along the side's normal with the widest gap, and close along it where they overlap."""
+    source, told = np.random.default_rng(4), {}
+    for number in range(8):
+        name = tiny.NAME.replace("00024", f"{number:05d}")
+        places, sizes = source.uniform((18, -4, -np.pi), (26, 4, np.pi), (2, 3)), source.uniform((3, 1), (9, 3), (2, 2))
+        steps = source.uniform(-0.8, 0.8, (2, 2))
+
+        def lines(frame: int, places=places, sizes=sizes, steps=steps) -> list[str]:
+            moved = (places[:, :2] + (frame - 3) * steps) * (1, -1)
+            return [
+                f"car {x} {y} 0 {length} {width} 1.5 {-yaw} 0 0 {actor} 9 True"
+                for (x, y), (length, width), yaw, actor in zip(moved, sizes, places[:, 2], (1223, 1212), strict=True)
+            ]
+
+        accident(tmp_path, lines, name=name, agents=("ego_vehicle",))
+        told[name] = ([outline(*at, *size) for at, size in zip(places, sizes, strict=True)], places[:, 2], steps)
+    da, overlaps = DeepAccident(dataroot=tmp_path, verbose=False), 0
+    for name, ((first, second), yaws, steps) in told.items():
+        found = da.collision(f"{tiny.TYPE}/{name}")
+        gaps = {}
+        for yaw in (*yaws, *(yaws + np.pi / 2)):
+            for normal in (np.array([np.cos(yaw), np.sin(yaw)]), -np.array([np.cos(yaw), np.sin(yaw)])):
+                gaps[tuple(normal)] = min(each @ normal for each in second) - max(each @ normal for each in first)
+        facing = np.array(max(gaps, key=gaps.get))
+        sides = []
+        for yaw, way in zip(yaws, (facing, -facing), strict=True):
+            turn = (np.arctan2(way[1], way[0]) - yaw + np.pi / 4) % (2 * np.pi) // (np.pi / 2)
+            sides.append(("front", "left", "rear", "right")[int(turn)])
+        there, back = nearest_line(first, second), -nearest_line(second, first)
+        apart = min(there, back, key=np.linalg.norm) if max(gaps.values()) > 0 else np.zeros(2)
+        overlaps += not apart.any()
+        normal = apart / np.linalg.norm(apart) if np.linalg.norm(apart) > 0.02 else facing
+        speeds = np.linalg.norm(10 * steps, axis=1)
+        assert (found.sides, found.gap) == (tuple(sides), pytest.approx(np.linalg.norm(apart), abs=1e-6))
+        assert_allclose([*found.speeds, found.closing_speed], [*speeds, 10 * (steps[0] - steps[1]) @ normal], atol=1e-4)
+        assert found.impact_angle == pytest.approx(abs((yaws[0] - yaws[1] + np.pi) % (2 * np.pi) - np.pi))
+    assert 1 < overlaps < 7
+
+
 @pytest.mark.usefixtures("origin")
 @pytest.mark.parametrize(("gap", "closing"), [(0.03, 10 / np.sqrt(2)), (0.01, 0)])
 def test_corners_close_along_the_shortest_line_and_where_they_touch_along_a_sides_normal(

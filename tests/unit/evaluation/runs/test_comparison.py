@@ -199,11 +199,51 @@ class TestForms:
         assert "p: share of all 1 swaps of clusters between a and b" in text
         assert "tested at 5%: iou 30x30; and the other headlines together" in text
 
-    def test_text_of_a_decision(self, generated: Callable[..., Comparison]) -> None:
-        text = generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]).to_text()
-        (line,) = (line.split() for line in text.splitlines() if line.startswith("iou 30x30"))
-        assert (line[3:6], line[-5:]) == (["37.500", "41.438", "+3.938"], ["+4.393]", "0.001", "b", "is", "better"])
-        assert "p: share of 1,000 random swaps" in text
+    def test_all_of_a_small_one(self, generated: Callable[..., Comparison]) -> None:
+        """Of seven clusters all 64 swaps are tried: none of the others differs as much."""
+        made = generated(HARD[:7], [each + 9 + number % 2 for number, each in enumerate(HARD[:7])], twins=True)
+        chance = "between equally good runs about 0.2 would, by chance"
+        notes = [
+            "p: share of all 64 swaps of clusters between a and b after which they differ at least as much",
+            "tested at 5%: iou 30x30; and the other headlines together, whose p is adjusted by Holm's rule",
+            "scenarios that would decide: with a chance of 80 %, if the true difference is the observed one",
+            f"for exploration: 0 of 4 other numbers have a p of at most 5%; {chance}",
+        ]
+        assert made.to_text().splitlines() == [
+            "motion, protocol released: 14 samples of 14 scenarios",
+            "clusters: 7 (an accident and its twin are one)",
+            f"a: {made.a}",
+            f"b: {made.b}",
+            "",
+            "number                a       b   b − a      95% interval      p             decision",
+            "iou 30x30 (%)    15.000  24.429  +9.429  [+8.934, +9.923]  0.016          b is better",
+            "iou 100x100 (%)  15.000  24.429  +9.429  [+8.934, +9.923]  0.047          b is better",
+            "vpq 30x30 (%)     0.000   0.000  +0.000                 –  1.000  the difference is 0",
+            "vpq 100x100 (%)   0.000   0.000  +0.000                 –  1.000  the difference is 0",
+            "min_ade (m)           –       –       –                 –      –   nothing to compare",
+            "min_fde (m)           –       –       –                 –      –   nothing to compare",
+            "miss_rate             –       –       –                 –      –   nothing to compare",
+            "",
+            *notes,
+        ]
+        whole = made.to_dict()
+        numbers = whole.pop("numbers")
+        assert whole == {
+            "a": str(made.a),
+            "b": str(made.b),
+            "task": "motion",
+            "protocol": "released",
+            "samples": 14,
+            "scenarios": 14,
+            "clusters": 7,
+            "left_out": 0,
+            "partial": [],
+            "swaps": 64,
+            "all_swaps": True,
+            "resampling": {"resamples": 1000, "confidence": 0.95, "seed": 0},
+            "notes": notes,
+        }
+        assert (len(numbers), numbers[1]["p"], numbers[1]["adjusted_p"]) == (12, 1 / 64, 3 / 64)
 
     def test_json_and_csv_have_every_number(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
         comparison = compare_bundles(*motion_bundles, FEW)

@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +16,6 @@ from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
-    Partial,
     SampleSelection,
     bundles,
     evaluate_results,
@@ -29,7 +27,6 @@ from deepaccident_devkit.evaluation.runs import (
 from deepaccident_devkit.evaluation.runs.bundles import chosen_threshold
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.runs.text import (
-    notes_of,
     number_text,
     predictor_tables,
     predictors_text,
@@ -60,25 +57,6 @@ def test_what_it_tells(run: EvaluationRun) -> None:
     assert "ego_vehicle 2 2 1.000 1.000 1.000 0.000 1.000" in lines
 
 
-def test_intervals_and_why_there_is_none(run: EvaluationRun) -> None:
-    summary = run.broken_down(["all"], Resampling(confidence=0.9)).summary()
-    [group] = summary["breakdowns"]["all"]["groups"]
-    group.update(intervals={"apa": [0.651, 1.0]}, notes=["no interval of id_error: fewer than 6 clusters have it"])
-    lines = lines_of(summary_text(summary, []))
-    assert "number value 90% interval" in lines
-    assert "apa 1.000 [0.651, 1.000]" in lines
-    assert "id_error 0.000 –" in lines
-    assert group["notes"][0] in lines
-
-
-def test_switches_and_no_intervals(run: EvaluationRun) -> None:
-    lines = lines_of(
-        summary_text(replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5})).summary())
-    )
-    assert "task accident, protocol boxes with reading.danger_distance=0.5" in lines
-    assert "number value" in lines
-
-
 def test_the_bundle_on_disk_reads_alike(run: EvaluationRun, tmp_path: Path) -> None:
     broken = run.broken_down(["all", "agent"], Resampling(resamples=10))
     assert summary_text(read_bundle(save_run(broken, tmp_path / "bundle")).summary) == summary_text(broken.summary())
@@ -92,13 +70,6 @@ def test_results_of_other_choices_stand_beside(
     text = summary_text(run.summary())
     assert "number value if sample_choice=mean_first" in lines_of(text)
     assert "6 of 6 predictions were given as instance maps" in text
-
-
-def test_every_block_of_a_partial_one_says_so(run: EvaluationRun) -> None:
-    partial = replace(run, partial=Partial(missing=2, extra=0, expected=8, evaluated=6))
-    text = summary_text(partial.broken_down(["all", "agent"], Resampling(resamples=0)).summary(), ["agent"])
-    titles = [block.splitlines()[0] for block in text.split("\n\n")]
-    assert titles == [f"{name}   PARTIAL: 6 of 8 samples" for name in ("evaluated", "results", "counts", "by agent")]
 
 
 def test_what_a_results_file_holds(
@@ -115,11 +86,6 @@ def test_what_a_results_file_holds(
     assert lines_of(results_text(motion))[-1].startswith(
         "form instances, up to 1 predictions of 5 frames, 0.5 s apart, cells x (-50.0, 50.0, 0.5), y (-50.0, 50.0, 0.5)"
     )
-
-
-def test_notes_of_results_that_stand_beside_say_of_which() -> None:
-    metrics = {"notes": ["both"], "beside": {"paper": {"notes": ["both", "its own"]}}}
-    assert list(notes_of(metrics)) == ["both", "if paper: its own"]
 
 
 SUMMARY: dict[str, Any] = {
@@ -174,19 +140,65 @@ def test_lines_are_aligned() -> None:
     )
 
 
-def test_breakdowns_show_five_headlines_and_what_is_unknown() -> None:
-    groups = [
-        {"value": value, "samples": 2, "scenarios": 1, "headlines": {"at/a": 0.25, "at/e": None, "at/f": 0.5}}
-        for value in ("near", None)
+def test_all_that_a_summary_may_have() -> None:
+    """Switches, agents, intervals, numbers of other choices, breakdowns of five headlines, notes; all of it partial."""
+    intervals = {"at/a": [0.25, 0.75], "at/b": [None, 1.0], "at/c": None}
+    agents, why = ["ego_vehicle", "infrastructure"], "and the first of all must be the present: leave out past frames"
+    everyone = {"value": None, "intervals": intervals, "notes": ["no interval of b: few clusters"]}
+    by_agent = [
+        {"value": value, "samples": 3, "scenarios": scenarios, "headlines": {"at/a": 0.25, "at/e": None, "at/f": 0.5}}
+        for value, scenarios in (("near", 1), (None, 2))
     ]
-    lines = summary_text({**SUMMARY, "breakdowns": {"agent": {"groups": groups}}}, ["agent", "weather"]).split("\n\n")[
-        -1
-    ]
-    assert lines_of(lines) == [
-        "by agent",
-        "value samples scenarios a b c d e",
-        "near 2 1 0.250 – – – –",
-        "unknown 2 1 0.250 – – – –",
+    summary = {
+        **SUMMARY,
+        "protocol": "released",
+        "partial": {"mark": "PARTIAL: 6 of 8 samples"},
+        "switches": {"x": 0.5, "y": "z"},
+        "agents": agents,
+        "horizon": 1.5,
+        "results": {"path": "/p", "fingerprint": "g", "form": FORM | {"predictions": 5, "frames": 6}},
+        "counts": {"samples": 6, "scenarios": 2, "left_out": 0},
+        "metrics": SUMMARY["metrics"]
+        | {"notes": ["so", "so"], "beside": {"paper": {"at": {"a": 0.125, "b": None}, "notes": ["so", "other"]}}},
+        "breakdowns": {
+            "all": {"groups": [everyone], "resampling": {"confidence": 0.9}},
+            "agent": {"groups": by_agent},
+            "town": {"groups": by_agent},
+        },
+    }
+    assert summary_text(summary, ["agent", "weather"]).splitlines() == [
+        "evaluated   PARTIAL: 6 of 8 samples",
+        "  task         accident, protocol released with x=0.5, y='z'",
+        f"  samples      6 of 2 scenarios: split val, list evaluate, scope all, {', '.join(agents)}, horizon 1.5 s",
+        "  predictions  /p (g)",
+        "  release      /r (v1, f)",
+        "  devkit       1",
+        "",
+        "results   PARTIAL: 6 of 8 samples",
+        "  number  value    90% interval  if paper",
+        "  a           1  [0.250, 0.750]     0.125",
+        "  b           2               –         –",
+        "  c           3               –         –",
+        "  d           4               –         –",
+        "  e           5               –         –",
+        "  f           6               –         –",
+        "  no interval of b: few clusters",
+        "",
+        "counts   PARTIAL: 6 of 8 samples",
+        "  n 1",
+        "  at      pairs 3+4",
+        "  longer  k 5",
+        "",
+        "by agent   PARTIAL: 6 of 8 samples",
+        "  value    samples  scenarios      a  b  c  d  e",
+        "  near           3          1  0.250  –  –  –  –",
+        "  unknown        3          2  0.250  –  –  –  –",
+        "",
+        "notes   PARTIAL: 6 of 8 samples",
+        "  so",
+        "  if paper: other",
+        f"  predictions have 6 frames; the first 4 are evaluated, {why}",
+        "  predictions of a sample: 5; published numbers are of 6, five samples and then their mean",
     ]
 
 
