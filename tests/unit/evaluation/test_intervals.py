@@ -230,25 +230,42 @@ def test_the_numbers_of_a_result() -> None:
     )
 
 
+PERCENTS = (
+    "ranges/30x30/iou",
+    "ranges/30x30/pq",
+    "ranges/30x30/sq",
+    "ranges/30x30/rq",
+    "iou/road",
+    "mean_iou",
+    "mean_average_precision",
+    "class_average_precision/car",
+)
+SHARES = (
+    *("apa", "average_precision", "false_alarm_rate", "id_error", "precision", "recall", "within/5/accuracy"),
+    *("beside/sample_choice=mean_first/within/5/accuracy", "mean_errors/ASE", "miss_rate", "path_accuracy"),
+    *(
+        "groups/all/auc_ahead",
+        "groups/all/twin_wins",
+        "groups/all/area_under_curve",
+        "groups/all/operating/early_share",
+    ),
+    *("groups/all/operating/time_in_alarm", "figures/drive all/recall_at_half", "precision_at_half", "precision_at_5"),
+    *("shares/a", "warned", "extrapolated"),
+)
+AMOUNTS = (
+    *("min_ade", "min_fde", "position_error", "time_error", "mean_errors/ATE", "mean_errors/AOE", "mean_errors/AVE"),
+    *("groups/all/mean_time", "operating/tta_hit", "operating/tta0", "groups/all/tta0_after/2", "time_at_r80"),
+    *("time_at_half", "episodes_per_minute", "alarm_seconds_per_minute", "braking_seconds_per_minute"),
+)
+
+
 @pytest.mark.parametrize(
     ("path", "expected"),
     [
-        ("ranges/30x30/iou", (0, 100)),
-        ("ranges/30x30/sq", (0, 100)),
-        ("iou/road", (0, 100)),
-        ("class_average_precision/car", (0, 100)),
-        ("within/5/accuracy", (0, 1)),
-        ("beside/sample_choice=mean_first/within/5/accuracy", (0, 1)),
-        ("mean_errors/ASE", (0, 1)),
-        ("mean_errors/ATE", (0, math.inf)),
-        ("episodes_per_minute", (0, math.inf)),
-        ("lateness", (-math.inf, math.inf)),
-        ("beside/time/lateness", (-math.inf, math.inf)),
-        ("groups/all/tta0_after/2", (0, math.inf)),
-        ("precision_at_5", (0, 1)),
-        ("groups/all/operating/alarm_seconds_per_minute", (0, math.inf)),
-        ("area_under_curve", (0, 1)),
-        ("mean_time", (0, math.inf)),
+        *((path, (0, 100)) for path in PERCENTS),
+        *((path, (0, 1)) for path in SHARES),
+        *((path, (0, math.inf)) for path in AMOUNTS),
+        *((path, (-math.inf, math.inf)) for path in ("lateness", "beside/time/lateness", "theirs")),
     ],
 )
 def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, float]) -> None:

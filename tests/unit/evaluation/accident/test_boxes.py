@@ -110,6 +110,7 @@ THREE = [alarm(1, time=1.5, score=0.6), alarm(40, score=0.9), alarm(2, time=2.5,
 def test_what_alarms_score(alarms, truth, expected) -> None:
     made = result(alarms, truth)
     assert {name: getattr(made, name) for name in expected} == pytest.approx(expected, nan_ok=True)
+    assert [math.isnan(each.accuracy) for each in made.within.values()] == [math.isnan(made.apa)] * 3
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,8 @@ ASIDE = {3: standing(20, 30)}
 NEXT_TO_IT = HIT | {3: standing(15.5, 13)}
 LATE_SWAP = {1: standing(20, 10), 2: follower(20, 20, 20, 0.5), 3: follower(1.5, 1.5, 1.5, 20)}
 
+PASSED = {1: standing(20, 10), 2: follower(20, 20, 20, 0.5, 20), 3: [(15, 10), *[(15, -20)] * 4]}
+
 
 def moved(cars, x: float = 0.0, y: float = 0.0):
     return {actor: [at and (at[0] + x, at[1] + y) for at in path] for actor, path in cars.items()}
@@ -230,12 +232,13 @@ def test_whom_the_truth_names() -> None:
     cases = [
         *((HIT | ASIDE, context) for context in (known(pair=(2, 1)), known(pair=(1, 3)), known(), UNKNOWN)),
         (CALM, known(pair=(2, 1))),
+        (PASSED, known(pair=(2, 1))),  # a third car was where one of the two is in the end
     ]
     counts = [PAPER.counts(as_maps(scene(cars)), scene(cars), context) for cars, context in cases]
-    assert [each["named"] for each in counts] == ["meta", "another", "another", "unknown", "none"]
+    assert [each["named"] for each in counts] == ["meta", "another", "another", "unknown", "none", "meta"]
     made = PAPER.result(counts)
-    assert made.truths == {"meta": 1, "another": 2, "none": 1, "unknown": 1}
-    assert (made.samples, made.positives, made.negatives) == (5, 4, 1)
+    assert made.truths == {"meta": 2, "another": 2, "none": 1, "unknown": 1}
+    assert (made.samples, made.positives, made.negatives) == (6, 5, 1)
 
 
 @pytest.mark.parametrize(("own", "named", "error"), [(77, "meta", 0), (76, "another", 1), (None, "unknown", None)])
