@@ -44,6 +44,12 @@ UNUSED = [
     ("render bev release --out a.png --pose-noise 0.3", "--pose-noise changes nothing without --agents"),
     ("render bev release --out a.png --agents all --seed 3", "--seed changes nothing without --pose-noise"),
     ("export mcap release --out a.mcap --channels Camera_Front --points 3", "--points changes nothing without the cha"),
+    (
+        EVALUATE.format("motion") + " --protocol clean",
+        "'clean' is a protocol of labels; choose the labels by the switch labels='clean' (--switch labels=clean)",
+    ),
+    (EVALUATE.format("accident") + " --protocol fiery", "'fiery' is a protocol of labels"),
+    ("labels release --split train --out out --preset clean", "'clean' is a protocol of labels: give protocol='clean'"),
     ("validate release --json --all", "--all changes nothing with --json"),
     ("split release --seed 3 --out mine.txt", "--seed changes nothing with --where or a split file"),
     ("split release --overwrite", "--overwrite changes nothing without --out"),

@@ -28,10 +28,9 @@ def test_they_are_small_halves_with_their_provenance() -> None:
     assert weights.path.stat().st_size < 1.3e6
     assert {each.dtype for each in weights.tensors.values()} == {torch.float16}
     made = weights.meta["made"]
-    assert made["command"].startswith("python docs/model_study.py")
     assert made["seed"] == made["protocol"]["seeds"][0]
     assert len(made["release"]) > 10
-    summary = Path(__file__).parents[3] / "docs" / "model_study.json"
+    summary = Path(__file__).parents[3] / "benchmarks" / "cooperation" / "study.json"
     assert json.loads(summary.read_text())["weights"]["scores"] == weights.meta["scored"]["scores"]
 
 
@@ -62,6 +61,10 @@ def test_predict_takes_them_by_their_name(release_root: Path, tmp_path: Path) ->
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert (tmp_path / "results" / "accident.json").is_file()
+    told = read_weights("tiny").meta["scored"]["scores"]
+    line = result.output.splitlines()[-1]
+    assert line.startswith("motion, labels clean: IoU ")
+    assert f"here; IoU {told['iou']:.1%}, VPQ {told['vpq']:.1%} on 2 synthetic scenarios" in line
 
 
 def test_the_demo_shows_their_prediction(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

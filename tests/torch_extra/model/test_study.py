@@ -1,4 +1,4 @@
-"""The experiment on cooperation (docs/model_study.py) and its page: what it counts, and a tiny run of all of it."""
+"""The experiment on cooperation (benchmarks/cooperation) and its page: what it counts, and a tiny run of all of it."""
 
 import importlib
 import json
@@ -18,34 +18,32 @@ from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperating_agents, visible_instances
 from deepaccident_devkit.v2x.cooperation import seen_actors
 
-DOCS = Path(__file__).parents[3] / "docs"
-NAMES = ("model_study_numbers", "model_study_rows", "model_study_protocol", "model_study", "make_model_page")
+TOP = Path(__file__).parents[3]
+NAMES = ("numbers", "rows", "protocol", "study", "page")
 LABELS = tiny().labels
 
 
 @pytest.fixture(scope="module")
 def scripts() -> Iterator[dict[str, ModuleType]]:
-    """The experiment's scripts by name; they import each other, and so do processes that they start."""
-    sys.path.insert(0, str(DOCS))
-    yield {name: importlib.import_module(name) for name in NAMES}
-    sys.path.remove(str(DOCS))
-    for name in NAMES:
-        del sys.modules[name]
+    """The experiment's modules by name; processes that they start import them, too."""
+    sys.path.append(str(TOP))
+    yield {name: importlib.import_module(f"benchmarks.cooperation.{name}") for name in NAMES}
+    sys.path.remove(str(TOP))
 
 
 @pytest.fixture
 def numbers(scripts: dict[str, ModuleType]) -> ModuleType:
-    return scripts["model_study_numbers"]
+    return scripts["numbers"]
 
 
 @pytest.fixture
 def rows(scripts: dict[str, ModuleType]) -> ModuleType:
-    return scripts["model_study_rows"]
+    return scripts["rows"]
 
 
 @pytest.fixture
 def page(scripts: dict[str, ModuleType]) -> ModuleType:
-    return scripts["make_model_page"]
+    return scripts["page"]
 
 
 @pytest.fixture
@@ -128,8 +126,8 @@ def test_the_headline_follows_from_the_interval(
 def test_what_is_committed_agrees(page: ModuleType, summary: dict[str, Any], scripts: dict[str, ModuleType]) -> None:
     """The page, the summary and the counts."""
     assert page.PAGE.read_text(encoding="utf-8") == page.page(summary)
-    study = scripts["model_study"]
-    again = study.summarised(scripts["model_study_rows"].read_counts(DOCS / study.COUNTS), study.PROTOCOL)
+    study = scripts["study"]
+    again = study.summarised(scripts["rows"].read_counts(study.HERE / study.COUNTS), study.PROTOCOL)
     same_numbers(again["rows"], summary["rows"])
 
 
@@ -147,7 +145,7 @@ def test_a_tiny_run_of_all_of_it(
     scripts: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    study, rows = scripts["model_study"], scripts["model_study_rows"]
+    study, rows = scripts["study"], scripts["rows"]
     run = study.Study(folder=tmp_path / "run", protocol=study.SMOKE)
     study.run(run)
     summary = json.loads((run.folder / study.SUMMARY).read_text())
@@ -158,7 +156,7 @@ def test_a_tiny_run_of_all_of_it(
     assert found["labels, all"]["hidden_foreground"]["value"] == found["labels, all"]["hidden_detected"]["value"] == 1
     assert found["labels, all"]["iou_100"]["value"] > 90 > found["everything"]["iou_100"]["value"] > 0
     assert found["nothing"]["false_foreground"]["value"] is None
-    assert scripts["make_model_page"].page(summary).count("`all, strangers`") > 3
+    assert scripts["page"].page(summary).count("`all, strangers`") > 3
     same_numbers(study.summarised(rows.read_counts(run.folder / study.COUNTS), study.SMOKE)["rows"], summary["rows"])
 
     shipped = read_weights(run.folder / "shipped" / study.WEIGHTS).meta

@@ -162,9 +162,9 @@ def test_complete_results_stay_and_others_are_refused(
     assert is_predicted(da_b, task, tokens, out, NOISY)
     assert predict_results(da_b, task, tokens, out, NOISY) == out
     others = ((tokens[1:], NOISY), (tokens[::-1], NOISY), (tokens, Baseline(agents="+behind")))
-    for samples, baseline in others:
-        with pytest.raises(ResultsError, match=f"{out}: is there already; choose another path, or remove it"):
-            predict_results(da_b, task, samples, out, baseline)
+    for (samples, baseline), told in zip(others, ("of other samples", "of other samples", "agents: "), strict=True):
+        called = partial(predict_results, da_b, task, samples, out, baseline)
+        assert_refused((called, ResultsError, (f"{out}: is there already ({told}", "choose another path")))
     broken = tmp_path / NAMES[task]
     broken.mkdir()
     (broken / "results.json").write_bytes(b"{}")

@@ -23,7 +23,7 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabelConfig, agents_to_ego, config_from_names
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.render.figures import layers_of
-from deepaccident_devkit.support.text import choice, meant_text
+from deepaccident_devkit.support.text import choice, differing_text, meant_text
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.testing import SmallRelease
 from deepaccident_devkit.v2x import AgentConfig, cooperating_agents
@@ -137,3 +137,15 @@ def test_files_of_a_release_are_read_exactly(da: DeepAccident) -> None:
     assert da.get("sample", da.sample[0]["token"]) == da.sample[0]
     with pytest.raises(TokenError, match=r"the scenario's agents are .*; did you mean 'ego_vehicle'\?$"):
         da.get("sample", f"{da.scenario[0]['token']}/Ego_Vehicle/001")
+
+
+def test_what_differs_is_told_with_both_values() -> None:
+    there = {"agents": ["ego"], "training": {"steps": 2, "rate": 0.1}, "old": 1}
+    asked = {"agents": ("ego",), "training": {"steps": 3, "rate": 0.1}}
+    assert differing_text(there, asked) == "old: 1, asked for None; training/steps: 2, asked for 3"
+    assert differing_text(there, there) == ""
+
+
+def test_a_word_that_means_something_elsewhere_is_told_so() -> None:
+    elsewhere = {"left": "; that is a side"}
+    assert_refused((lambda: choice("way", "LEFT", ("on", "off"), elsewhere=elsewhere), ChoiceError, ("a side",)))

@@ -19,6 +19,7 @@ from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
     Partial,
     SampleSelection,
+    checked_target,
     evaluate_results,
     read_bundle,
     read_rows,
@@ -131,6 +132,11 @@ class TestPlaces:
         assert "report.html" in read_bundle(folder).checksums()
         save_run(run, folder, overwrite=True)
         assert {path.name for path in folder.iterdir()} == FILES
+
+    def test_what_differs_from_an_evaluation_that_is_there(self, run: EvaluationRun, tmp_path: Path) -> None:
+        folder, asked = save_run(run, tmp_path / "bundle"), {"task": run.setup.task, "split": "mine.txt"}
+        differs = f"(split: {run.selection.split!r}, asked for 'mine.txt')"
+        assert_refused((lambda: checked_target(folder, asked=asked), ResultsError, (differs,)))
 
     def test_replaced_only_when_told_and_with_files_of_its_own_alone(self, run: EvaluationRun, tmp_path: Path) -> None:
         folder = save_run(run, tmp_path / "bundle")
