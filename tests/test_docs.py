@@ -27,6 +27,7 @@ from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCam
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
 from deepaccident_devkit.selection.fields import FIELDS, full_name
 from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.validation import CODES
 
 pytestmark = pytest.mark.slow
 
@@ -266,6 +267,12 @@ def test_every_field_that_finds_scenarios_is_on_the_page() -> None:
 
 def test_the_code_on_the_format_runs(in_demo: Path) -> None:
     assert run_page(DOCS / "format.md")["meta"].collision is not None
+
+
+def test_what_the_release_is_known_for_is_on_the_page() -> None:
+    page = (DOCS / "validation.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([a-z-]+)` \|", page, re.MULTILINE)
+    assert [name for name in rows if name in CODES] == [name for name, code in CODES.items() if code.known]
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/exports.md", "docs/index.md", "docs/validation.md"])

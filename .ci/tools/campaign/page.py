@@ -23,7 +23,7 @@ _SUMMARY = """{count:,} changed files of {kinds} kinds, by `{command}`:
 
 def tables(outcomes: Sequence[Outcome], stops: Sequence[Stopped]) -> str:
     """A row for each kind of file (read, refused, **failed**), and one for each command."""
-    return f"{_table(_rows(outcomes))}\n{_table(_stop_rows(stops))}"
+    return "\n".join([_table(_rows(outcomes)), *([_table(_stop_rows(stops))] if stops else [])])
 
 
 def summary(outcomes: Sequence[Outcome], stops: Sequence[Stopped], command: str) -> str:
