@@ -254,6 +254,17 @@ def test_the_attributes_of_samples_are_those_of_their_records(da_motion: DeepAcc
     assert {value: len(each) for value, each in by_value["time_to_impact"].items()} == {"2 s": 10, "1 s": 10}
 
 
+def test_without_meta_it_is_not_known_whether_there_is_an_impact(
+    da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    [record, *_] = [each for each in da_motion.scenario if each["collision"] is None]
+    token = f"{record['token']}/ego_vehicle/010"
+    unknown = {name: None for name, value in record.items() if name != "token" and not isinstance(value, int)}
+    monkeypatch.setattr(type(da_motion), "scenario", {record["token"]: record | unknown}, raising=False)
+    [each] = sample_attributes(da_motion, [token]).values()
+    assert (each.time_to_impact, each.impact_step, each.value("collision_status")) == (None, None, None)
+
+
 def test_a_breakdown_of_motion_metrics(da_motion: DeepAccident) -> None:
     evaluator = MotionEvaluator(trajectories=False)
     tokens = [
