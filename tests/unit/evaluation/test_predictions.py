@@ -83,28 +83,27 @@ class TestMotionOutput:
     def test_what_is_no_output(self) -> None:
         segmentation, centerness, offset, flow = stacked()
         coarse = MotionOutput.from_arrays(*stacked(1, (6, 8)), grid=BevGrid((-4.0, 4.0, 1.0), (-3.0, 3.0, 1.0)))
-        made = partial(partial, MotionOutput.from_arrays, grid=GRID)
+        none = np.zeros((0, 5, *GRID.shape), dtype=int)
         assert_refused(
             *(
-                (given, GeometryError, words)
-                for given, words in (
-                    (made(segmentation, centerness, offset[:2], flow), ("offset", "(K, T, channels, H, W)", "(2, 5")),
-                    (made(segmentation[0, 0], centerness, offset, flow), ("segmentation", "(K, T, channels, H, W)")),
-                    (made(segmentation, centerness, offset, flow[:, :4]), ("flow", "expected shape")),
-                    (made(*(each[:0] for each in stacked())), ("at least one prediction",)),
-                    (made(*stacked(), grid=None), ("grid", "BevGrid", "NoneType")),
-                    (lambda: MotionOutput(grid=GRID), ("heads, or instances", "not both")),
-                    (
-                        lambda: MotionOutput(grid=GRID, heads=coarse.heads),
-                        ("(12, 16) cells in orientation devkit", "(6, 8) in devkit"),
-                    ),
-                    (lambda: MotionOutput(grid=GRID, heads=()), ("at least one prediction",)),
-                    (
-                        lambda: instances_of(np.zeros((0, 5, *GRID.shape), dtype=int), GRID),
-                        ("at least one prediction",),
-                    ),
+                (partial(MotionOutput.from_arrays, *arrays, grid=GRID), GeometryError, words)
+                for arrays, words in (
+                    ((segmentation, centerness, offset[:2], flow), ("offset", "(K, T, channels, H, W)", "(2, 5")),
+                    ((segmentation[0, 0], centerness, offset, flow), ("segmentation", "(K, T, channels, H, W)")),
+                    ((segmentation, centerness, offset, flow[:, :4]), ("flow", "expected shape")),
+                    ([each[:0] for each in stacked()], ("at least one prediction",)),
                 )
-            )
+            ),
+            *(
+                (partial(MotionOutput, grid=GRID, **given), GeometryError, words)
+                for given, words in (
+                    ({}, ("heads, or instances", "not both")),
+                    ({"heads": coarse.heads}, ("(12, 16) cells in orientation devkit", "(6, 8) in devkit")),
+                    ({"heads": ()}, ("at least one prediction",)),
+                    ({"instances": none}, ("at least one prediction",)),
+                )
+            ),
+            (partial(MotionOutput.from_arrays, *stacked(), grid=None), GeometryError, ("grid", "BevGrid", "NoneType")),
         )
 
     def test_its_text_says_how_many_predictions_of_which_form(self) -> None:
