@@ -15,6 +15,7 @@ from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.breakdowns import (
     ATTRIBUTES,
     NO_IMPACT,
+    WITHIN_RECORDINGS,
     SampleAttributes,
     breakdown,
     cluster_of,
@@ -248,6 +249,8 @@ def test_the_attributes_of_samples_are_those_of_their_records(da_motion: DeepAcc
             scenario["town"],
             scenario["weather"],
         ]
+    within = ("accident_visibility", "time_to_impact", "impact_step", "time_to_end")
+    assert (ATTRIBUTES[0], ATTRIBUTES[-5:], {*WITHIN_RECORDINGS}) == ("all", ("agent", *within), {*within})
     chosen = {token: attributes[token] for token in evaluated}
     by_value = {name: tokens_by_value(chosen, name) for name in ATTRIBUTES}
     assert {sum(map(len, each.values())) for each in by_value.values()} == {len(evaluated)}
