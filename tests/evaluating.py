@@ -5,7 +5,7 @@ from typing import Any
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import instances_of
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, total
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 
 BROKEN = -1.0
 
@@ -39,3 +39,24 @@ def labels_as_maps(dataset: DeepAccident, token: str) -> Sequence[Any]:
     label = dataset.motion_labels(token).to_present("bilinear")
     moved = label.instance[:, ::-1]
     return instances_of(moved, label.config.grid), label
+
+
+@dataclass(frozen=True)
+class Ratio:
+    ratio: float
+    nothing: float = math.nan
+    median_of_all: float = 0.5
+
+
+class Ratios(Evaluator[Ratio]):
+    """The ratio of two sums."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    def update(self, token: str, *arguments: Any) -> None:
+        self.add(token, {"above": arguments[0], "below": arguments[1]})
+
+    def result_of(self, counts: Collection[Counts]) -> Ratio:
+        return Ratio(ratio(total(counts, "above"), total(counts, "below")))

@@ -50,6 +50,8 @@ def truth_of(*paths: Path, **columns: Any) -> BoxTruth:
         ([[(0, 0)] * 3, [(0, 2), (0, 2.5), (0, 2)]], (10, 20)),
         ([MOVING, [(0, 3), (1, 3), (2, 3)]], None),  # exactly a metre
         ([MOVING, [(0, 3), (1, 2.9), (2, 3)]], (10, 20)),
+        ([MOVING, [(4.99, 0), (5.99, 0), (6.99, 0)]], (10, 20)),  # one behind the other
+        ([MOVING, [(5, 0), (6, 0), (7, 0)]], None),
         ([MOVING, [(0, 2.9), FAR, FAR], [AWAY, AWAY, (2, 2.2)]], (10, 30)),  # the nearest
         ([MOVING, [FAR, FAR, (2, 2.5)], [AWAY, (1, 2.5), AWAY]], (10, 30)),  # the earliest
         ([MOVING, [FAR, (1, 2.5), FAR], [AWAY, (1, -2.5), AWAY]], (10, 20)),  # the first

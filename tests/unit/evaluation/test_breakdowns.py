@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import pytest
+from evaluating import Ratios
 from generated_bundles import motion_counts
 from refusals import assert_refused
 
@@ -14,6 +15,7 @@ from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.breakdowns import (
     ATTRIBUTES,
     NO_IMPACT,
+    WITHIN_RECORDINGS,
     SampleAttributes,
     breakdown,
     cluster_of,
@@ -21,7 +23,7 @@ from deepaccident_devkit.evaluation.breakdowns import (
     time_bin,
     tokens_by_value,
 )
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.evaluator import Counts, total
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.predictions import instances_of
@@ -43,37 +45,11 @@ STORY = {
 }
 
 
-@dataclass(frozen=True)
-class Share:
-    hits: int
-    share: float
-    unknown: float | None = None
-
-
-class Shares(Evaluator[Share]):
-    """The share of hits."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return {}
-
-    def update(self, token: str, *arguments: Any) -> None:
-        self.add(token, {"hit": arguments[0]})
-
-    def result_of(self, counts: Collection[Counts]) -> Share:
-        hits = total(counts, "hit")
-        return Share(hits=int(hits), share=ratio(hits, len(counts)))
-
-
-class PooledShares(Shares):
+class PooledRatios(Ratios):
     """The same from sums."""
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
-        return [{"hit": total(counts, "hit"), "samples": sum(each.get("samples", 1) for each in counts)}]
-
-    def result_of(self, counts: Collection[Counts]) -> Share:
-        hits, samples = total(counts, "hit"), sum(each.get("samples", 1) for each in counts)
-        return Share(hits=int(hits), share=ratio(hits, samples))
+        return [{name: total(counts, name) for name in ("above", "below")}]
 
 
 def attributes_of(number: int, **changes: Any) -> SampleAttributes:
@@ -90,10 +66,10 @@ def attributes_of(number: int, **changes: Any) -> SampleAttributes:
     return SampleAttributes(**(values | changes))
 
 
-def filled(numbers: range = range(100), kind: type[Shares] = Shares) -> Shares:
+def filled(numbers: range = range(100), kind: type[Ratios] = Ratios) -> Ratios:
     evaluator = kind()
     for number in numbers:
-        evaluator.add(f"{number:03d}", {"hit": float(number % 7 == 0 or number // 10 == 3)})
+        evaluator.add(f"{number:03d}", {"above": float(number % 7 == 0 or number // 10 == 3), "below": 1.0})
     return evaluator
 
 
@@ -125,9 +101,9 @@ def test_everything_is_a_breakdown_too() -> None:
     (group,) = breakdown(filled(), MANY, "all").groups
     assert (group.value, group.samples, group.scenarios) == ("all", 100, 10)
     assert group.result == filled().compute()
-    low, high = group.intervals["share"]
-    assert 0 < low < group.result.share < high < 1
-    assert (set(group.intervals), group.notes) == ({"share"}, ())
+    low, high = group.intervals["ratio"]
+    assert 0 < low < group.result.ratio < high < 1
+    assert (set(group.intervals), group.notes) == ({"ratio"}, ())
 
 
 def changed(some: Callable[[int], bool], **changes: Any) -> dict[str, SampleAttributes]:
@@ -187,8 +163,8 @@ def test_a_cluster_has_no_ending(scenario: str, cluster: str) -> None:
     assert cluster_of(scenario) == cluster
 
 
-@pytest.mark.parametrize("kind", [Shares, PooledShares])
-def test_no_order_makes_a_difference(kind: type[Shares]) -> None:
+@pytest.mark.parametrize("kind", [Ratios, PooledRatios])
+def test_no_order_makes_a_difference(kind: type[Ratios]) -> None:
     expected = breakdown(filled(kind=kind), MANY, "town")
     backwards = dict(reversed(list(MANY.items())))
     assert breakdown(filled(range(99, -1, -1), kind), backwards, "town") == expected
@@ -199,16 +175,16 @@ def test_no_order_makes_a_difference(kind: type[Shares]) -> None:
 
 def test_an_accident_and_its_twin_are_one_cluster() -> None:
     """Twins that are equal tell nothing new: the interval is that of the accidents alone."""
-    accidents, both, attributes = Shares(), Shares(), {}
+    accidents, both, attributes = Ratios(), Ratios(), {}
     for number in range(80):
         for kind in ("accident", "normal"):
             token, story = f"{number:03d} {kind}", f"type1_subtype1_{kind}/Town03_{number // 10}"
             attributes[token] = attributes_of(number, scenario=story)
             for evaluator in (accidents, both) if kind == "accident" else (both,):
-                evaluator.add(token, {"hit": float(number // 10 % 2)})
+                evaluator.add(token, {"above": float(number // 10 % 2), "below": 1.0})
     [one], [two] = (breakdown(each, attributes, "all").groups for each in (accidents, both))
     assert (two.scenarios, two.clusters, one.scenarios, one.clusters) == (16, 8, 8, 8)
-    assert two.intervals["share"] == pytest.approx(one.intervals["share"])
+    assert two.intervals["ratio"] == pytest.approx(one.intervals["ratio"])
 
 
 def test_a_percentage_that_is_always_100_is_not_sure() -> None:
@@ -273,10 +249,23 @@ def test_the_attributes_of_samples_are_those_of_their_records(da_motion: DeepAcc
             scenario["town"],
             scenario["weather"],
         ]
+    within = ("accident_visibility", "time_to_impact", "impact_step", "time_to_end")
+    assert (ATTRIBUTES[0], ATTRIBUTES[-5:], {*WITHIN_RECORDINGS}) == ("all", ("agent", *within), {*within})
     chosen = {token: attributes[token] for token in evaluated}
     by_value = {name: tokens_by_value(chosen, name) for name in ATTRIBUTES}
     assert {sum(map(len, each.values())) for each in by_value.values()} == {len(evaluated)}
     assert {value: len(each) for value, each in by_value["time_to_impact"].items()} == {"2 s": 10, "1 s": 10}
+
+
+def test_without_meta_it_is_not_known_whether_there_is_an_impact(
+    da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    [record, *_] = [each for each in da_motion.scenario if each["collision"] is None]
+    token = f"{record['token']}/ego_vehicle/010"
+    unknown = {name: None for name, value in record.items() if name != "token" and not isinstance(value, int)}
+    monkeypatch.setattr(type(da_motion), "scenario", {record["token"]: record | unknown}, raising=False)
+    [each] = sample_attributes(da_motion, [token]).values()
+    assert (each.time_to_impact, each.impact_step, each.value("collision_status")) == (None, None, None)
 
 
 def test_a_breakdown_of_motion_metrics(da_motion: DeepAccident) -> None:

@@ -143,8 +143,11 @@ def test_counts_cannot_be_changed() -> None:
     with pytest.raises(TypeError):
         evaluator.counts["b"] = {}  # type: ignore[index]
     evaluator.counts["a"]["value"] = 2.0  # type: ignore[index]
-    assert evaluator.compute() == 1e16
-    assert (list(evaluator.counts), len(evaluator.counts), "a" in evaluator.counts) == (["a"], 1, True)
+    evaluator.add("n", {"value": 1.0, "lists": [[1], {"of": [2]}]})
+    evaluator.counts["n"]["lists"][1]["of"].append(3)
+    assert evaluator.counts["n"]["lists"] == [[1], {"of": [2]}]
+    assert evaluator.compute(["a"]) == 1e16
+    assert (list(evaluator.counts), len(evaluator.counts), "a" in evaluator.counts) == (["a", "n"], 2, True)
     assert list(evaluator.pooled([{"value": 1.0}])) == [{"value": 1.0}]
 
 

@@ -2,17 +2,18 @@
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+import scipy.stats
+from evaluating import Ratio, Ratios
+from numpy.testing import assert_allclose
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.intervals import (
     LEAST_CLUSTERS,
     Intervals,
@@ -24,32 +25,10 @@ from deepaccident_devkit.evaluation.intervals import (
     numbers_of,
     parts_of,
     range_of,
-    standard_errors,
 )
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
 from deepaccident_devkit.evaluation.task import HEADLINE_UNITS
-
-
-@dataclass(frozen=True)
-class Ratio:
-    ratio: float
-    nothing: float = math.nan
-    median_of_all: float = 0.5
-
-
-class Ratios(Evaluator[Ratio]):
-    """The ratio of two sums."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return {}
-
-    def update(self, token: str, *arguments: Any) -> None:
-        self.add(token, {"above": arguments[0], "below": arguments[1]})
-
-    def result_of(self, counts: Collection[Counts]) -> Ratio:
-        return Ratio(ratio(total(counts, "above"), total(counts, "below")))
 
 
 def made(
@@ -93,17 +72,6 @@ def test_a_mean_from_0_on_has_an_interval_by_factors() -> None:
     low, high = made([1.0, 3.0] * 10).ends["ratio"]
     assert low * high == pytest.approx(2.0**2)
     assert math.log(high / 2) == pytest.approx(2.0930 * math.sqrt(1 / 19) / 2, abs=1e-4)
-
-
-def test_a_mean_of_both_signs_has_a_symmetric_one() -> None:
-    low, high = made([-1.0, 3.0] * 10).ends["ratio"]
-    assert (low, high) == pytest.approx((1 - 2.0930 * 2 / math.sqrt(19), 1 + 2.0930 * 2 / math.sqrt(19)), abs=1e-3)
-
-
-def test_errors_of_numbers_that_hang_on_one_cluster_are_uncertain() -> None:
-    even, mostly_one = np.array([[1.0], [-1.0]] * 10), np.where(np.arange(20) == 3, 10.0, 0.1)[:, None]
-    assert standard_errors(np.zeros(1), even)[1] == 19
-    assert standard_errors(np.zeros(1), mostly_one)[1] == pytest.approx(20 / 19, abs=0.01)
 
 
 LEFT_OUT = f"(an accident and its twin are one); at least {LEAST_CLUSTERS} are needed"
@@ -165,15 +133,49 @@ def test_intervals_of_joined_clusters_are_nearly_the_same() -> None:
     assert joined == pytest.approx((np.mean(above) - 1.97 * errors, np.mean(above) + 1.97 * errors), abs=0.012)
 
 
-def test_each_number_for_itself() -> None:
-    """Several numbers at once have the intervals of each alone."""
-    left_out = np.random.default_rng(0).uniform(0.4, 0.6, (20, 3))
-    values, ranges = np.full(3, 0.5), np.array([[0, 1], [0, math.inf], [-math.inf, math.inf]])
-    together = interval_ends(values, left_out, ranges, 0.95)
-    for at in range(3):
-        alone = interval_ends(values[at : at + 1], left_out[:, at : at + 1], ranges[at : at + 1], 0.95)
-        assert_array_equal(np.ravel(alone), [together[0][at], together[1][at]])
-    assert_allclose(interval_ends(values * 100, left_out * 100, ranges * [1, 100], 0.95)[0][0], 100 * together[0][0])
+def plain_ends(
+    value: float, left_out: list[float], limits: tuple[float, float], having: int, confidence: float
+) -> tuple[float, float]:
+    """By scipy's t and the formulas of docs/statistics.md, number by number."""
+    count, apart, (least, most) = len(left_out), [each - value for each in left_out], limits
+    squares, changing = sum(each**2 for each in apart), sum(each != 0 for each in apart)
+    error = math.sqrt((count - 1) / count * squares)
+    width = most - least if math.isfinite(most) else abs(value)
+    same = error <= 1e-9 * width
+    if (having if same else changing) < LEAST_CLUSTERS or (same and math.isinf(most)):
+        return math.nan, math.nan
+    likely = (1 + confidence) / 2
+    unlike = math.nan if same else count * sum(each**4 for each in apart) / squares**2 - 1
+    t = scipy.stats.t.ppf(likely, max(min(changing - 1, count / max(unlike, 1e-12)), 1))
+    if math.isinf(most):
+        factor = math.exp(t * error / value)
+        return (value / factor, value * factor) if least == 0 else (value - t * error, value + t * error)
+    share, one_a_part = (value - least) / width, scipy.stats.t.ppf(likely, having - 1) ** 2 / having
+    unsure = one_a_part
+    if not same:
+        variance = (error / width) ** 2 / (share * (1 - share))
+        unsure = max(one_a_part * having * variance, min(t**2 * variance, one_a_part))
+    middle, half = share + unsure / 2, math.sqrt(unsure * share * (1 - share) + unsure**2 / 4)
+    low, high = ((middle + side * half) / (1 + unsure) for side in (-1, 1))
+    return least + width * max(low, 0), least + width * min(high, 1)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_ends_are_those_of_the_formulas_number_by_number(seed: int) -> None:
+    """Of few and many parts, some of which do not change a number, or by much more than others."""
+    source = np.random.default_rng(seed)
+    count, confidence = int(source.integers(6, 25)), (0.9, 0.95)[seed % 2]
+    limits = [(0.0, 1.0), (0.0, 100.0), (0.0, math.inf), (-math.inf, math.inf)]
+    values = source.uniform(0.2, 0.8, 4) * [1, 100, 9, 9]
+    apart = source.normal(0, source.choice([0.1, 0.01, 0.3]), (count, 4)) * (source.random((count, 4)) < 0.8)
+    apart[0] *= source.choice([1, 5])
+    apart *= [0.1, 10, 0.9, 0.9] * (source.random(4) < 0.9)
+    having = source.integers(5, count + 1, 4)
+    low, high = interval_ends(values, values + apart, np.array(limits), confidence, having)
+    for at in range(4):
+        left_out = (values + apart)[:, at].tolist()
+        expected = plain_ends(float(values[at]), left_out, limits[at], int(having[at]), confidence)
+        assert (low[at], high[at]) == pytest.approx(expected, nan_ok=True)
 
 
 @pytest.mark.parametrize(("share", "end"), [(0.0, 0), (1.0, 1)])
@@ -198,13 +200,6 @@ def test_settings_and_their_edges() -> None:
             for value in values
         )
     )
-
-
-@pytest.mark.parametrize("changing", [1, 5, 6, 10])
-def test_a_number_that_few_parts_change_has_no_interval(changing: int) -> None:
-    left_out = 1.0 + 0.1 * (np.arange(20) < changing)[:, None] * (-1) ** np.arange(20)[:, None]
-    low, high = interval_ends(np.ones(1), left_out, np.array([[-math.inf, math.inf]]), 0.95)
-    assert (np.isnan(low[0]), np.isnan(high[0])) == (changing < LEAST_CLUSTERS,) * 2
 
 
 def test_the_difference_of_two_runs_has_its_own_interval() -> None:

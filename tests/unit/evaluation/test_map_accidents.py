@@ -85,5 +85,18 @@ def test_positions_are_means_of_cells_where_the_labels_have_them(rules, place: t
     assert accident_of(maps[:1], BevGrid(), rules, AccidentReading()).explicit(0.5) is None
 
 
+@pytest.mark.parametrize(
+    ("points", "group", "hulls"),
+    [
+        ([(3, 4)], [0], [[(3, 4)]]),
+        ([(0, 0), (2, 2), (1, 1)], [0, 0, 0], [[(0, 0), (2, 2)]]),
+        ([(0, 0), (1, 1), (0, 2), (2, 0), (2, 2), (0, 1)], [0] * 6, [[(0, 0), (2, 0), (2, 2), (0, 2)]]),
+        ([(5, 5), (0, 0), (0, 1)], [1, 0, 0], [[(0, 0), (0, 1)], [(5, 5), (5, 5)]]),  # the last one again
+    ],
+)
+def test_hulls_of_points_and_lines_have_one_or_two_corners(points, group, hulls) -> None:
+    assert convex_hulls(np.array(points), np.array(group)).tolist() == [[list(each) for each in hull] for hull in hulls]
+
+
 def test_of_no_points_there_are_no_hulls() -> None:
     assert convex_hulls(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)).shape == (0, 1, 2)

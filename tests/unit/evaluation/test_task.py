@@ -4,6 +4,7 @@ import copy
 import json
 import math
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -183,4 +184,6 @@ def test_mappings_of_results_are_frozen_and_have_a_hash() -> None:
     changes = ("__setitem__", "__delitem__", "__ior__", "clear", "pop", "popitem", "setdefault", "update")
     assert_refused(*((getattr(frozen, name), TypeError, ("make a dict of it",)) for name in changes))
     assert [pickle.loads(pickle.dumps(frozen)), copy.deepcopy(frozen)] == [frozen] * 2
+    nested = replace(MotionEvaluator().compute(), ranges={"a": {"b": 1}}).ranges["a"]
+    assert (type(nested), nested) == (FrozenDict, {"b": 1})
     assert hash(frozen) == hash(FrozenDict({"b": 2, "a": 1})) != hash(FrozenDict({"a": 1}))

@@ -146,3 +146,6 @@ def test_which_accidents_are_compared(protocol, form, predicted, label, times) -
     made = compared_accidents(given, scene(label), KNOWN, PROTOCOLS[protocol])
     assert [each.time for each in made.predicted] == times
     assert (made.true and made.true.time, made.unplaced) == (2.0 if len(label) > 1 else None, None)
+    for accident in (made.true, *made.predicted) if len(label) > 1 else ():
+        ends = [path[-1] for path in label.values()]
+        np.testing.assert_allclose(np.sort(accident.positions, axis=0), np.sort(ends, axis=0), atol=1.1)

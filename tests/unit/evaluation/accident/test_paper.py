@@ -293,15 +293,19 @@ def test_what_cannot_be_compared() -> None:
         MotionOutput(grid=grid, instances=label.instance[None, :frames])
         for grid, frames in ((label.config.grid, 3), (other, FRAMES))
     )
-    counts = partial(partial, PAPER.counts)
     assert_refused(
-        (counts([(20.0, 10.0)], label, UNKNOWN), EvaluationError, ("a MotionOutput or a list of Accidents",)),
-        (counts([alarm()], None, UNKNOWN), EvaluationError, ("motion labels",)),
-        (counts(as_maps(label), None, UNKNOWN), EvaluationError, ("motion labels",)),
-        (counts(as_maps(label), scene(HIT, protocol="clean"), UNKNOWN), EvaluationError, ("protocol 'released'",)),
-        (counts(few, label, UNKNOWN), EvaluationError, ("at least 5 frames", "found 3")),
-        (counts(elsewhere, label, UNKNOWN), EvaluationError, ("make both with the same grid",)),
-        (counts(as_maps(label), scene(HIT, frames=0), UNKNOWN), EvaluationError, ("present frame",)),
+        *(
+            (partial(PAPER.counts, given, beside, UNKNOWN), EvaluationError, words)
+            for given, beside, words in (
+                ([(20.0, 10.0)], label, ("a MotionOutput or a list of Accidents", "tuple")),
+                ([alarm()], None, ("motion labels",)),
+                (as_maps(label), None, ("motion labels",)),
+                (as_maps(label), scene(HIT, protocol="clean"), ("protocol 'released'",)),
+                (few, label, ("at least 5 frames", "found 3")),
+                (elsewhere, label, ("make both with the same grid",)),
+                (as_maps(label), scene(HIT, frames=0), ("present frame",)),
+            )
+        ),
         (lambda: PaperAccidents(sample_choice="worst"), ChoiceError, ("sample_choice", "best, mean_first", "worst")),
         (lambda: AccidentReading(danger_distance=0), ConfigError, ("danger_distance", "above 0")),
         (lambda: AccidentReading(danger_distance=math.inf), ConfigError, ("danger_distance", "inf")),

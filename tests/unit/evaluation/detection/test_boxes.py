@@ -120,16 +120,19 @@ def test_the_edges_of_what_can_be() -> None:
     assert detection_protocol("paper", thresholds=[1, 2, 4]).thresholds == (1, 2, 4)
     released_iou = DETECTION_PROTOCOLS["released_iou"]
     assert [released_iou.limits(name) for name in ("car", "cyclist")] == [(0.3, 0.15), (0.2, 0.1)]
-    paper = partial(partial, detection_protocol, "paper")
     assert_refused(
         (lambda: DetectionEvaluator("kitti"), ChoiceError, ("protocol", "released, released_iou, paper", "kitti")),
         (lambda: DetectionEvaluator("paper", treshold=1), ChoiceError, ("no switch 'treshold'", "thresholds")),
         *(
-            (paper(**{name: "other"}), ChoiceError, (f"{name}: expected one of", "other"))
+            (
+                partial(detection_protocol, "paper", **{name: "other"}),
+                ChoiceError,
+                (f"{name}: expected one of", "other"),
+            )
             for name in ("truth", "measure", "matching", "area_of", "curve")
         ),
         *(
-            (paper(**switches), ConfigError, words)
+            (partial(detection_protocol, "paper", **switches), ConfigError, words)
             for switches, words in (
                 ({"thresholds": (1.0,)}, ("error_threshold", "one of the thresholds")),
                 ({"thresholds": (), "error_threshold": None}, ("at least one",)),

@@ -10,6 +10,7 @@ from evaluation_of_warnings import always, evaluated, never
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.evaluation.warning import FieldWarnings, ScoreSeries, field_figures, printed_figures
 from deepaccident_devkit.evaluation.warning.field import FIELD_CODES
 from deepaccident_devkit.evaluation.warning.recordings import REFERENCES, TRIVIAL
@@ -117,6 +118,10 @@ def test_what_a_result_holds(*, references: bool) -> None:
     assert [*made.references] == ([*TRIVIAL, *REFERENCES] if references else [])
     assert all([*each] == names for each in made.references.values())
     assert made.figures["drive bystander"].precision_at_half == pytest.approx(12 / (12 + 19))
+    rows = (("AP", "share"), ("mTTA", "s"), ("TTA@R80", "s"))
+    assert [(each.name, each.unit, each.higher_is_better) for each in headlines("warning", made)] == [
+        (f"{row} {name}", unit, True) for row, unit in rows for name in names
+    ]
     *said, last = made.notes
     assert said == [f"{name}: {each.note}" for name, each in made.figures.items() if each.note]
     assert last.startswith("times and precisions of different codes are not comparable")
