@@ -156,17 +156,6 @@ def lift(release: Path, agent: str, name: str = tiny.NAME, frame: int = 6) -> No
 
 class TestRoundTrip:
     @pytest.mark.slow
-    def test_every_sample_reads_as_it_is_made(self, da_motion: DeepAccident, tmp_path: Path) -> None:
-        tokens = [record["token"] for record in da_motion.sample]
-        assert write(da_motion, tmp_path / "a" / "new folder", tokens, workers=2) == LabelsWritten(
-            samples=350, written=10, kept=0
-        )
-        files = LabelFiles(tmp_path / "a" / "new folder", MotionLabelConfig())
-        assert (list(files), len(files)) == (tokens, len(tokens))
-        for token in tokens[::3]:
-            assert_same(files[token], motion_labels(da_motion, token))
-
-    @pytest.mark.slow
     @pytest.mark.parametrize("name", CONFIGS)
     def test_every_configuration(self, da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
         tokens = tokens_of(da_motion, 1, 27, agents=("ego_vehicle", "infrastructure"))
@@ -179,8 +168,7 @@ class TestRoundTrip:
     @pytest.mark.parametrize("name", ["clean, everybody, untracked too", "everybody", "quirks of one's own"])
     def test_untracked_actors(self, small: DeepAccident, tmp_path: Path, name: str) -> None:
         """Each row is an instance without an actor, or all are actor −1."""
-        config = replace(CONFIGS[name], filter_invisible=False)
-        tokens = tokens_of(small, 1, 9, 12)
+        config, tokens = replace(CONFIGS[name], filter_invisible=False), tokens_of(small, 1, 9, 12)
         write(small, tmp_path / "labels", tokens, config)
         files, shared = LabelFiles(tmp_path / "labels", config), config.rules.untracked_share_an_id
         for token in tokens:
@@ -533,8 +521,7 @@ class TestReading:
     def test_results_cannot_be_written_to(self, files: LabelFiles) -> None:
         labels = files[next(iter(files))]
         for name in MAPS:
-            with pytest.raises(ValueError, match="read-only"):
-                getattr(labels, name)[...] = 1
+            assert not getattr(labels, name).flags.writeable, name
         with pytest.raises(TypeError, match="does not support item assignment"):
             labels.id_map[3] = 4
 
@@ -878,21 +865,13 @@ class TestStops:
         assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
 
 
-def test_labels_can_be_pickled(small: DeepAccident) -> None:
-    label = small.motion_labels(small.sample[0]["token"])
-    again = pickle.loads(pickle.dumps(label))
-    np.testing.assert_array_equal(again.instance, label.instance)
-    assert (again.config, again.id_map) == (label.config, label.id_map)
-
-
 def test_a_file_is_made_again_if_any_row_of_its_scenario_changed(tmp_path: Path, out: Path) -> None:
     """One with no box at all, then the same elsewhere, then with one box more each time."""
     config = MotionLabelConfig(grid=BevGrid((-4, 4, 1), (-4, 4, 1)), receptive_field=1, future_frames=1)
     token = f"{tiny.TOKEN}/infrastructure/001"
     rows = ["0 0", "car 2 0 0 4 2 1.5 0 0 0 5 9 True", "car 0 0 0 4 2 1.5 0 0 0 -1 9 True"]
     for count, written in ((1, 1), (1, 0), (2, 1), (3, 1)):
-        root = tmp_path / f"release {count}"
-        lines = partial(lambda there, *_: there, rows[:count])
+        root, lines = tmp_path / f"release {count}", partial(lambda there, *_: there, rows[:count])
         tiny.write_tiny_release(root, frames=1, agents=("infrastructure",), lines_of=lines)
         release = opened(root)
         assert write(release, out, [token], config) == LabelsWritten(samples=1, written=written, kept=1 - written)

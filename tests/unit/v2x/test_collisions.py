@@ -300,13 +300,11 @@ def test_pairs_in_any_pose_by_plain_steps(tmp_path: Path) -> None:
         told[name] = ([outline(*at, *size) for at, size in zip(places, sizes, strict=True)], places[:, 2], steps)
     da, overlaps = DeepAccident(dataroot=tmp_path, verbose=False), 0
     for name, ((first, second), yaws, steps) in told.items():
-        found = da.collision(f"{tiny.TYPE}/{name}")
-        gaps = {}
+        found, gaps = da.collision(f"{tiny.TYPE}/{name}"), {}
         for yaw in (*yaws, *(yaws + np.pi / 2)):
             for normal in (np.array([np.cos(yaw), np.sin(yaw)]), -np.array([np.cos(yaw), np.sin(yaw)])):
                 gaps[tuple(normal)] = min(each @ normal for each in second) - max(each @ normal for each in first)
-        facing = np.array(max(gaps, key=gaps.get))
-        sides = []
+        facing, sides = np.array(max(gaps, key=gaps.get)), []
         for yaw, way in zip(yaws, (facing, -facing), strict=True):
             turn = (np.arctan2(way[1], way[0]) - yaw + np.pi / 4) % (2 * np.pi) // (np.pi / 2)
             sides.append(("front", "left", "rear", "right")[int(turn)])

@@ -164,20 +164,6 @@ class TestNumbers:
             assert each.difference in (0.0, None)
             assert each.decision in ("the difference is 0", "nothing to compare", "for exploration")
 
-    @pytest.mark.slow
-    def test_twins_are_one_cluster(self, generated: Callable[..., Comparison]) -> None:
-        better = [each + 3 + number % 3 for number, each in enumerate(HARD)]
-        alone, both = (generated(HARD, better, twins=twins) for twins in (False, True))
-        assert (alone.scenarios, alone.clusters, both.scenarios, both.clusters) == (16, 16, 32, 16)
-        assert [each.p for each in both.numbers] == [each.p for each in alone.numbers]
-        assert by_name(both)[MAIN].high == pytest.approx(by_name(alone)[MAIN].high)
-
-    def test_few_clusters_cannot_decide(self, generated: Callable[..., Comparison]) -> None:
-        iou = by_name(generated(HARD[:5], [each + 9 for each in HARD[:5]]))[MAIN]
-        assert (iou.real, iou.low) == (False, None)
-        assert iou.decision == "no decision is possible with 5 clusters; at least 6 are needed"
-        assert by_name(generated(HARD[:6], [each + 9 for each in HARD[:6]]))[MAIN].real
-
     def test_what_would_decide(self, generated: Callable[..., Comparison]) -> None:
         iou = by_name(generated([50] * 20, [50 + 3 * (-1) ** number + 1 for number in range(20)]))[MAIN]
         assert not iou.real
@@ -190,15 +176,6 @@ class TestNumbers:
 
 
 class TestForms:
-    def test_text(self, motion_bundles: tuple[Path, Path]) -> None:
-        text = compare_bundles(*motion_bundles, FEW).to_text()
-        head = "motion, protocol released: 6 samples of 2 scenarios\nclusters: 1 (an accident and its twin are one)"
-        assert text.startswith(f"{head}\na: {motion_bundles[0]}\n")
-        (line,) = (line for line in text.splitlines() if line.startswith("iou 100x100"))
-        assert line.endswith("no decision is possible with 1 cluster; at least 8 are needed")
-        assert "p: share of all 1 swaps of clusters between a and b" in text
-        assert "tested at 5%: iou 30x30; and the other headlines together" in text
-
     def test_all_of_a_small_one(self, generated: Callable[..., Comparison]) -> None:
         """Of seven clusters all 64 swaps are tried: none of the others differs as much."""
         made = generated(HARD[:7], [each + 9 + number % 2 for number, each in enumerate(HARD[:7])], twins=True)
@@ -522,14 +499,6 @@ def test_half_of_the_ties_of_random_swaps_count() -> None:
     assert p_values(np.array([0.0]), swapped, swaps)[0] == 1
 
 
-def test_pairs_are_what_is_tested() -> None:
-    """Clusters differ by far more than the runs; were one run's in another order, nothing would be real."""
-    hard = np.linspace(0, 10, 12)
-    better = hard + 0.1 + np.linspace(0, 0.02, 12)
-    assert paired(hard, better).p[0] <= 2 / 1001
-    assert paired(hard, np.roll(better, 3)).p[0] > 0.5
-
-
 def test_clusters_that_do_not_differ_are_not_swapped() -> None:
     first = np.arange(40.0)
     made = paired(first, first + np.where(np.arange(40) % 5 == 0, 1.0, 0.0))
@@ -578,14 +547,6 @@ class TestUndecided:
         nothing = np.full(8, math.nan)
         with np.errstate(all="ignore"), pytest.warns(RuntimeWarning):
             assert undecided(paired(np.zeros(8), nothing), 0, 1, 8) == "nothing to compare"
-
-    def test_how_many_would_decide(self) -> None:
-        """A difference of 0.5 with a spread of 2: (1.96 + 0.84)² = 7.849 times the square of their ratio."""
-        made = paired(np.zeros(20), 0.5 + np.tile([2.0, -2.0], 10))
-        assert made.p[0] > 0.05
-        clusters = 7.849 * 20 / 19 * 4 / 0.5**2
-        needed = math.ceil(clusters * 2 / 10) * 10  # two scenarios each, with two digits
-        assert undecided(made, 0, 1, 40) == f"not decided: about {needed} scenarios would decide it"
 
 
 def test_all_swaps_or_random_ones() -> None:
