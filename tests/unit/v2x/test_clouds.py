@@ -165,10 +165,7 @@ def test_a_cloud_in_an_image_of_its_own_agent(da: DeepAccident, sample: str) -> 
     assert_array_equal(shown.color[shown.mask], image[v, u])
     assert not shown.color[~shown.mask].any()
     height, width = image.shape[:2]
-    assert u.min() >= 0
-    assert v.min() >= 0
-    assert u.max() < width
-    assert v.max() < height
+    assert (u.min() >= 0, v.min() >= 0, u.max() < width, v.max() < height) == (True,) * 4
     assert da.map_pointcloud_to_image(camera, colors=False).color is None
 
 
