@@ -266,13 +266,6 @@ def test_a_sample_without_a_label(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("sample", ["", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3}])
-def test_what_is_no_sample(small: DeepAccident, sample: object) -> None:
-    assert_refused(
-        (lambda: small.motion_labels(sample), TokenError, r"no token|expected a token or a record"),
-    )
-
-
 def test_agents_of_a_partial_release(tmp_path: Path) -> None:
     two = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines))
     assert VAN in two.motion_labels(f"{EGO}/002").id_map
@@ -290,14 +283,16 @@ def test_agents_of_a_partial_release(tmp_path: Path) -> None:
     assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+other", filter_invisible=False)).id_map
 
 
-@pytest.mark.parametrize("agents", ["everybody", "ego_vehicle", ("pole",), ()])
-def test_agents_that_do_not_exist(small: DeepAccident, agents: object) -> None:
+def test_what_is_no_sample_and_agents_that_do_not_exist(small: DeepAccident) -> None:
     assert_refused(
-        (
-            lambda: small.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)),
-            ChoiceError,
-            r"agents?: expected",
-        ),
+        *[
+            (partial(small.motion_labels, sample), TokenError, r"no token|expected a token or a record")
+            for sample in ("", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3})
+        ],
+        *[
+            (lambda wrong=wrong: MotionLabelConfig(agents=wrong), ChoiceError, r"agents?: expected")
+            for wrong in ("everybody", "ego_vehicle", ("pole",), ())
+        ],
     )
 
 
@@ -392,39 +387,22 @@ def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:
     assert str(told.value).endswith(f"or choose another split: it has {here.pop()}: 2 scenarios")
 
 
-@pytest.mark.parametrize("horizon", ["2", None, [2.0]])
-def test_a_horizon_is_a_number(da_motion: DeepAccident, horizon: object) -> None:
-    with pytest.raises(ConfigError, match="horizon: expected a number of seconds"):
-        samples(da_motion, "train", "evaluate", "paper", horizon=horizon)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        ({"purpose": "testing"}, "purpose: expected one of train, evaluate, all, every"),
-        ({"protocol": "boxes"}, "protocol: expected one of released, paper"),
-        ({"protocol": "paper", "scope": "some"}, "scope: expected one of accident, all"),
-    ],
-)
-def test_unknown_choices_name_those_there_are(da_motion: DeepAccident, arguments: dict[str, str], told: str) -> None:
-    with pytest.raises(ChoiceError, match=re.escape(told)):
-        samples(da_motion, "train", **{"purpose": "train", **arguments})  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("horizon", [0.0, 0.4999, 0.7, -1.0, float("nan"), float("inf")])
-def test_a_horizon_is_a_number_of_half_seconds(da_motion: DeepAccident, horizon: float) -> None:
+def test_choices_and_horizons_that_there_are_not(da_motion: DeepAccident) -> None:
+    """Horizons are numbers of half seconds, and the released protocol has one."""
+    evaluate = partial(samples, da_motion, "train", "evaluate")
     assert_refused(
-        (
-            lambda: samples(da_motion, "train", "evaluate", "paper", horizon=horizon),
-            ConfigError,
-            r"choose 0\.5, 1, 1\.5",
-        ),
-    )
-
-
-def test_the_released_protocol_has_one_horizon(da_motion: DeepAccident) -> None:
-    assert_refused(
-        (lambda: samples(da_motion, "train", "evaluate", horizon=3.0), ConfigError, "protocol='paper'"),
+        (lambda: samples(da_motion, "train", "testing"), ChoiceError, ("purpose", "train, evaluate, all, every")),
+        (partial(evaluate, "boxes"), ChoiceError, ("protocol: expected one of released, paper",)),
+        (partial(evaluate, "paper", scope="some"), ChoiceError, ("scope: expected one of accident, all",)),
+        (partial(evaluate, horizon=3.0), ConfigError, ("protocol='paper'",)),
+        *[
+            (partial(evaluate, "paper", horizon=horizon), ConfigError, ("horizon: expected a number of seconds",))
+            for horizon in ("2", None, [2.0])
+        ],
+        *[
+            (partial(evaluate, "paper", horizon=horizon), ConfigError, ("choose 0.5, 1, 1.5",))
+            for horizon in (0.0, 0.4999, 0.7, -1.0, float("nan"), float("inf"))
+        ],
     )
 
 

@@ -38,23 +38,14 @@ def test_rounded_poses_are_zero_away_from_themselves() -> None:
     assert_allclose(future_egomotion(rounded[[0, 0]]), 0, atol=1e-9)
 
 
-@pytest.mark.parametrize("poses", [None, "abc", SE3.identity(), [], np.eye(4), [np.eye(3)], [SE3.identity(), None]])
-def test_what_is_no_poses_is_refused(poses: object) -> None:
+def test_what_is_no_poses_is_refused() -> None:
     assert_refused(
         *[
             (partial(function, poses), GeometryError, r"world_from_(agent|ego): expected")
             for function in (relative_pose_to_ego, future_egomotion)
+            for poses in (None, "abc", SE3.identity(), [], np.eye(4), [np.eye(3)], [SE3.identity(), None])
         ],
-    )
-
-
-def test_a_pose_without_an_inverse_is_refused() -> None:
-    assert_refused(
-        (
-            lambda: relative_pose_to_ego(np.zeros((2, 4, 4))),
-            GeometryError,
-            "a transform has no inverse: its rotation is no rotation",
-        ),
+        (lambda: relative_pose_to_ego(np.zeros((2, 4, 4))), GeometryError, ("has no inverse", "no rotation")),
     )
 
 

@@ -19,6 +19,8 @@ from deepaccident_devkit.motion import MotionHeads, predict_instances
 FIRST, SECOND, THIRD = plain.TOKENS
 GRID = BevGrid((-2.0, 2.0, 0.5), (-1.5, 1.5, 0.5))
 LARGE = BevGrid()
+FIRST_DATE = {(1980, 1, 1, 0, 0, 0)}
+"""Of all files: so that the same predictions are the same bytes."""
 
 
 def written(path: Path, task: Any, predictions: dict[str, Any], **options: Any) -> Results:
@@ -92,7 +94,10 @@ def test_instance_maps_are_stored_as_given(tmp_path: Path, highest: int, dtype: 
     assert isinstance(read, MotionOutput)
     np.testing.assert_array_equal(read.instances, maps)  # type: ignore[arg-type]
     with np.load(tmp_path / "m" / "shards" / "00000.npz") as file:
-        assert file[f"{FIRST}/instance"].dtype == dtype
+        assert (file[f"{FIRST}/instance"].dtype, {entry.date_time for entry in file.zip.infolist()}) == (
+            dtype,
+            FIRST_DATE,
+        )
     results.check()
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -96,26 +97,39 @@ def test_breakdowns(run: EvaluationRun) -> None:
 
 @pytest.mark.usefixtures("nothing_long")
 class TestRefused:
-    def test_a_kind_that_the_task_does_not_take(
-        self, da_b: DeepAccident, results: Results, selection: SampleSelection
+    def test_results_that_do_not_fit(
+        self,
+        da_b: DeepAccident,
+        selection: SampleSelection,
+        tmp_path: Path,
+        write_motion: Write,
+        write_accidents: Write,
     ) -> None:
+        """Of another kind, of too short a look ahead, with a damaged shard, missing samples, nothing in common."""
+        tokens, motion = selection.tokens(da_b), EvaluationSetup(task="motion")
+        accidents = write_accidents(tmp_path / "some.json", tokens[1:])
+        others = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
+        maps, damaged = (write_motion(tmp_path / name, tokens) for name in ("motion", "damaged"))
+        shard = next((tmp_path / "damaged" / "shards").iterdir())
+        shard.write_bytes(shard.read_bytes()[:-100])
+        evaluate = partial(evaluate_results, da_b)
         assert_refused(
+            (partial(evaluate, accidents, motion, selection), EvaluationError, ("accident results", "motion results")),
             (
-                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection),
+                partial(evaluate, maps, replace(motion, horizon=3.0), selection),
                 EvaluationError,
-                r"holds accident results; motion is evaluated from motion results",
+                ("look 2 s ahead (5 frames, 0.5 s apart",),
             ),
-        )
-
-    def test_predictions_that_do_not_look_far_enough(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
-    ) -> None:
-        results = write_motion(tmp_path / "motion", selection.tokens(da_b))
-        assert_refused(
+            (partial(evaluate, damaged, motion, selection), ResultsError, (shard.name,)),
             (
-                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection),
-                EvaluationError,
-                r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the",
+                partial(evaluate, accidents, SETUP, selection),
+                ResultsError,
+                (f"some.json: 1 of 6 samples have no prediction ({tokens[0]})",),
+            ),
+            (
+                partial(evaluate, others, SETUP, selection, allow_partial=True),
+                ResultsError,
+                ("of the splits train", "nothing is left to evaluate"),
             ),
         )
 
@@ -127,61 +141,22 @@ class TestRefused:
         silent = [scenario["token"] for scenario in da_b.find(split="train")][:1]
         for token in silent:
             (own_release / "train" / token.replace("/", "/meta/")).with_suffix(".txt").unlink()
-        partial = DeepAccident(dataroot=own_release, verbose=False)
+        release = DeepAccident(dataroot=own_release, verbose=False)
         with ResultsWriter(tmp_path / "none.json", "accident") as writer:
-            for sample in every.tokens(partial):
+            for sample in every.tokens(release):
                 writer.add(sample, [])
         assert_refused(
             (
                 lambda: evaluate_results(
-                    partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every
+                    release, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every
                 ),
                 EvaluationError,
                 r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'",
             ),
         )
-        save_selection(partial.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
+        save_selection(release.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
         chosen = replace(every, split=str(tmp_path / "mine.txt"))
-        check_metas(partial, chosen.tokens(partial), chosen.split)
-
-    def test_a_damaged_shard(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
-    ) -> None:
-        results = write_motion(tmp_path / "motion", selection.tokens(da_b))
-        shard = next((tmp_path / "motion" / "shards").iterdir())
-        shard.write_bytes(shard.read_bytes()[:-100])
-        assert_refused(
-            (
-                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection),
-                ResultsError,
-                shard.name,
-            ),
-        )
-
-    def test_missing_samples(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
-    ) -> None:
-        results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
-        missing = selection.tokens(da_b)[0]
-        assert_refused(
-            (
-                lambda: evaluate_results(da_b, results, SETUP, selection),
-                ResultsError,
-                rf"some.json: 1 of 6 samples have no prediction \({missing}\); the pred",
-            ),
-        )
-
-    def test_nothing_in_common(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
-    ) -> None:
-        other = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
-        assert_refused(
-            (
-                lambda: evaluate_results(da_b, other, SETUP, selection, allow_partial=True),
-                ResultsError,
-                r"of the splits train .*; nothing is left to evaluate",
-            ),
-        )
+        check_metas(release, chosen.tokens(release), chosen.split)
 
 
 def test_only_what_is_in_both_and_marked(
