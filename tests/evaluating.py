@@ -1,6 +1,8 @@
 """An evaluator and loaders for tests of whole runs: in a module that a spawned process can import by name."""
 
+import math
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from deepaccident_devkit import DeepAccident

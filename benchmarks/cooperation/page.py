@@ -124,7 +124,7 @@ joins an agent's own past with its present, joins the maps of up to five agents,
 
 `tiny` has cells of 1 m and learns the labels `clean`. So all numbers here are **clean, 1 m**: limits that the metrics
 count in cells are twice as long in metres as the released ones, and the labels are others. They never stand beside
-numbers of the released protocol, nor beside the paper's ([which numbers compare](comparable_numbers.md)).
+numbers of the released protocol, nor beside the paper's ([which numbers compare](numbers.md#which-number-beside-which-published-one)).
 
 ## Does cooperation help?
 
@@ -139,7 +139,7 @@ MEASURED = """
   tested; nothing is chosen among them.
 - The test has {samples} samples of `ego_vehicle`, within the last two seconds of {pairs} pairs of an accident and its
   twin; in {positives} of them an accident comes. In brackets are intervals of 95 % over these pairs
-  ([how](statistics.md)), none where too few of them change a number. The model seeds are pooled: the intervals say how
+  ([how](numbers.md#intervals)), none where too few of them change a number. The model seeds are pooled: the intervals say how
   a number varies from scene to scene, not from training to training.
 - Actors within 50 m that only a partner sees, by the released rule of visibility ({hidden}, beside {seen} that the ego
   sees), are counted apart. One is on the map if the cell of its centre is foreground at the present, and detected if a

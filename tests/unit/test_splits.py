@@ -186,8 +186,7 @@ def test_only_scenarios_with_more_than_five_labels_of_ego_count(tmp_path: Path) 
     write_tiny_release(tmp_path, frames=7, name=f"{base}03", agents=("ego_vehicle",), labelled=False)
     write_tiny_release(tmp_path, frames=7, name=f"{base}04", agents=("other_vehicle",))
     da = DeepAccident(dataroot=tmp_path, verbose=False)
-    made = official_split(da)
-    tokens = [scenario["token"] for scenario in da.scenario]
+    made, tokens = official_split(da), [scenario["token"] for scenario in da.scenario]
     assert (made.train, made.left_out) == ((tokens[1],), (tokens[0], tokens[2], tokens[3]))
     report = split_report(da, made)
     assert "five labels or fewer: 3 scenarios" in report.to_text()
@@ -302,8 +301,7 @@ def test_what_is_saved_is_read_back(tmp_path_factory: pytest.TempPathFactory, sc
 
 
 def test_split_files_of_ones_own(da_b: DeepAccident, tmp_path: Path) -> None:
-    tokens = [scenario["token"] for scenario in da_b.scenario]
-    path = tmp_path / "mine.txt"
+    tokens, path = [scenario["token"] for scenario in da_b.scenario], tmp_path / "mine.txt"
     lines = [token.replace("/", " ") for token in tokens]
     path.write_bytes(f"\ufeff{lines[0]}  \r\n\r\n \t{lines[1]}\r\n".encode())
     assert da_b.split_scenarios(path) == set(tokens[:2])

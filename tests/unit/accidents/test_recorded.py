@@ -8,6 +8,7 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.accidents.recorded import CLASS_MASSES, accident_of, accidents_of, masses_of
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.tables.records import ScenarioRecord
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 
@@ -26,47 +27,37 @@ def test_the_pair_of_an_accident(da_motion: DeepAccident) -> None:
     assert (accident.masses > 0).all()
 
 
+def without_first(root: Path, scenario: ScenarioRecord, *frames: int) -> None:
+    """Take the first of the pair out of all labels of some frames."""
+    first, agent = str(scenario["collision"]["ids"][0]), scenario["collision"]["agents"][0]
+    folder = root / scenario["folder"] / scenario["scenario_type"]
+    for label in folder.glob(f"*/label/{scenario['name']}/*.txt"):
+        if int(label.stem[-3:]) in frames:
+            gone = [first, "-100"] if f"/{agent}/" in str(label) else [first]
+            rows = label.read_text().splitlines(keepends=True)
+            label.write_text("".join(row for row in rows if row.split()[-3:-2] not in [[each] for each in gone]))
+    shutil.rmtree(root / ".deepaccident", ignore_errors=True)
+
+
 def test_a_missing_label_is_bridged_the_shorter_way(own_release: Path) -> None:
     scenario = DeepAccident("v1", own_release, verbose=False).find(collision=True)[0]
     whole = accident_of(DeepAccident("v1", own_release, verbose=False), scenario)
-    first = scenario["collision"]["ids"][0]
-    agent = dict(zip(scenario["collision"]["ids"], scenario["collision"]["agents"], strict=True))[first]
-    for label in (own_release / scenario["folder"] / scenario["scenario_type"]).glob(
-        f"*/label/{scenario['name']}/*_002.txt"
-    ):
-        rows = [line for line in label.read_text().splitlines(keepends=True) if line.split()[-3:-2] != [str(first)]]
-        if f"/{agent}/" in str(label):
-            rows = [line for line in rows if " -100 " not in line]
-        label.write_text("".join(rows))
-    shutil.rmtree(own_release / ".deepaccident")
+    without_first(own_release, scenario, 2)
     accident = accident_of(DeepAccident("v1", own_release, verbose=False), scenario)
-    assert whole is not None
-    assert accident is not None
     assert (whole.interpolated, accident.interpolated) == (0, 1)
     np.testing.assert_allclose(accident.paths[0, 1], whole.paths[0, [0, 2]].mean(axis=0), atol=1e-3)
 
 
 def test_scenarios_that_lack_something_are_named_and_the_others_stay(own_release: Path) -> None:
     accidents = DeepAccident("v1", own_release, verbose=False).find(collision=True)
-    without_meta, seen_once = accidents[:2]
-    (
-        own_release / without_meta["folder"] / without_meta["scenario_type"] / "meta" / f"{without_meta['name']}.txt"
-    ).unlink()
-    first, agent = str(seen_once["collision"]["ids"][0]), seen_once["collision"]["agents"][0]
-    for label in (own_release / seen_once["folder"] / seen_once["scenario_type"]).glob(
-        f"*/label/{seen_once['name']}/*.txt"
-    ):
-        if not label.stem.endswith("_002"):
-            own, rows = f"/{agent}/" in str(label), label.read_text().splitlines(keepends=True)
-            label.write_text(
-                "".join(row for row in rows if row.split()[-3:-2] not in ([first], ["-100"] if own else [first]))
-            )
-    shutil.rmtree(own_release / ".deepaccident")
+    silent, seen_once = accidents[:2]
+    (own_release / silent["folder"] / silent["scenario_type"] / "meta" / f"{silent['name']}.txt").unlink()
+    without_first(own_release, seen_once, 1, 3, 4)
     found, skipped = accidents_of(DeepAccident("v1", own_release, verbose=False))
     assert {each.scenario for each in found} == {each["token"] for each in accidents[2:]}
     reasons = {each.scenario: each.reason for each in skipped}
-    assert reasons.keys() == {without_meta["token"], seen_once["token"]}
-    assert "no meta file" in reasons[without_meta["token"]]
+    assert reasons.keys() == {silent["token"], seen_once["token"]}
+    assert "no meta file" in reasons[silent["token"]]
     assert "together at 1 frames" in reasons[seen_once["token"]]
 
 

@@ -49,12 +49,6 @@ def test_the_matrix_is_a_read_only_copy_and_the_callers_stays_writable() -> None
         assert not array.flags.writeable
 
 
-def test_no_points_and_integer_points() -> None:
-    pose = SE3.from_yaw(0.3, (1, 2, 3))
-    assert pose.apply(np.zeros((0, 3))).shape == (0, 3)
-    assert_allclose(pose.apply([[0, 0, 0]]), [[1, 2, 3]])
-
-
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
@@ -72,11 +66,6 @@ def test_what_is_no_rigid_transform_is_refused(fault: object, message: str) -> N
     assert_refused(
         (lambda: SE3(fault), GeometryError, message),
     )
-
-
-def test_single_precision_rotations_are_taken() -> None:
-    turn = SE3.from_quaternion(Quaternion(1, 2, 3, 4)).matrix.astype(np.float32)
-    assert_allclose(SE3(turn).matrix, turn, rtol=0)
 
 
 @pytest.fixture

@@ -88,8 +88,7 @@ def test_two_that_stand_are_none_and_frames_at_which_both_stand_do_not_count() -
 
 
 def test_what_rides_on_another_is_no_pair_and_one_that_is_hit_is() -> None:
-    sizes = {2: BIKE, 3: PEDESTRIAN}
-    ride = {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 6)}
+    sizes, ride = {2: BIKE, 3: PEDESTRIAN}, {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 6)}
     assert pairs_in(ride, sizes=sizes) == []
     assert pairs_in({**ride, 3: [*straight(3, 0.2, 0, 6), *straight(3, 1.9, 3, 0)]}, sizes=sizes) == [(2, 3)]
     assert pairs_in({2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 0)}, sizes=sizes) == [(2, 3)]
@@ -124,8 +123,7 @@ def test_braking_is_in_the_time_with_accelerations_alone() -> None:
 
 
 def test_delta_v_follows_the_masses() -> None:
-    paths = {1: straight(3, 0, 0, 10), 2: straight(3, 9, 0, 0)}
-    sizes = {2: PEDESTRIAN}
+    paths, sizes = {1: straight(3, 0, 0, 10), 2: straight(3, 9, 0, 0)}, {2: PEDESTRIAN}
     _, measured, _ = of_scene(paths, sizes=sizes)
     car, pedestrian = measured.values["delta_v"][0, 0]
     assert car + pedestrian == pytest.approx(10)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import jsonschema
@@ -62,34 +63,29 @@ def test_it_is_computed_once_and_kept(own: DeepAccident, computed: list[str]) ->
     assert_same(own.interactions(record), first)
 
 
-@pytest.mark.parametrize("fault", ["cut", "changed", "empty", "foreign", "older", "folder"])
+FAULTS: dict[str, Callable[[Path, bytes], object]] = {
+    "cut": lambda path, content: path.write_bytes(content[:-20]),
+    "changed": lambda path, content: path.write_bytes(content[:400] + bytes([content[400] ^ 1]) + content[401:]),
+    "empty": lambda path, _: path.write_bytes(b""),
+    "foreign": lambda path, _: shutil.copyfile(next(path.parents[4].glob("kept/*/*")), path),
+    "older": lambda path, content: path.write_bytes(content),
+    "folder": lambda path, _: (path.unlink(), path.mkdir()),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
 def test_a_file_that_is_no_good_is_made_again(
     own: DeepAccident, computed: list[str], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     token = own.scenario[0]["token"]
     path = scenario.kept_path(own, token)
-    if fault == "older":
-        monkeypatch.setattr(scenario, "VERSION", "0")
-    first, content = own.interactions(token), path.read_bytes()
-    match fault:
-        case "cut":
-            path.write_bytes(content[:-20])
-        case "changed":
-            path.write_bytes(content[:400] + bytes([content[400] ^ 1]) + content[401:])
-        case "empty":
-            path.write_bytes(b"")
-        case "foreign":
-            shutil.copyfile(own.tables_folder.parent / "kept" / token, path)
-        case "older":
-            monkeypatch.setattr(scenario, "VERSION", "1")
-        case "folder":
-            path.unlink()
-            path.mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(scenario, "VERSION", "0" if fault == "older" else scenario.VERSION)
+        first = own.interactions(token)
+    FAULTS[fault](path, path.read_bytes())
     assert_same(own.interactions(token), first)
-    assert len(computed) == 2
-    if fault != "folder":
-        assert_same(own.interactions(token), first)
-        assert len(computed) == 2
+    assert_same(own.interactions(token), first)
+    assert len(computed) == 2 + (fault == "folder")
 
 
 def test_where_nothing_can_be_written_it_is_computed_each_time(own: DeepAccident, computed: list[str]) -> None:

@@ -21,15 +21,6 @@ def test_the_default_is_the_released_labels_in_the_devkits_orientation() -> None
     assert config == MotionLabelConfig.preset("deepaccident")
 
 
-def test_presets() -> None:
-    for seconds in (3, 4, 5):
-        assert MotionLabelConfig.preset(f"deepaccident-{seconds}s").label_frames == 1 + 2 * seconds
-    fiery = MotionLabelConfig.preset("fiery", future_frames=2)
-    assert (fiery.grid.orientation, fiery.draw_ego, fiery.label_frames) == ("fiery", False, 3)
-    assert MotionLabelConfig.preset("beverse").only_vehicle
-    assert {name: MotionLabelConfig.preset(name) for name in PRESETS} == dict(PRESETS)
-
-
 def test_the_orientation_is_the_grids_and_a_new_grid_brings_its_own() -> None:
     fiery, released = BevGrid(orientation="fiery"), BevGrid(orientation="released")
     assert MotionLabelConfig(grid=fiery).grid is fiery

@@ -123,149 +123,130 @@ def assert_same(one: MotionLabels, other: MotionLabels) -> None:
     assert dict(one.id_map) == dict(other.id_map)
 
 
-class TestTime:
-    def test_first_frame(self, small: DeepAccident) -> None:
-        labels = small.motion_labels(f"{EGO}/001")
-        assert labels.valid.tolist() == [False] * 2 + [True] * 5
-        assert_array_equal(labels.future_egomotion[:2], 0)
-        assert labels.future_egomotion[2:].any(axis=1).all()
-        assert labels.instance.any(axis=(1, 2)).all()
-
-    @pytest.mark.parametrize("number", [12, 26, 27, 31])
-    def test_last_frames(self, small: DeepAccident, number: int) -> None:
-        there = [number + 5 * step <= 31 for step in range(-2, 5)]
-        after = [number + 5 * step <= 31 for step in range(-1, 6)]
-        for protocol, mark in (("released", 0), ("clean", 255)):
-            labels = small.motion_labels(f"{EGO}/{number:03d}", MotionLabelConfig(protocol=protocol))
-            assert (labels.valid.tolist(), labels.future_egomotion.any(axis=1).tolist()) == (there, after)
-            missing = ~labels.label_valid
-            for name in ("segmentation", "instance", "centerness"):
-                assert (getattr(labels, name)[missing] == mark).all()
-            assert (labels.offset[missing] == 255).all()
-            assert (labels.flow[missing] == 255).all()
-            last = int(labels.label_valid.sum()) - 1
-            assert (labels.flow[last] == 255).all()
-            assert (labels.flow[:last] != 255).any(axis=(1, 2, 3)).all()
-
-    def test_a_step_and_a_past_that_leave_the_recording(self, small: DeepAccident) -> None:
-        labels = small.motion_labels(f"{EGO}/016", MotionLabelConfig(receptive_field=9, future_frames=1, step=20))
-        assert labels.valid.tolist() == [False] * 8 + [True, False]
-        assert_array_equal(labels.future_egomotion, 0)
-        assert not labels.instance[1].any()
+def test_labels_of_the_first_frame(small: DeepAccident) -> None:
+    labels = small.motion_labels(f"{EGO}/001")
+    assert labels.valid.tolist() == [False] * 2 + [True] * 5
+    assert_array_equal(labels.future_egomotion[:2], 0)
+    assert labels.future_egomotion[2:].any(axis=1).all()
+    assert labels.instance.any(axis=(1, 2)).all()
 
 
-class TestWhoIsDrawn:
-    def test_own_row_only_as_the_egos_own_box(self, small: DeepAccident) -> None:
-        """−101 and never −100, whether unseen actors are left out or not."""
-        for filtered in (True, False):
-            for protocol in ("released", "clean"):
-                config = MotionLabelConfig(filter_invisible=filtered, protocol=protocol)
-                with_ego = small.motion_labels(f"{EGO}/006", config)
-                without = small.motion_labels(f"{EGO}/006", replace(config, draw_ego=False))
-                assert -100 not in with_ego.id_map
-                assert min(drawn(with_ego, OWN_BOX_ID)) > 20
-                assert {*with_ego.id_map} - {*without.id_map} == {OWN_BOX_ID}
-                middle = np.s_[:, 96:104, 94:106]
-                assert with_ego.segmentation[middle].any(axis=(1, 2)).all()
-                assert not without.segmentation[middle].any()
+@pytest.mark.parametrize("number", [12, 26, 27, 31])
+def test_labels_of_the_last_frames(small: DeepAccident, number: int) -> None:
+    there = [number + 5 * step <= 31 for step in range(-2, 5)]
+    after = [number + 5 * step <= 31 for step in range(-1, 6)]
+    for protocol, mark in (("released", 0), ("clean", 255)):
+        labels = small.motion_labels(f"{EGO}/{number:03d}", MotionLabelConfig(protocol=protocol))
+        assert (labels.valid.tolist(), labels.future_egomotion.any(axis=1).tolist()) == (there, after)
+        missing = ~labels.label_valid
+        for name in ("segmentation", "instance", "centerness"):
+            assert (getattr(labels, name)[missing] == mark).all()
+        assert (labels.offset[missing] == 255).all()
+        assert (labels.flow[missing] == 255).all()
+        last = int(labels.label_valid.sum()) - 1
+        assert (labels.flow[last] == 255).all()
+        assert (labels.flow[:last] != 255).any(axis=(1, 2, 3)).all()
 
-    def test_the_pole_has_no_own_box(self, small: DeepAccident) -> None:
-        for protocol in LABEL_PROTOCOLS:
-            labels = small.motion_labels(f"{POLE}/006", MotionLabelConfig(protocol=protocol))
-            assert OWN_BOX_ID not in labels.id_map
-            assert not labels.segmentation[:, 98:102, 98:102].any()
 
-    def test_only_vehicle_leaves_out_pedestrians(self, small: DeepAccident) -> None:
-        assert min(drawn(small.motion_labels(f"{EGO}/006"), WALKER)) > 0
-        assert {*small.motion_labels(f"{EGO}/006", MotionLabelConfig(only_vehicle=True)).id_map} == {OWN_BOX_ID, VAN}
+def test_a_step_and_a_past_that_leave_the_recording(small: DeepAccident) -> None:
+    labels = small.motion_labels(f"{EGO}/016", MotionLabelConfig(receptive_field=9, future_frames=1, step=20))
+    assert labels.valid.tolist() == [False] * 8 + [True, False]
+    assert_array_equal(labels.future_egomotion, 0)
+    assert not labels.instance[1].any()
 
-    def test_who_appears_later(self, small: DeepAccident) -> None:
-        """Present at 6: the car is seen from 11 on. Released: never drawn; clean: from then on."""
-        assert LATER not in small.motion_labels(f"{EGO}/006").id_map
-        for config in (MotionLabelConfig(protocol="clean"), changed(drawn_when="since"), changed(drawn_when="now")):
-            counts = drawn(small.motion_labels(f"{EGO}/006", config), LATER)
-            assert counts[0] == 0
-            assert min(counts[1:]) > 20
-        assert drawn(small.motion_labels(f"{EGO}/006", MotionLabelConfig(filter_invisible=False)), LATER)[0] > 20
 
-    def test_untracked_actors_are_seen_by_nobody(self, small: DeepAccident) -> None:
+def test_own_row_only_as_the_egos_own_box(small: DeepAccident) -> None:
+    """−101 and never −100, whether unseen actors are left out or not."""
+    for filtered in (True, False):
         for protocol in ("released", "clean"):
-            assert (
-                not small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
-                .segmentation[:, 70:130, 50:70]
-                .any()
-            )
-            everybody = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol, filter_invisible=False))
-            left = [len(np.unique(frame[70:130, 50:70])) - 1 for frame in everybody.instance]
-            assert left == [1 if protocol == "released" else 2] * 5
-
-    def test_whose_sight_counts(self, tmp_path: Path) -> None:
-        """The van is seen by the pole alone."""
-
-        def seen_by_pole(agent: str, frame: int) -> list[str]:
-            return [
-                line.replace(" 12 True", " 0 False") if agent != "infrastructure" else line
-                for line in tiny.label_lines(agent, frame)
-            ]
-
-        release = opened(tiny.write_tiny_release(tmp_path, lines_of=seen_by_pole))
-        for agents, there in {
-            None: True,
-            "all": True,
-            "+infrastructure": True,
-            ("infrastructure",): True,
-            "single": False,
-            "vehicles": False,
-            ("ego_vehicle", "other_vehicle"): False,
-        }.items():
-            assert (VAN in release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)).id_map) == there, (
-                agents
-            )
+            config = MotionLabelConfig(filter_invisible=filtered, protocol=protocol)
+            with_ego = small.motion_labels(f"{EGO}/006", config)
+            without = small.motion_labels(f"{EGO}/006", replace(config, draw_ego=False))
+            assert -100 not in with_ego.id_map
+            assert min(drawn(with_ego, OWN_BOX_ID)) > 20
+            assert {*with_ego.id_map} - {*without.id_map} == {OWN_BOX_ID}
+            middle = np.s_[:, 96:104, 94:106]
+            assert with_ego.segmentation[middle].any(axis=(1, 2)).all()
+            assert not without.segmentation[middle].any()
 
 
-class TestIds:
-    def test_ids_go_on_from_the_sample_before(self, small: DeepAccident) -> None:
-        """As a worker of the released code has them; what nobody met before comes behind."""
-        assert {*small.motion_labels(f"{EGO}/001").id_map} == {OWN_BOX_ID, VAN, WALKER}
-        before = {VAN: 1, 4711: 2}
-        second = small.motion_labels(f"{EGO}/016", id_map=before)
-        assert dict(second.id_map) == {VAN: 1, 4711: 2, OWN_BOX_ID: 3, LATER: 4, WALKER: 5}
-        assert before == {VAN: 1, 4711: 2}
-        fresh = small.motion_labels(f"{EGO}/016")
-        for actor, number in fresh.id_map.items():
-            assert_array_equal(fresh.instance == number, second.instance == second.id_map[actor])
-        for name in ("segmentation", "centerness", "offset", "flow"):
-            assert_array_equal(getattr(fresh, name), getattr(second, name))
-
-    def test_they_count_in_the_order_drawn(self, small: DeepAccident) -> None:
-        assert dict(small.motion_labels(f"{EGO}/016").id_map) == {OWN_BOX_ID: 1, VAN: 2, LATER: 3, WALKER: 4}
-        assert dict(small.motion_labels(f"{POLE}/016").id_map) == {VAN: 1, LATER: 2, WALKER: 3}
+def test_the_pole_has_no_own_box(small: DeepAccident) -> None:
+    for protocol in LABEL_PROTOCOLS:
+        labels = small.motion_labels(f"{POLE}/006", MotionLabelConfig(protocol=protocol))
+        assert OWN_BOX_ID not in labels.id_map
+        assert not labels.segmentation[:, 98:102, 98:102].any()
 
 
-class TestAtPresent:
-    def test_vectors_turn_with_their_cells(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """The ego turns by 40 degrees within 2 s: at the present, a cell and its offset still lead to one place.
+def test_untracked_actors_are_seen_by_nobody(small: DeepAccident) -> None:
+    for protocol in ("released", "clean"):
+        assert (
+            not small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
+            .segmentation[:, 70:130, 50:70]
+            .any()
+        )
+        everybody = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol, filter_invisible=False))
+        left = [len(np.unique(frame[70:130, 50:70])) - 1 for frame in everybody.instance]
+        assert left == [1 if protocol == "released" else 2] * 5
 
-        The released ones lead elsewhere, the farther the longer the van.
-        """
-        monkeypatch.setattr(tiny, "ego_to_world", lambda _agent, frame: tiny.pose(2.0 * frame))
-        release = opened(tiny.write_tiny_release(tmp_path, frames=31))
-        errors = {}
-        for protocol in ("released", "clean"):
-            labels = release.motion_labels(f"{EGO}/003", MotionLabelConfig(protocol=protocol)).to_present()
-            assert min(drawn(labels, VAN)) > 20
-            errors[protocol] = [spread(labels, t, VAN) for t in range(5)]
-        assert errors["released"][0] == 0 < min(errors["released"][2:]), errors
-        assert errors["released"][4] > 2, errors
-        assert max(errors["clean"]) <= 1, errors
 
-    def test_the_present_frame_is_as_it_was(self, small: DeepAccident) -> None:
-        for protocol in LABEL_PROTOCOLS:
-            labels = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
-            present = labels.to_present()
-            for name in MAPS:
-                assert_array_equal(getattr(labels, name)[0], getattr(present, name)[0])
-            assert present.at_present
+def test_whose_sight_counts(tmp_path: Path) -> None:
+    """The van is seen by the pole alone."""
+
+    def seen_by_pole(agent: str, frame: int) -> list[str]:
+        return [
+            line.replace(" 12 True", " 0 False") if agent != "infrastructure" else line
+            for line in tiny.label_lines(agent, frame)
+        ]
+
+    release = opened(tiny.write_tiny_release(tmp_path, lines_of=seen_by_pole))
+    for agents, there in {
+        None: True,
+        "all": True,
+        "+infrastructure": True,
+        ("infrastructure",): True,
+        "single": False,
+        "vehicles": False,
+        ("ego_vehicle", "other_vehicle"): False,
+    }.items():
+        assert (VAN in release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)).id_map) == there, agents
+
+
+def test_ids_go_on_from_the_sample_before(small: DeepAccident) -> None:
+    """As a worker of the released code has them; what nobody met before comes behind."""
+    assert {*small.motion_labels(f"{EGO}/001").id_map} == {OWN_BOX_ID, VAN, WALKER}
+    before = {VAN: 1, 4711: 2}
+    second = small.motion_labels(f"{EGO}/016", id_map=before)
+    assert (dict(second.id_map), before) == ({VAN: 1, 4711: 2, OWN_BOX_ID: 3, LATER: 4, WALKER: 5}, {VAN: 1, 4711: 2})
+    fresh = small.motion_labels(f"{EGO}/016")
+    for actor, number in fresh.id_map.items():
+        assert_array_equal(fresh.instance == number, second.instance == second.id_map[actor])
+    for name in ("segmentation", "centerness", "offset", "flow"):
+        assert_array_equal(getattr(fresh, name), getattr(second, name))
+
+
+def test_vectors_turn_with_their_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ego turns by 40 degrees within 2 s: at the present, a cell and its offset still lead to one place.
+
+    The released ones lead elsewhere, the farther the longer the van.
+    """
+    monkeypatch.setattr(tiny, "ego_to_world", lambda _agent, frame: tiny.pose(2.0 * frame))
+    release, errors = opened(tiny.write_tiny_release(tmp_path, frames=31)), {}
+    for protocol in ("released", "clean"):
+        labels = release.motion_labels(f"{EGO}/003", MotionLabelConfig(protocol=protocol)).to_present()
+        assert min(drawn(labels, VAN)) > 20
+        errors[protocol] = [spread(labels, t, VAN) for t in range(5)]
+    assert errors["released"][0] == 0 < min(errors["released"][2:]), errors
+    assert errors["released"][4] > 2, errors
+    assert max(errors["clean"]) <= 1, errors
+
+
+def test_the_present_frame_is_as_it_was(small: DeepAccident) -> None:
+    for protocol in LABEL_PROTOCOLS:
+        labels = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
+        present = labels.to_present()
+        for name in MAPS:
+            assert_array_equal(getattr(labels, name)[0], getattr(present, name)[0])
+        assert present.at_present
 
 
 def spread(labels: MotionLabels, t: int, actor: int) -> float:
@@ -274,56 +255,52 @@ def spread(labels: MotionLabels, t: int, actor: int) -> float:
     return float(np.ptp(cells + labels.offset[t][:, cells[:, 0], cells[:, 1]].T, axis=0).max()) / 2
 
 
-class TestErrors:
-    def test_a_sample_without_a_label(self, tmp_path: Path) -> None:
-        release = opened(tiny.write_tiny_release(tmp_path, labelled=False))
-        assert_refused(
+def test_a_sample_without_a_label(tmp_path: Path) -> None:
+    release = opened(tiny.write_tiny_release(tmp_path, labelled=False))
+    assert_refused(
+        (
+            lambda: release.motion_labels(f"{EGO}/002"),
+            NotAvailableError,
+            r"ego_vehicle/002 has no label \(the test split has",
+        ),
+    )
+
+
+def test_agents_of_a_partial_release(tmp_path: Path) -> None:
+    two = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines))
+    assert VAN in two.motion_labels(f"{EGO}/002").id_map
+    assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
+    assert_refused(
+        *[
             (
-                lambda: release.motion_labels(f"{EGO}/002"),
+                partial(two.motion_labels, f"{EGO}/002", MotionLabelConfig(agents=agents)),
                 NotAvailableError,
-                r"ego_vehicle/002 has no label \(the test split has",
-            ),
-        )
+                r"agents: other_vehicle\w* is not in this release|behind is not",
+            )
+            for agents in ("+other", "all", ("ego_vehicle", "other_vehicle"))
+        ],
+    )
+    assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+other", filter_invisible=False)).id_map
 
-    @pytest.mark.parametrize("sample", ["", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3}])
-    def test_what_is_no_sample(self, small: DeepAccident, sample: object) -> None:
-        assert_refused(
-            (lambda: small.motion_labels(sample), TokenError, r"no token|expected a token or a record"),
-        )
 
-    def test_agents_of_a_partial_release(self, tmp_path: Path) -> None:
-        two = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines))
-        assert VAN in two.motion_labels(f"{EGO}/002").id_map
-        assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
-        assert_refused(
-            *[
-                (
-                    partial(two.motion_labels, f"{EGO}/002", MotionLabelConfig(agents=agents)),
-                    NotAvailableError,
-                    r"agents: other_vehicle\w* is not in this release|behind is not",
-                )
-                for agents in ("+other", "all", ("ego_vehicle", "other_vehicle"))
-            ],
-        )
-        assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+other", filter_invisible=False)).id_map
+def test_what_is_no_sample_and_agents_that_do_not_exist(small: DeepAccident) -> None:
+    assert_refused(
+        *[
+            (partial(small.motion_labels, sample), TokenError, r"no token|expected a token or a record")
+            for sample in ("", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3})
+        ],
+        *[
+            (lambda wrong=wrong: MotionLabelConfig(agents=wrong), ChoiceError, r"agents?: expected")
+            for wrong in ("everybody", "ego_vehicle", ("pole",), ())
+        ],
+    )
 
-    @pytest.mark.parametrize("agents", ["everybody", "ego_vehicle", ("pole",), ()])
-    def test_agents_that_do_not_exist(self, small: DeepAccident, agents: object) -> None:
-        assert_refused(
-            (
-                lambda: small.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)),
-                ChoiceError,
-                r"agents?: expected",
-            ),
-        )
 
-    def test_an_agent_without_labels_sees_nothing(self, tmp_path: Path) -> None:
-        tiny.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)
-        release = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle",)))
-        assert {*release.motion_labels(f"{EGO}/002").id_map} == {OWN_BOX_ID, VAN}
-        assert {*release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",))).id_map} == {
-            OWN_BOX_ID
-        }
+def test_an_agent_without_labels_sees_nothing(tmp_path: Path) -> None:
+    tiny.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)
+    release = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle",)))
+    assert {*release.motion_labels(f"{EGO}/002").id_map} == {OWN_BOX_ID, VAN}
+    assert {*release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",))).id_map} == {OWN_BOX_ID}
 
 
 def test_a_label_without_boxes(tmp_path: Path) -> None:
@@ -410,39 +387,22 @@ def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:
     assert str(told.value).endswith(f"or choose another split: it has {here.pop()}: 2 scenarios")
 
 
-@pytest.mark.parametrize("horizon", ["2", None, [2.0]])
-def test_a_horizon_is_a_number(da_motion: DeepAccident, horizon: object) -> None:
-    with pytest.raises(ConfigError, match="horizon: expected a number of seconds"):
-        samples(da_motion, "train", "evaluate", "paper", horizon=horizon)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        ({"purpose": "testing"}, "purpose: expected one of train, evaluate, all, every"),
-        ({"protocol": "boxes"}, "protocol: expected one of released, paper"),
-        ({"protocol": "paper", "scope": "some"}, "scope: expected one of accident, all"),
-    ],
-)
-def test_unknown_choices_name_those_there_are(da_motion: DeepAccident, arguments: dict[str, str], told: str) -> None:
-    with pytest.raises(ChoiceError, match=re.escape(told)):
-        samples(da_motion, "train", **{"purpose": "train", **arguments})  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("horizon", [0.0, 0.4999, 0.7, -1.0, float("nan"), float("inf")])
-def test_a_horizon_is_a_number_of_half_seconds(da_motion: DeepAccident, horizon: float) -> None:
+def test_choices_and_horizons_that_there_are_not(da_motion: DeepAccident) -> None:
+    """Horizons are numbers of half seconds, and the released protocol has one."""
+    evaluate = partial(samples, da_motion, "train", "evaluate")
     assert_refused(
-        (
-            lambda: samples(da_motion, "train", "evaluate", "paper", horizon=horizon),
-            ConfigError,
-            r"choose 0\.5, 1, 1\.5",
-        ),
-    )
-
-
-def test_the_released_protocol_has_one_horizon(da_motion: DeepAccident) -> None:
-    assert_refused(
-        (lambda: samples(da_motion, "train", "evaluate", horizon=3.0), ConfigError, "protocol='paper'"),
+        (lambda: samples(da_motion, "train", "testing"), ChoiceError, ("purpose", "train, evaluate, all, every")),
+        (partial(evaluate, "boxes"), ChoiceError, ("protocol: expected one of released, paper",)),
+        (partial(evaluate, "paper", scope="some"), ChoiceError, ("scope: expected one of accident, all",)),
+        (partial(evaluate, horizon=3.0), ConfigError, ("protocol='paper'",)),
+        *[
+            (partial(evaluate, "paper", horizon=horizon), ConfigError, ("horizon: expected a number of seconds",))
+            for horizon in ("2", None, [2.0])
+        ],
+        *[
+            (partial(evaluate, "paper", horizon=horizon), ConfigError, ("choose 0.5, 1, 1.5",))
+            for horizon in (0.0, 0.4999, 0.7, -1.0, float("nan"), float("inf"))
+        ],
     )
 
 
@@ -450,8 +410,7 @@ def test_a_split_without_labels_says_so(own_release: Path) -> None:
     for folder in own_release.glob("**/label"):
         for path in folder.rglob("*.txt"):
             path.unlink()
-    unlabelled = DeepAccident("v1", own_release, verbose=False)
-    split = own_release / "mine.txt"
+    unlabelled, split = DeepAccident("v1", own_release, verbose=False), own_release / "mine.txt"
     split.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
     assert_refused(
         (lambda: samples(unlabelled, split, "train"), NotAvailableError, "none of its samples here has labels"),

@@ -1,7 +1,7 @@
 """Whose sight counts: configurations of agents, and who of them sees an accident."""
 
 import itertools
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 
@@ -60,23 +60,6 @@ def test_partners_are_renamed_as_in_the_released_code(ego: str, side: str, expec
     assert (everyone, set(everyone)) == ((ego, *expected), set(AGENTS))
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: AgentConfig("mine", ("front",)), r"partners: expected one of behind, .*found 'front'"),
-        (lambda: AGENT_CONFIGS["all"].agents_for("bus"), r"agent: expected one of ego_vehicle, .*found 'bus'"),
-        (
-            lambda: AGENT_CONFIGS["all"].agents_for(POLE, side="left"),
-            "side: expected one of ego_vehicle, other_vehicle, found 'left'",
-        ),
-    ],
-)
-def test_wrong_roles_agents_and_sides(make: Callable[[], object], sentence: str) -> None:
-    assert_refused(
-        (make, ChoiceError, sentence),
-    )
-
-
 def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
     sample = f"{da_b.scenario[0]['token']}/{OTHER}/002"
     assert cooperating_agents(da_b, sample) == (OTHER, EGO, EGO_BEHIND, OTHER_BEHIND, POLE)
@@ -123,37 +106,35 @@ def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
     assert MotionLabelConfig(agents="available").digest == MotionLabelConfig().digest
 
 
-@pytest.mark.parametrize("agents", [3, 2.5, object()])
-def test_what_names_no_agents_is_refused(da_b: DeepAccident, agents: object) -> None:
+def test_names_roles_sides_and_views_that_are_none(da_b: DeepAccident) -> None:
+    sample, everyone, agents = da_b.sample[0], AGENT_CONFIGS["all"], np.array(["infrastructure", "ego_vehicle"])
+    assert cooperating_agents(da_b, sample, agents) == ("ego_vehicle", "infrastructure")
+    assert AgentConfig("mine", ["behind"]) == AgentConfig("mine", ("behind",))
     assert_refused(
+        (lambda: AgentConfig("mine", ("front",)), ChoiceError, ("partners: expected one of behind", "'front'")),
+        (lambda: everyone.agents_for("bus"), ChoiceError, ("agent: expected one of ego_vehicle", "'bus'")),
         (
-            lambda: da_b.cooperative_boxes(da_b.sample[0], agents=agents),
+            lambda: everyone.agents_for(POLE, side="left"),
             ChoiceError,
-            "agents: expected agents' names or a configuration, found",
+            ("side: expected one of ego_vehicle, other_vehicle", "'left'"),
         ),
-    )
-
-
-def test_names_of_another_kind(da_b: DeepAccident) -> None:
-    assert_refused(
         *[
-            (
-                partial(cooperating_agents, da_b, da_b.sample[0], wrong),
-                ChoiceError,
-                r"agent: expected one of ego_vehicle, .* found",
-            )
+            (partial(da_b.cooperative_boxes, sample, agents=wrong), ChoiceError, ("agents' names or a configuration",))
+            for wrong in (3, 2.5, object())
+        ],
+        *[
+            (partial(cooperating_agents, da_b, sample, wrong), ChoiceError, ("agent: expected one of ego_vehicle",))
             for wrong in ([None], [3], [np.zeros(2)])
         ],
-    )
-    named = cooperating_agents(da_b, da_b.sample[0], np.array(["infrastructure", "ego_vehicle"]))
-    assert named == ("ego_vehicle", "infrastructure")
-    assert_refused(
         *[
-            (partial(AgentConfig, "mine", wrong), ChoiceError, "partners: expected roles, found")
+            (partial(AgentConfig, "mine", wrong), ChoiceError, ("partners: expected roles",))
             for wrong in (3, "behind", None)
         ],
+        *[
+            (partial(accident_visible_mask, views), GeometryError, ("in_view: expected",))
+            for views in ([True], np.zeros((3, 2)), True, "abc", None)
+        ],
     )
-    assert AgentConfig("mine", ["behind"]) == AgentConfig("mine", ("behind",))
 
 
 VIEWS = np.array(list(itertools.product([False, True], repeat=3)))
@@ -170,13 +151,6 @@ def test_without_a_collision_and_behind_sheer_curtains_all_is_seen() -> None:
     assert accident_visible_mask(VIEWS, collision=False).all()
     assert accident_visible_mask(VIEWS, exempt=True).all()
     assert_array_equal(accident_visible_mask(VIEWS, exempt=[True] + [False] * 7), [True, *SEEN[1:]])
-
-
-@pytest.mark.parametrize("views", [[True], np.zeros((3, 2)), True, "abc", None])
-def test_views_are_of_three_moments(views: object) -> None:
-    assert_refused(
-        (lambda: accident_visible_mask(views), GeometryError, "in_view: expected"),
-    )
 
 
 def test_a_pair_is_in_view_if_all_but_the_agent_itself_are() -> None:

@@ -160,21 +160,10 @@ def test_agents_without_labels_see_nothing(tmp_path: Path) -> None:
     assert (len(da.cooperative_boxes(sample, frame="ego")), da.visible_instances(sample)) == (0, [])
 
 
-def test_frames_and_samples_that_do_not_exist(da: DeepAccident) -> None:
-    assert_refused(
-        (
-            lambda: da.cooperative_boxes(da.sample[0], frame="map"),
-            ChoiceError,
-            "frame: expected one of world, ego, lidar",
-        ),
-    )
-
-
 def test_the_callers_release_is_not_changed(da: DeepAccident) -> None:
     before = da.boxes(da.sample[0], "lidar").center.copy()
     boxes = da.cooperative_boxes(da.sample[0])
-    with pytest.raises(ValueError, match="read-only"):
-        boxes.center[0] = 0
+    assert not boxes.center.flags.writeable
     assert_array_equal(da.boxes(da.sample[0], "lidar").center, before)
     assert np.isfinite(boxes.center).all()
 

@@ -15,9 +15,7 @@ from deepaccident_devkit import DeepAccident, v2x
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link, PoseNoise
-from deepaccident_devkit.v2x.messages import messages, uniforms
-
-FIRST_DRAW = (0.8390037267799063, 0.07483574513276203, 0.8888751418060693, 0.6098842047921865)
+from deepaccident_devkit.v2x.messages import messages
 
 
 @pytest.fixture
@@ -66,19 +64,6 @@ def test_settings_that_are_not_possible() -> None:
     assert pickle.loads(pickle.dumps(Link(pose_noise=0.3))) == Link(pose_noise=0.3)
 
 
-def test_draws_have_the_moments_that_they_say() -> None:
-    keys = [str(number) for number in range(20000)]
-    paper = np.array([PoseNoise(mean=0.5, std=0.02, heading_std=0.1).draw(key) for key in keys])
-    distance = np.hypot(paper[:, 0], paper[:, 1])
-    assert_allclose([distance.mean(), distance.std()], [0.5, 0.02], atol=2e-3)
-    assert_allclose(paper.mean(axis=0), 0, atol=0.02)
-    assert_allclose(paper[:, 2].std(), 0.1, atol=5e-3)
-
-
-def test_draws_are_the_same_on_every_machine() -> None:
-    assert_allclose(uniforms("0/scenario/agent/1"), FIRST_DRAW, rtol=0, atol=1e-15)
-
-
 def test_a_draw_depends_on_seed_scenario_partner_and_frame_alone(da_b: DeepAccident, sample: str) -> None:
     link = Link(pose_noise=0.3, packet_loss=0.4, seed=7)
 
@@ -91,13 +76,6 @@ def test_a_draw_depends_on_seed_scenario_partner_and_frame_alone(da_b: DeepAccid
     for agent in AGENTS[:0:-1]:
         assert errors([agent], link) in ({}, {agent: together[agent]})
     assert not set(errors(None, Link(pose_noise=0.3, seed=8)).values()) & set(together.values())
-
-
-def test_loss_is_as_frequent_as_asked_and_never_the_egos() -> None:
-    link = Link(packet_loss=0.3)
-    lost = [link.loses("scenario", agent, frame) for agent in AGENTS for frame in range(1000)]
-    assert np.mean(lost) == pytest.approx(0.3, abs=0.03)
-    assert not any(Link().loses("scenario", AGENTS[0], frame) for frame in range(100))
 
 
 def test_the_egos_own_data_are_never_disturbed(da_b: DeepAccident, sample: str) -> None:
@@ -140,8 +118,7 @@ def test_latency_shows_what_the_partner_saw_then(da_b: DeepAccident, sample: str
 
 def test_a_sweep_arrives_as_it_did_when_it_was_the_present(da_b: DeepAccident, sample: str) -> None:
     """Of four sweeps each is what its own frame received, as far as the latency lets anything arrive there."""
-    link = Link(latency=0.1, pose_noise=0.3, packet_loss=0.4, seed=5)
-    agents = list(AGENTS[1:])
+    link, agents = Link(latency=0.1, pose_noise=0.3, packet_loss=0.4, seed=5), list(AGENTS[1:])
 
     def facts(token: str, sweeps: int) -> list[tuple[str, str, bytes]]:
         return [

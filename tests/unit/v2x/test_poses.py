@@ -38,23 +38,14 @@ def test_rounded_poses_are_zero_away_from_themselves() -> None:
     assert_allclose(future_egomotion(rounded[[0, 0]]), 0, atol=1e-9)
 
 
-@pytest.mark.parametrize("poses", [None, "abc", SE3.identity(), [], np.eye(4), [np.eye(3)], [SE3.identity(), None]])
-def test_what_is_no_poses_is_refused(poses: object) -> None:
+def test_what_is_no_poses_is_refused() -> None:
     assert_refused(
         *[
             (partial(function, poses), GeometryError, r"world_from_(agent|ego): expected")
             for function in (relative_pose_to_ego, future_egomotion)
+            for poses in (None, "abc", SE3.identity(), [], np.eye(4), [np.eye(3)], [SE3.identity(), None])
         ],
-    )
-
-
-def test_a_pose_without_an_inverse_is_refused() -> None:
-    assert_refused(
-        (
-            lambda: relative_pose_to_ego(np.zeros((2, 4, 4))),
-            GeometryError,
-            "a transform has no inverse: its rotation is no rotation",
-        ),
+        (lambda: relative_pose_to_ego(np.zeros((2, 4, 4))), GeometryError, ("has no inverse", "no rotation")),
     )
 
 
@@ -106,26 +97,8 @@ def test_there_and_back_is_the_identity(da: DeepAccident) -> None:
         assert_allclose(there.inverse().matrix, back.matrix, atol=1e-9)
 
 
-def test_a_world_point_seen_from_all_agents_returns(da: DeepAccident) -> None:
-    world = np.random.default_rng(0).uniform(-600, 600, (20, 3))
-    points, here, frame = world, samples(da)[0], "world"
-    for place, next_frame in zip(samples(da), itertools.cycle(FRAMES[1:])):
-        points = da.transform(place, here, next_frame, frame).apply(points)
-        here, frame = place, next_frame
-        assert_allclose(da.transform(place, place, "world", frame).apply(points), world, atol=1e-7)
-
-
-def test_boxes_come_back(da: DeepAccident) -> None:
-    sample, other = f"{tiny.TOKEN}/infrastructure/001", f"{tiny.TOKEN}/other_vehicle/002"
-    boxes = da.boxes(sample, "lidar")
-    there = da.transform(other, sample, "Camera_Front", "lidar").apply(boxes, frame="Camera_Front")
-    back = da.transform(sample, other, "lidar", "Camera_Front").apply(there, frame="lidar")
-    assert_allclose(back.corners(), boxes.corners(), atol=1e-4)
-
-
 def test_poses_are_the_files_numbers(da: DeepAccident, way) -> None:
-    sample = samples(da)[3]
-    expected = way(tilted("ego_vehicle_behind", 2)).astype(np.float64)
+    sample, expected = samples(da)[3], way(tilted("ego_vehicle_behind", 2)).astype(np.float64)
     flip = np.diag([1.0, -1, 1, 1])
     assert_array_equal(da.world_from(sample, "ego").matrix[:3], (flip @ expected @ flip)[:3])
     assert_array_equal(da.world_from(sample, "ego").matrix[3], [0, 0, 0, 1])

@@ -19,6 +19,8 @@ from deepaccident_devkit.motion import MotionHeads, predict_instances
 FIRST, SECOND, THIRD = plain.TOKENS
 GRID = BevGrid((-2.0, 2.0, 0.5), (-1.5, 1.5, 0.5))
 LARGE = BevGrid()
+FIRST_DATE = {(1980, 1, 1, 0, 0, 0)}
+"""Of all files: so that the same predictions are the same bytes."""
 
 
 def written(path: Path, task: Any, predictions: dict[str, Any], **options: Any) -> Results:
@@ -61,119 +63,130 @@ def labelled(ignore: int | None = None, frames: int = 3) -> MotionHeads:
     return MotionHeads.from_arrays(*maps, ignore_index=ignore)
 
 
-class TestMotion:
-    @pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
-    def test_of_heads_their_instances_are_stored(self, tmp_path: Path, orientation: Any) -> None:
-        outputs = {FIRST: heads(1, 2, orientation), SECOND: heads(2, 1, orientation)}
-        results = written(tmp_path / "motion", "motion", outputs, step=0.3, labels="clean")
-        assert results.form == MotionForm(
-            stored="instances",
-            grid=GRID.with_orientation(orientation),
-            predictions=2,
-            frames=3,
-            step=0.3,
-            labels="clean",
-        )
-        for token, output in outputs.items():
-            linked = [predict_instances(each, "motion") for each in output.heads or ()]
-            read = results.prediction(token)
-            assert isinstance(read, MotionOutput)
-            np.testing.assert_array_equal(read.instances, [each.instance for each in linked])  # type: ignore[arg-type]
-            assert read.grid == output.grid
-        results.check()
-
-    @pytest.mark.parametrize(("highest", "dtype"), [(255, "u1"), (256, "u2"), (65535, "u2"), (65536, "i4")])
-    def test_instance_maps_are_stored_as_given(self, tmp_path: Path, highest: int, dtype: str) -> None:
-        maps = plain.instance_arrays()["instance"].astype(np.int32)
-        maps[maps == 7] = highest
-        maps[-1, 2] = 0  # both instances are gone in the last frame
-        results = written(tmp_path / "m", "motion", {FIRST: instances_of(maps, GRID)})
-        read = results.prediction(FIRST)
-        assert isinstance(read, MotionOutput)
-        np.testing.assert_array_equal(read.instances, maps)  # type: ignore[arg-type]
-        with np.load(tmp_path / "m" / "shards" / "00000.npz") as file:
-            assert file[f"{FIRST}/instance"].dtype == dtype
-        results.check()
-
-    def test_heads_on_request(self, tmp_path: Path) -> None:
-        output = heads(3)
-        results = written(tmp_path / "motion", "motion", {FIRST: output}, store="heads", labels=None)
-        read = results.prediction(FIRST)
-        assert isinstance(read, MotionOutput)
-        assert read.heads
-        assert output.heads
-        for one, other in zip(read.heads, output.heads, strict=True):
-            for name in ("segmentation", "centerness", "offset", "flow"):
-                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-        results.check()
-
-    def test_paths_that_earlier_files_have_are_not_read(self, tmp_path: Path) -> None:
-        folder = plain.write_motion(tmp_path / "b")
-        paths = {"trajectory_id": np.array([1, 7]), "trajectory": np.zeros((2, 3, 2))}
-        plain.write_shard(
-            folder / "shards" / "00000.npz", {token: plain.instance_arrays() | paths for token in (FIRST, SECOND)}
-        )
-        plain.relist(folder)
-        read_results(folder).check()
-
-    def test_a_sample_is_small(self, tmp_path: Path) -> None:
-        """Issue 8: at most 50 KB for five predictions; here of thirty cars whose edges are noise."""
-        tokens = [f"a/b/ego_vehicle/{number:03d}" for number in range(3)]
-        results = written(tmp_path / "m", "motion", {token: thirty_cars(seed) for seed, token in enumerate(tokens)})
-        for token in tokens:
-            read = results.prediction(token)
-            assert isinstance(read, MotionOutput)
-            assert len(read) == 5
-            assert len(np.unique(read.instances)) > 25  # type: ignore[arg-type]
-        assert sum(path.stat().st_size for path in (tmp_path / "m").rglob("*") if path.is_file()) / len(tokens) < 50_000
-
-    def test_shards_of_64_samples(self, tmp_path: Path) -> None:
-        maps = instances_of(plain.instance_arrays()["instance"], GRID)
-        tokens = [f"a/b/ego_vehicle/{number:03d}" for number in range(130)]
-        results = written(tmp_path / "m", "motion", dict.fromkeys(tokens, maps))
-        told = json.loads((tmp_path / "m" / "results.json").read_text(encoding="utf-8"))
-        assert [len(shard["tokens"]) for shard in told["shards"]] == [64, 64, 2]
-        assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
-        results.check()
-        assert results.tokens == tuple(tokens)
-
-    def test_shards_of_some_megabytes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("deepaccident_devkit.evaluation.results.writer.MOST_BYTES", 2000)
-        written(tmp_path / "m", "motion", {token: heads(1) for token in plain.TOKENS}, store="heads")
-        assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
-
-    @pytest.mark.parametrize(
-        ("output", "words"),
-        [
-            (heads(orientation="fiery"), "expected a prediction on BevGrid"),
-            (heads(grid=BevGrid((-2.0, 2.0, 0.25), GRID.y)), "expected a prediction on BevGrid"),
-            (instances_of(plain.instance_arrays()["instance"], GRID), "expected heads, found instance maps"),
-            (MotionOutput(grid=GRID, heads=(labelled(ignore=255),)), "found those of labels, which hold values to"),
-            (MotionOutput(grid=GRID, heads=(labelled(frames=2),)), "expected 3 frames as of the samples before, found"),
-        ],
+@pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
+def test_of_heads_their_instances_are_stored(tmp_path: Path, orientation: Any) -> None:
+    outputs = {FIRST: heads(1, 2, orientation), SECOND: heads(2, 1, orientation)}
+    results = written(tmp_path / "motion", "motion", outputs, step=0.3, labels="clean")
+    assert results.form == MotionForm(
+        stored="instances",
+        grid=GRID.with_orientation(orientation),
+        predictions=2,
+        frames=3,
+        step=0.3,
+        labels="clean",
     )
-    def test_predictions_that_do_not_go_together(self, tmp_path: Path, output: MotionOutput, words: str) -> None:
-        with ResultsWriter(tmp_path / "m", "motion", store="heads") as writer:
-            writer.add(FIRST, heads())
-            assert_refused(
-                (lambda: writer.add(SECOND, output), ResultsError, f"m: {SECOND}: .*{words}"),
-            )
-        assert read_results(tmp_path / "m").tokens == (FIRST,)
+    for token, output in outputs.items():
+        linked = [predict_instances(each, "motion") for each in output.heads or ()]
+        read = results.prediction(token)
+        assert isinstance(read, MotionOutput)
+        np.testing.assert_array_equal(read.instances, [each.instance for each in linked])  # type: ignore[arg-type]
+        assert read.grid == output.grid
+    results.check()
 
-    def test_the_grid_that_was_asked_for(self, tmp_path: Path) -> None:
-        with ResultsWriter(tmp_path / "m", "motion", grid=LARGE) as writer:
-            assert_refused(
-                (lambda: writer.add(FIRST, heads()), ResultsError, "expected a prediction on BevGrid"),
-            )
-            writer.add(FIRST, instances_of(np.zeros((1, 2, 200, 200)), LARGE))
 
-    def test_negative_ids(self, tmp_path: Path) -> None:
-        with ResultsWriter(tmp_path / "m", "motion") as writer:
-            assert_refused(
-                (
-                    lambda: writer.add(FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID)),
-                    ResultsError,
-                    "instances: expected ids from 1, and 0 elsewhere, found -7",
-                ),
-            )
-            writer.add(FIRST, heads())
+@pytest.mark.parametrize(("highest", "dtype"), [(255, "u1"), (256, "u2"), (65535, "u2"), (65536, "i4")])
+def test_instance_maps_are_stored_as_given(tmp_path: Path, highest: int, dtype: str) -> None:
+    maps = plain.instance_arrays()["instance"].astype(np.int32)
+    maps[maps == 7] = highest
+    maps[-1, 2] = 0  # both instances are gone in the last frame
+    results = written(tmp_path / "m", "motion", {FIRST: instances_of(maps, GRID)})
+    read = results.prediction(FIRST)
+    assert isinstance(read, MotionOutput)
+    np.testing.assert_array_equal(read.instances, maps)  # type: ignore[arg-type]
+    with np.load(tmp_path / "m" / "shards" / "00000.npz") as file:
+        assert (file[f"{FIRST}/instance"].dtype, {entry.date_time for entry in file.zip.infolist()}) == (
+            dtype,
+            FIRST_DATE,
+        )
+    results.check()
+
+
+def test_heads_on_request(tmp_path: Path) -> None:
+    output = heads(3)
+    results = written(tmp_path / "motion", "motion", {FIRST: output}, store="heads", labels=None)
+    read = results.prediction(FIRST)
+    assert isinstance(read, MotionOutput)
+    assert read.heads
+    assert output.heads
+    for one, other in zip(read.heads, output.heads, strict=True):
+        for name in ("segmentation", "centerness", "offset", "flow"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    results.check()
+
+
+def test_paths_that_earlier_files_have_are_not_read(tmp_path: Path) -> None:
+    folder = plain.write_motion(tmp_path / "b")
+    paths = {"trajectory_id": np.array([1, 7]), "trajectory": np.zeros((2, 3, 2))}
+    plain.write_shard(
+        folder / "shards" / "00000.npz", {token: plain.instance_arrays() | paths for token in (FIRST, SECOND)}
+    )
+    plain.relist(folder)
+    read_results(folder).check()
+
+
+def test_a_sample_is_small(tmp_path: Path) -> None:
+    """Issue 8: at most 50 KB for five predictions; here of thirty cars whose edges are noise."""
+    tokens = [f"a/b/ego_vehicle/{number:03d}" for number in range(3)]
+    results = written(tmp_path / "m", "motion", {token: thirty_cars(seed) for seed, token in enumerate(tokens)})
+    for token in tokens:
+        read = results.prediction(token)
+        assert isinstance(read, MotionOutput)
+        assert len(read) == 5
+        assert len(np.unique(read.instances)) > 25  # type: ignore[arg-type]
+    assert sum(path.stat().st_size for path in (tmp_path / "m").rglob("*") if path.is_file()) / len(tokens) < 50_000
+
+
+def test_shards_of_64_samples(tmp_path: Path) -> None:
+    maps = instances_of(plain.instance_arrays()["instance"], GRID)
+    tokens = [f"a/b/ego_vehicle/{number:03d}" for number in range(130)]
+    results = written(tmp_path / "m", "motion", dict.fromkeys(tokens, maps))
+    told = json.loads((tmp_path / "m" / "results.json").read_text(encoding="utf-8"))
+    assert [len(shard["tokens"]) for shard in told["shards"]] == [64, 64, 2]
+    assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
+    results.check()
+    assert results.tokens == tuple(tokens)
+
+
+def test_shards_of_some_megabytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deepaccident_devkit.evaluation.results.writer.MOST_BYTES", 2000)
+    written(tmp_path / "m", "motion", {token: heads(1) for token in plain.TOKENS}, store="heads")
+    assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [
+        (heads(orientation="fiery"), "expected a prediction on BevGrid"),
+        (heads(grid=BevGrid((-2.0, 2.0, 0.25), GRID.y)), "expected a prediction on BevGrid"),
+        (instances_of(plain.instance_arrays()["instance"], GRID), "expected heads, found instance maps"),
+        (MotionOutput(grid=GRID, heads=(labelled(ignore=255),)), "found those of labels, which hold values to"),
+        (MotionOutput(grid=GRID, heads=(labelled(frames=2),)), "expected 3 frames as of the samples before, found"),
+    ],
+)
+def test_predictions_that_do_not_go_together(tmp_path: Path, output: MotionOutput, words: str) -> None:
+    with ResultsWriter(tmp_path / "m", "motion", store="heads") as writer:
+        writer.add(FIRST, heads())
+        assert_refused(
+            (lambda: writer.add(SECOND, output), ResultsError, f"m: {SECOND}: .*{words}"),
+        )
+    assert read_results(tmp_path / "m").tokens == (FIRST,)
+
+
+def test_the_grid_that_was_asked_for(tmp_path: Path) -> None:
+    with ResultsWriter(tmp_path / "m", "motion", grid=LARGE) as writer:
+        assert_refused(
+            (lambda: writer.add(FIRST, heads()), ResultsError, "expected a prediction on BevGrid"),
+        )
+        writer.add(FIRST, instances_of(np.zeros((1, 2, 200, 200)), LARGE))
+
+
+def test_negative_ids(tmp_path: Path) -> None:
+    with ResultsWriter(tmp_path / "m", "motion") as writer:
+        assert_refused(
+            (
+                lambda: writer.add(FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID)),
+                ResultsError,
+                "instances: expected ids from 1, and 0 elsewhere, found -7",
+            ),
+        )
+        writer.add(FIRST, heads())

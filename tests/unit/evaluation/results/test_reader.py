@@ -441,8 +441,7 @@ def test_arrays(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("missing", ["centerness", "flow"])
 def test_heads_that_are_missing(tmp_path: Path, missing: str) -> None:
-    folder = plain.write_motion(tmp_path / "motion", "heads")
-    arrays = plain.head_arrays()
+    folder, arrays = plain.write_motion(tmp_path / "motion", "heads"), plain.head_arrays()
     del arrays[missing]
     plain.write_shard(folder / "shards" / "00000.npz", {FIRST: arrays, SECOND: plain.head_arrays()})
     plain.relist(folder)

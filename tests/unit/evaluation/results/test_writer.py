@@ -207,69 +207,73 @@ def results(request: pytest.FixtureRequest, tmp_path: Path) -> Results:
     return write(tmp_path / ("m" if request.param == "motion" else "results.json"), request.param)
 
 
-class TestResults:
-    def test_samples(self, results: Results) -> None:
-        assert (len(results), results.tokens) == (3, plain.TOKENS)
-        assert FIRST in results
-        assert OTHER not in results
-        assert 3 not in results
-        assert repr(results) == f"<{results.task} results: 3 samples in {results.path}>"
-        assert_refused(
-            (lambda: results.prediction(OTHER), TokenError, f"has no prediction of '{OTHER}'"),
-        )
+def test_results_are_by_token(results: Results) -> None:
+    assert (len(results), results.tokens) == (3, plain.TOKENS)
+    assert FIRST in results
+    assert OTHER not in results
+    assert 3 not in results
+    assert repr(results) == f"<{results.task} results: 3 samples in {results.path}>"
+    assert_refused(
+        (lambda: results.prediction(OTHER), TokenError, f"has no prediction of '{OTHER}'"),
+    )
 
-    def test_ways_to_name_them(self, results: Results) -> None:
-        folder = results.path if results.task == "motion" else results.path.parent
-        for path in (folder, str(folder), folder / "results.json"):
-            again = read_results(path)
-            assert (again.path, again.fingerprint) == (results.path, results.fingerprint)
 
-    def test_a_copy_reads_again(self, results: Results) -> None:
-        content = pickle.dumps(results)
-        assert len(content) < 1000
-        reader.kept.clear()
-        copy = pickle.loads(content)
-        assert (copy.task, copy.path, copy.fingerprint) == (results.task, results.path, results.fingerprint)
-        assert (copy.tokens, copy.meta, copy.form) == (results.tokens, results.meta, results.form)
-        assert len(copy.prediction(SECOND)) == len(results.prediction(SECOND))
+def test_ways_to_name_results(results: Results) -> None:
+    folder = results.path if results.task == "motion" else results.path.parent
+    for path in (folder, str(folder), folder / "results.json"):
+        again = read_results(path)
+        assert (again.path, again.fingerprint) == (results.path, results.fingerprint)
 
-    def test_a_process_parses_once(self, results: Results, monkeypatch: pytest.MonkeyPatch) -> None:
-        def parsed(content: bytes, path: Path) -> None:
-            raise AssertionError("parsed again")
 
-        monkeypatch.setattr(reader, "read_document", parsed)
-        for _ in range(3):
-            pickle.loads(pickle.dumps(results)).prediction(FIRST)
-        read_results(results.path).prediction(FIRST)
+def test_a_copy_reads_again(results: Results) -> None:
+    content = pickle.dumps(results)
+    assert len(content) < 1000
+    reader.kept.clear()
+    copy = pickle.loads(content)
+    assert (copy.task, copy.path, copy.fingerprint) == (results.task, results.path, results.fingerprint)
+    assert (copy.tokens, copy.meta, copy.form) == (results.tokens, results.meta, results.form)
+    assert len(copy.prediction(SECOND)) == len(results.prediction(SECOND))
 
-    def test_in_threads_and_forked_processes(self, results: Results) -> None:
-        expected = [len(results.prediction(token)) for token in plain.TOKENS]
-        with ThreadPoolExecutor(8) as pool:
-            assert list(pool.map(lambda number: length(results, plain.TOKENS[number % 3]), range(60))) == expected * 20
-        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
-            assert list(pool.map(length, [results] * 6, plain.TOKENS * 2)) == expected * 2
 
-    def test_a_change_is_noticed(self, results: Results) -> None:
-        file = results.path / "results.json" if results.task == "motion" else results.path
-        copy = pickle.dumps(results)
-        results.check()
-        file.write_bytes(file.read_bytes().replace(b'"meta": {}', b'"meta": {"a": 1}'))
-        assert_refused(
-            (results.check, ResultsError, "was changed after it was opened; open it again"),
-        )
-        reader.kept.clear()
-        assert_refused(
-            (
-                lambda: pickle.loads(copy).prediction(FIRST),
-                ResultsError,
-                "was changed after it was opened; open it again",
-            ),
-        )
-        assert read_results(results.path).fingerprint != results.fingerprint
-        file.unlink()
-        assert_refused(
-            (results.check, ResultsError, r"results\.json: cannot be read \("),
-        )
+def test_a_process_parses_once(results: Results, monkeypatch: pytest.MonkeyPatch) -> None:
+    def parsed(content: bytes, path: Path) -> None:
+        raise AssertionError("parsed again")
+
+    monkeypatch.setattr(reader, "read_document", parsed)
+    for _ in range(3):
+        pickle.loads(pickle.dumps(results)).prediction(FIRST)
+    read_results(results.path).prediction(FIRST)
+
+
+def test_in_threads_and_forked_processes(results: Results) -> None:
+    expected = [len(results.prediction(token)) for token in plain.TOKENS]
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(lambda number: length(results, plain.TOKENS[number % 3]), range(60))) == expected * 20
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
+        assert list(pool.map(length, [results] * 6, plain.TOKENS * 2)) == expected * 2
+
+
+def test_a_change_is_noticed(results: Results) -> None:
+    file = results.path / "results.json" if results.task == "motion" else results.path
+    copy = pickle.dumps(results)
+    results.check()
+    file.write_bytes(file.read_bytes().replace(b'"meta": {}', b'"meta": {"a": 1}'))
+    assert_refused(
+        (results.check, ResultsError, "was changed after it was opened; open it again"),
+    )
+    reader.kept.clear()
+    assert_refused(
+        (
+            lambda: pickle.loads(copy).prediction(FIRST),
+            ResultsError,
+            "was changed after it was opened; open it again",
+        ),
+    )
+    assert read_results(results.path).fingerprint != results.fingerprint
+    file.unlink()
+    assert_refused(
+        (results.check, ResultsError, r"results\.json: cannot be read \("),
+    )
 
 
 def length(results: Results, token: str) -> int:
@@ -315,8 +319,7 @@ accidents = st.builds(
 
 @st.composite
 def boxes(draw: Callable[[Any], Any]) -> DetectedBoxes:
-    count = draw(st.integers(0, 5))
-    source = np.random.default_rng(draw(st.integers(0, 2**32)))
+    count, source = draw(st.integers(0, 5)), np.random.default_rng(draw(st.integers(0, 2**32)))
     velocity = source.normal(0, 10, (count, 3)) * [1, 1, 0]
     velocity[source.random(count) < 0.3] = np.nan
     return DetectedBoxes.from_arrays(
@@ -341,59 +344,62 @@ def written(path: Path, task: Any, predictions: dict[str, Any], **options: Any) 
     return read_results(path)
 
 
-class TestEntries:
-    @settings(max_examples=25)
-    @given(st.lists(st.lists(accidents, max_size=4), min_size=1, max_size=4))
-    def test_accidents_come_back(self, tmp_path_factory: pytest.TempPathFactory, lists: list[list[Accident]]) -> None:
-        predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
-        results = written(tmp_path_factory.mktemp("accidents") / "accident.json", "accident", predictions)
-        assert results.tokens == tuple(predictions)
-        for token, given_ones in predictions.items():
-            read = results.prediction(token)
-            assert isinstance(read, list)
-            assert list(map(as_plain, read)) == list(map(as_plain, given_ones))
-
-    @settings(max_examples=25)
-    @given(st.lists(boxes(), min_size=1, max_size=4))
-    def test_boxes_come_back(self, tmp_path_factory: pytest.TempPathFactory, lists: list[DetectedBoxes]) -> None:
-        predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
-        results = written(tmp_path_factory.mktemp("boxes") / "detection.json", "detection", predictions)
-        for token, given_ones in predictions.items():
-            read = results.prediction(token)
-            assert isinstance(read, DetectedBoxes)
-            np.testing.assert_array_equal(read.scores, given_ones.scores)
-            assert read.boxes.frame == "world"
-            for name in ("center", "size", "rotation", "velocity", "category", "actor_id", "row"):
-                np.testing.assert_array_equal(getattr(read.boxes, name), getattr(given_ones.boxes, name))
-
-    def test_the_plain_accidents(self, tmp_path: Path) -> None:
-        results = read_results(plain.write_json(tmp_path / "accident.json", plain.accidents()))
-        assert (results.task, results.meta, results.form) == ("accident", {"method": "plain"}, None)
-        read = results.prediction(FIRST)
+@settings(max_examples=25)
+@given(st.lists(st.lists(accidents, max_size=4), min_size=1, max_size=4))
+def test_accidents_come_back(tmp_path_factory: pytest.TempPathFactory, lists: list[list[Accident]]) -> None:
+    predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
+    results = written(tmp_path_factory.mktemp("accidents") / "accident.json", "accident", predictions)
+    assert results.tokens == tuple(predictions)
+    for token, given_ones in predictions.items():
+        read = results.prediction(token)
         assert isinstance(read, list)
-        positions = ((12.5, 0.5), (13.0, -2.0))
-        assert list(map(as_plain, read)) == [(positions, 1.5, 0.75, (1236, 1240)), (positions, 0.0, 0.75, None)]
-        assert results.prediction(THIRD) == []
+        assert list(map(as_plain, read)) == list(map(as_plain, given_ones))
 
-    def test_the_plain_boxes(self, tmp_path: Path) -> None:
-        results = read_results(plain.write_json(tmp_path / "detection.json", plain.detections()))
-        read = results.prediction(FIRST)
+
+@settings(max_examples=25)
+@given(st.lists(boxes(), min_size=1, max_size=4))
+def test_boxes_come_back(tmp_path_factory: pytest.TempPathFactory, lists: list[DetectedBoxes]) -> None:
+    predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
+    results = written(tmp_path_factory.mktemp("boxes") / "detection.json", "detection", predictions)
+    for token, given_ones in predictions.items():
+        read = results.prediction(token)
         assert isinstance(read, DetectedBoxes)
+        np.testing.assert_array_equal(read.scores, given_ones.scores)
         assert read.boxes.frame == "world"
-        np.testing.assert_array_equal(read.boxes.size, [[4.5, 1.9, 1.6]] * 2)  # length, width, height
-        np.testing.assert_array_equal(read.boxes.center, [[105.25, -33.0, 0.75]] * 2)
-        np.testing.assert_allclose(read.boxes.yaw, 2 * np.arctan2(0.8, 0.6), atol=1e-12)
-        np.testing.assert_array_equal(read.boxes.velocity, [[0, 8.25, 0], [np.nan] * 3])
-        np.testing.assert_array_equal(read.scores, [0.9, 0.9])
-        assert (CATEGORIES[read.boxes.category[0]], len(results.prediction(THIRD))) == ("van", 0)
+        for name in ("center", "size", "rotation", "velocity", "category", "actor_id", "row"):
+            np.testing.assert_array_equal(getattr(read.boxes, name), getattr(given_ones.boxes, name))
 
-    def test_a_sample_a_line(self, tmp_path: Path) -> None:
-        predictions = {FIRST: [Accident(positions=np.zeros((2, 2)), time=1.0)], SECOND: []}
-        written(tmp_path / "accident.json", "accident", predictions, meta={"b": 1, "a": [None]})
-        lines = (tmp_path / "accident.json").read_text(encoding="utf-8").splitlines()
-        header = ['"format": "DeepAccident results",', '"version": 1,', '"task": "accident",']
-        assert lines[:6] == ["{", *header, '"meta": {"b": 1, "a": [null]},', '"results": {']
-        assert lines[7:] == [f'"{SECOND}": []', "}", "}"]
+
+def test_the_plain_accidents(tmp_path: Path) -> None:
+    results = read_results(plain.write_json(tmp_path / "accident.json", plain.accidents()))
+    assert (results.task, results.meta, results.form) == ("accident", {"method": "plain"}, None)
+    read = results.prediction(FIRST)
+    assert isinstance(read, list)
+    positions = ((12.5, 0.5), (13.0, -2.0))
+    assert list(map(as_plain, read)) == [(positions, 1.5, 0.75, (1236, 1240)), (positions, 0.0, 0.75, None)]
+    assert results.prediction(THIRD) == []
+
+
+def test_the_plain_boxes(tmp_path: Path) -> None:
+    results = read_results(plain.write_json(tmp_path / "detection.json", plain.detections()))
+    read = results.prediction(FIRST)
+    assert isinstance(read, DetectedBoxes)
+    assert read.boxes.frame == "world"
+    np.testing.assert_array_equal(read.boxes.size, [[4.5, 1.9, 1.6]] * 2)  # length, width, height
+    np.testing.assert_array_equal(read.boxes.center, [[105.25, -33.0, 0.75]] * 2)
+    np.testing.assert_allclose(read.boxes.yaw, 2 * np.arctan2(0.8, 0.6), atol=1e-12)
+    np.testing.assert_array_equal(read.boxes.velocity, [[0, 8.25, 0], [np.nan] * 3])
+    np.testing.assert_array_equal(read.scores, [0.9, 0.9])
+    assert (CATEGORIES[read.boxes.category[0]], len(results.prediction(THIRD))) == ("van", 0)
+
+
+def test_a_sample_a_line(tmp_path: Path) -> None:
+    predictions = {FIRST: [Accident(positions=np.zeros((2, 2)), time=1.0)], SECOND: []}
+    written(tmp_path / "accident.json", "accident", predictions, meta={"b": 1, "a": [None]})
+    lines = (tmp_path / "accident.json").read_text(encoding="utf-8").splitlines()
+    header = ['"format": "DeepAccident results",', '"version": 1,', '"task": "accident",']
+    assert lines[:6] == ["{", *header, '"meta": {"b": 1, "a": [null]},', '"results": {']
+    assert lines[7:] == [f'"{SECOND}": []', "}", "}"]
 
 
 def test_a_velocity_that_is_known_in_part_is_unknown() -> None:

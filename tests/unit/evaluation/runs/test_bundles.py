@@ -116,134 +116,140 @@ def test_rows_are_plain_columns(run: EvaluationRun, tmp_path: Path) -> None:
     assert list(kinds.values()) == ["string", "int64", "double", "bool", "int64"]
 
 
-class TestPlaces:
-    def test_an_extra_that_fails_leaves_nothing(self, run: EvaluationRun, tmp_path: Path) -> None:
-        def fails(folder: Path) -> None:
-            assert FILES - {"files.json"} <= {path.name for path in folder.iterdir()}
-            raise KeyError("plot")
+def test_an_extra_that_fails_leaves_nothing(run: EvaluationRun, tmp_path: Path) -> None:
+    def fails(folder: Path) -> None:
+        assert FILES - {"files.json"} <= {path.name for path in folder.iterdir()}
+        raise KeyError("plot")
 
-        assert_refused(
-            (lambda: save_run(run, tmp_path / "bundle", extras=[fails]), KeyError, "plot"),
-        )
-        assert not list(tmp_path.glob("*bundle*"))
-
-    def test_what_extras_write_belongs_to_it(self, run: EvaluationRun, tmp_path: Path) -> None:
-        folder = save_run(run, tmp_path / "bundle", extras=[lambda folder: (folder / "report.html").write_text("!")])
-        assert "report.html" in read_bundle(folder).checksums()
-        save_run(run, folder, overwrite=True)
-        assert {path.name for path in folder.iterdir()} == FILES
-
-    def test_what_differs_from_an_evaluation_that_is_there(self, run: EvaluationRun, tmp_path: Path) -> None:
-        folder, asked = save_run(run, tmp_path / "bundle"), {"task": run.setup.task, "split": "mine.txt"}
-        differs = f"(split: {run.selection.split!r}, asked for 'mine.txt')"
-        assert_refused((lambda: checked_target(folder, asked=asked), ResultsError, (differs,)))
-
-    def test_replaced_only_when_told_and_with_files_of_its_own_alone(self, run: EvaluationRun, tmp_path: Path) -> None:
-        folder = save_run(run, tmp_path / "bundle")
-        assert_refused((lambda: save_run(run, folder), ResultsError, ("bundle: holds an evaluation", "--overwrite")))
-        save_run(replace(run, sanity={"warnings": []}), folder, overwrite=True)
-        assert read_bundle(folder).summary["sanity"] == {"warnings": []}
-        assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["bundle"]
-        (folder / "thoughts.txt").write_text("mine")
-        assert_refused((lambda: save_run(run, folder, overwrite=True), ResultsError, ("thoughts.txt", "move it")))
-
-    def test_a_link_to_one_is_replaced_itself(self, run: EvaluationRun, tmp_path: Path) -> None:
-        folder = save_run(run, tmp_path / "bundle")
-        (tmp_path / "latest").symlink_to(folder)
-        before = {path.name: path.read_bytes() for path in folder.iterdir()}
-        save_run(replace(run, sanity={}), tmp_path / "latest", overwrite=True)
-        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-        assert read_bundle(tmp_path / "latest").summary["sanity"] == {}
-
-    def test_the_earlier_one_stays_if_the_new_one_fails(
-        self, run: EvaluationRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        folder = save_run(run, tmp_path / "bundle")
-        before = {name: file_checksum(folder / name) for name in FILES}
-
-        replace_file = os.replace
-
-        def full(source: Path, target: Path) -> None:
-            if target == folder:
-                raise OSError(28, "No space left on device")
-            replace_file(source, target)
-
-        monkeypatch.setattr("deepaccident_devkit.support.files.os.replace", full)
-        assert_refused(
-            (
-                lambda: save_run(replace(run, sanity={}), folder, overwrite=True),
-                ResultsError,
-                r"bundle: cannot be written \(.*No space left",
-            ),
-        )
-        assert {name: file_checksum(folder / name) for name in FILES} == before
-
-    @pytest.mark.parametrize("overwrite", [False, True])
-    def test_another_folder_is_never_replaced(self, run: EvaluationRun, tmp_path: Path, *, overwrite: bool) -> None:
-        (tmp_path / "work" / "deep").mkdir(parents=True)
-        (tmp_path / "work" / "deep" / "thesis.tex").touch()
-        assert_refused(
-            *[
-                (refused, ResultsError, words)
-                for words, refused in (
-                    (
-                        r"work: is not empty and holds no evaluation",
-                        lambda: save_run(run, tmp_path / "work", overwrite=overwrite),
-                    ),
-                    (
-                        r"thesis.tex: is a file; choose a folder that is new",
-                        lambda: save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite),
-                    ),
-                    (r"out: expected a folder, found an empty path", lambda: save_run(run, "", overwrite=overwrite)),
-                )
-            ],
-        )
-
-    def test_an_empty_folder_is_fine_and_checkpoints_go(
-        self, da_b: DeepAccident, results: Results, selection: SampleSelection, run: EvaluationRun, tmp_path: Path
-    ) -> None:
-        out = tmp_path / "bundle"
-        out.mkdir()
-        again = evaluate_results(da_b, results, run.setup, selection, workers=1, out=out)
-        assert (tmp_path / "bundle.unfinished").is_dir()
-        save_run(again, out)
-        assert not (tmp_path / "bundle.unfinished").exists()
+    assert_refused(
+        (lambda: save_run(run, tmp_path / "bundle", extras=[fails]), KeyError, "plot"),
+    )
+    assert not list(tmp_path.glob("*bundle*"))
 
 
-class TestDamaged:
-    @pytest.mark.parametrize(
-        ("content", "sentence"),
-        [
-            (None, r"metrics_summary.json: is missing; give a folder that"),
-            ("{", r"metrics_summary.json: is no JSON \(line 1"),
-            ("[]", r"metrics_summary.json: expected an object, found list"),
-            ('{"format": "nuScenes"}', r"expected the format 'DeepAccident metrics summary', found 'nuScenes'"),
-            (
-                '{"format": "DeepAccident metrics summary", "version": 9, "devkit_version": "7.0"}',
-                r"is of version 9, this devkit reads 1; use the devkit that wrote it \('7.0'\)",
-            ),
+def test_what_extras_write_belongs_to_it(run: EvaluationRun, tmp_path: Path) -> None:
+    folder = save_run(run, tmp_path / "bundle", extras=[lambda folder: (folder / "report.html").write_text("!")])
+    assert "report.html" in read_bundle(folder).checksums()
+    save_run(run, folder, overwrite=True)
+    assert {path.name for path in folder.iterdir()} == FILES
+
+
+def test_what_differs_from_an_evaluation_that_is_there(run: EvaluationRun, tmp_path: Path) -> None:
+    folder, asked = save_run(run, tmp_path / "bundle"), {"task": run.setup.task, "split": "mine.txt"}
+    differs = f"(split: {run.selection.split!r}, asked for 'mine.txt')"
+    assert_refused((lambda: checked_target(folder, asked=asked), ResultsError, (differs,)))
+
+
+def test_replaced_only_when_told_and_with_files_of_its_own_alone(run: EvaluationRun, tmp_path: Path) -> None:
+    folder = save_run(run, tmp_path / "bundle")
+    assert_refused((lambda: save_run(run, folder), ResultsError, ("bundle: holds an evaluation", "--overwrite")))
+    save_run(replace(run, sanity={"warnings": []}), folder, overwrite=True)
+    assert read_bundle(folder).summary["sanity"] == {"warnings": []}
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["bundle"]
+    (folder / "thoughts.txt").write_text("mine")
+    assert_refused((lambda: save_run(run, folder, overwrite=True), ResultsError, ("thoughts.txt", "move it")))
+
+
+def test_a_link_to_one_is_replaced_itself(run: EvaluationRun, tmp_path: Path) -> None:
+    folder = save_run(run, tmp_path / "bundle")
+    (tmp_path / "latest").symlink_to(folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    save_run(replace(run, sanity={}), tmp_path / "latest", overwrite=True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert read_bundle(tmp_path / "latest").summary["sanity"] == {}
+
+
+def test_the_earlier_one_stays_if_the_new_one_fails(
+    run: EvaluationRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = save_run(run, tmp_path / "bundle")
+    before = {name: file_checksum(folder / name) for name in FILES}
+
+    replace_file = os.replace
+
+    def full(source: Path, target: Path) -> None:
+        if target == folder:
+            raise OSError(28, "No space left on device")
+        replace_file(source, target)
+
+    monkeypatch.setattr("deepaccident_devkit.support.files.os.replace", full)
+    assert_refused(
+        (
+            lambda: save_run(replace(run, sanity={}), folder, overwrite=True),
+            ResultsError,
+            r"bundle: cannot be written \(.*No space left",
+        ),
+    )
+    assert {name: file_checksum(folder / name) for name in FILES} == before
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_another_folder_is_never_replaced(run: EvaluationRun, tmp_path: Path, *, overwrite: bool) -> None:
+    (tmp_path / "work" / "deep").mkdir(parents=True)
+    (tmp_path / "work" / "deep" / "thesis.tex").touch()
+    assert_refused(
+        *[
+            (refused, ResultsError, words)
+            for words, refused in (
+                (
+                    r"work: is not empty and holds no evaluation",
+                    lambda: save_run(run, tmp_path / "work", overwrite=overwrite),
+                ),
+                (
+                    r"thesis.tex: is a file; choose a folder that is new",
+                    lambda: save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite),
+                ),
+                (r"out: expected a folder, found an empty path", lambda: save_run(run, "", overwrite=overwrite)),
+            )
         ],
     )
-    def test_no_summary(self, run: EvaluationRun, tmp_path: Path, content: str | None, sentence: str) -> None:
-        path = save_run(run, tmp_path / "bundle") / "metrics_summary.json"
-        if content is None:
-            path.unlink()
-        else:
-            path.write_text(content)
-        assert_refused(
-            (lambda: read_bundle(path.parent), ResultsError, sentence),
-        )
 
-    @pytest.mark.parametrize("fault", MISFITS)
-    def test_a_summary_against_its_schema(self, run: EvaluationRun, tmp_path: Path, fault: str) -> None:
-        change, told = MISFITS[fault]
-        path = save_run(run.broken_down(["all"]), tmp_path / "bundle") / "metrics_summary.json"
-        summary = read(path)
-        change(summary)
-        path.write_text(json.dumps(summary), encoding="utf-8")
-        with pytest.raises(ResultsError, match=rf"metrics_summary.json: does not say what was evaluated: {told}") as e:
-            read_bundle(path.parent)
-        assert len(str(e.value)) < 1000
+
+def test_an_empty_folder_is_fine_and_checkpoints_go(
+    da_b: DeepAccident, results: Results, selection: SampleSelection, run: EvaluationRun, tmp_path: Path
+) -> None:
+    out = tmp_path / "bundle"
+    out.mkdir()
+    again = evaluate_results(da_b, results, run.setup, selection, workers=1, out=out)
+    assert (tmp_path / "bundle.unfinished").is_dir()
+    save_run(again, out)
+    assert not (tmp_path / "bundle.unfinished").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (None, r"metrics_summary.json: is missing; give a folder that"),
+        ("{", r"metrics_summary.json: is no JSON \(line 1"),
+        ("[]", r"metrics_summary.json: expected an object, found list"),
+        ('{"format": "nuScenes"}', r"expected the format 'DeepAccident metrics summary', found 'nuScenes'"),
+        (
+            '{"format": "DeepAccident metrics summary", "version": 9, "devkit_version": "7.0"}',
+            r"is of version 9, this devkit reads 1; use the devkit that wrote it \('7.0'\)",
+        ),
+    ],
+)
+def test_a_summary_that_is_none(run: EvaluationRun, tmp_path: Path, content: str | None, sentence: str) -> None:
+    path = save_run(run, tmp_path / "bundle") / "metrics_summary.json"
+    if content is None:
+        path.unlink()
+    else:
+        path.write_text(content)
+    assert_refused(
+        (lambda: read_bundle(path.parent), ResultsError, sentence),
+    )
+
+
+@pytest.mark.parametrize("fault", MISFITS)
+def test_a_summary_against_its_schema(run: EvaluationRun, tmp_path: Path, fault: str) -> None:
+    change, told = MISFITS[fault]
+    path = save_run(run.broken_down(["all"]), tmp_path / "bundle") / "metrics_summary.json"
+    summary = read(path)
+    change(summary)
+    path.write_text(json.dumps(summary), encoding="utf-8")
+    with pytest.raises(ResultsError, match=rf"metrics_summary.json: does not say what was evaluated: {told}") as e:
+        read_bundle(path.parent)
+    assert len(str(e.value)) < 1000
 
 
 def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: Path) -> None:

@@ -109,183 +109,166 @@ HARD = [5 * number for number in range(16)]
 """Cells found in clusters that differ by far more than two runs do."""
 
 
-class TestNumbers:
-    def test_the_better_one_is_named(self, generated: Callable[..., Comparison]) -> None:
-        iou = by_name(generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]))[MAIN]
-        assert (iou.family, iou.real, iou.better, iou.decision) == ("main", True, "b", "b is better")
-        assert iou.difference == pytest.approx(iou.b - iou.a)
-        assert 3 < iou.low < iou.difference < iou.high < 5
-        assert iou.p == iou.adjusted_p == pytest.approx(1 / 1001)
-        assert iou.unit == "%"
-
-    def test_pairs_are_compared(self, generated: Callable[..., Comparison]) -> None:
-        """Were the clusters of one run in another order, the same numbers would tell nothing."""
-        better = [each + 3 for each in HARD]
-        apart = by_name(generated(HARD, better[5:] + better[:5]))[MAIN]
-        assert apart.difference == pytest.approx(3)
-        assert not apart.real
-        assert apart.low < -5 < 10 < apart.high
-
-    def test_the_other_way_round_all_turns(self, generated: Callable[..., Comparison]) -> None:
-        better = [each + number % 4 for number, each in enumerate(HARD)]
-        forth, back = (by_name(generated(*runs)) for runs in ((HARD, better), (better, HARD)))
-        for name, each in forth.items():
-            other = back[name]
-            assert (other.a, other.b, other.real, other.p) == (each.b, each.a, each.real, each.p)
-            if each.low is not None:
-                assert (other.low, other.high) == pytest.approx((-each.high, -each.low))
-        assert back[MAIN].better == "a"
-
-    def test_headlines_first_then_every_number(self, motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
-        numbers = compare_bundles(*motion_bundles, FEW).numbers
-        assert [each.headline for each in numbers][:2] == ["iou 30x30", "iou 100x100"]
-        families = [each.family for each in numbers]
-        assert families == ["main", *["headlines"] * families.count("headlines"), *["other"] * families.count("other")]
-        assert [each.headline is None for each in numbers] == [each == "other" for each in families]
-        assert "ranges/30x30/sq" in {each.number for each in numbers}
-        assert len({each.number for each in numbers}) == len(numbers) > 10
-        assert set(numbers_of(run.result)) != {each.number for each in numbers}
-
-    def test_the_other_headlines_are_tested_together(self, generated: Callable[..., Comparison]) -> None:
-        """Both ranges have the same numbers: by itself one is real, of several it is not."""
-        numbers = by_name(generated([50] * 10, [50 + each for each in [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]]))
-        alone, together = numbers[MAIN], numbers["iou 100x100"]
-        assert alone.p == together.p == alone.adjusted_p <= 0.05 < together.adjusted_p
-        assert (alone.real, together.real, together.better) == (True, False, None)
-        tested = [each for each in numbers.values() if each.family == "headlines" and each.p is not None]
-        assert together.adjusted_p == pytest.approx(min(len(tested) * together.p, 1))
-        others = [each for each in numbers.values() if each.family == "other"]
-        assert {each.decision for each in others} == {"for exploration"}
-        assert not any(each.real for each in others)
-
-    def test_itself_differs_in_nothing(self, generated: Callable[..., Comparison]) -> None:
-        for each in generated(HARD, HARD).numbers:
-            assert (each.real, each.better, each.low) == (False, None, None)
-            assert each.difference in (0.0, None)
-            assert each.decision in ("the difference is 0", "nothing to compare", "for exploration")
-
-    @pytest.mark.slow
-    def test_twins_are_one_cluster(self, generated: Callable[..., Comparison]) -> None:
-        better = [each + 3 + number % 3 for number, each in enumerate(HARD)]
-        alone, both = (generated(HARD, better, twins=twins) for twins in (False, True))
-        assert (alone.scenarios, alone.clusters, both.scenarios, both.clusters) == (16, 16, 32, 16)
-        assert [each.p for each in both.numbers] == [each.p for each in alone.numbers]
-        assert by_name(both)[MAIN].high == pytest.approx(by_name(alone)[MAIN].high)
-
-    def test_few_clusters_cannot_decide(self, generated: Callable[..., Comparison]) -> None:
-        iou = by_name(generated(HARD[:5], [each + 9 for each in HARD[:5]]))[MAIN]
-        assert (iou.real, iou.low) == (False, None)
-        assert iou.decision == "no decision is possible with 5 clusters; at least 6 are needed"
-        assert by_name(generated(HARD[:6], [each + 9 for each in HARD[:6]]))[MAIN].real
-
-    def test_what_would_decide(self, generated: Callable[..., Comparison]) -> None:
-        iou = by_name(generated([50] * 20, [50 + 3 * (-1) ** number + 1 for number in range(20)]))[MAIN]
-        assert not iou.real
-        assert iou.decision == "not decided: about 75 scenarios would decide it"  # 7.849 · 9 · 20 / 19
-
-    def test_without_resamples(self, generated: Callable[..., Comparison]) -> None:
-        comparison = generated(HARD, [each + 9 for each in HARD], Resampling(resamples=0))
-        assert {(each.p, each.low, each.real) for each in comparison.numbers} == {(None, None, False)}
-        assert comparison.notes() == ["no intervals and no tests: no resamples were asked for"]
+def test_the_better_one_is_named(generated: Callable[..., Comparison]) -> None:
+    iou = by_name(generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]))[MAIN]
+    assert (iou.family, iou.real, iou.better, iou.decision) == ("main", True, "b", "b is better")
+    assert iou.difference == pytest.approx(iou.b - iou.a)
+    assert 3 < iou.low < iou.difference < iou.high < 5
+    assert iou.p == iou.adjusted_p == pytest.approx(1 / 1001)
+    assert iou.unit == "%"
 
 
-class TestForms:
-    def test_text(self, motion_bundles: tuple[Path, Path]) -> None:
-        text = compare_bundles(*motion_bundles, FEW).to_text()
-        head = "motion, protocol released: 6 samples of 2 scenarios\nclusters: 1 (an accident and its twin are one)"
-        assert text.startswith(f"{head}\na: {motion_bundles[0]}\n")
-        (line,) = (line for line in text.splitlines() if line.startswith("iou 100x100"))
-        assert line.endswith(" too few")
-        assert text.count("too few: no decision is possible with 1 cluster; at least 8 are needed") == 1
-        assert "p: share of all 1 swaps of clusters between a and b" in text
-        assert "tested at 5%: iou 30x30; and the other headlines together" in text
-
-    def test_all_of_a_small_one(self, generated: Callable[..., Comparison]) -> None:
-        """Of seven clusters all 64 swaps are tried: none of the others differs as much."""
-        made = generated(HARD[:7], [each + 9 + number % 2 for number, each in enumerate(HARD[:7])], twins=True)
-        chance = "between equally good runs about 0.2 would, by chance"
-        notes = [
-            "p: share of all 64 swaps of clusters between a and b after which they differ at least as much",
-            "tested at 5%: iou 30x30; and the other headlines together, whose p is adjusted by Holm's rule",
-            "scenarios that would decide: with a chance of 80 %, if the true difference is the observed one",
-            f"for exploration: 0 of 4 other numbers have a p of at most 5%; {chance}",
-        ]
-        assert made.to_text().splitlines() == [
-            "motion, protocol released: 14 samples of 14 scenarios",
-            "clusters: 7 (an accident and its twin are one)",
-            f"a: {made.a}",
-            f"b: {made.b}",
-            "",
-            "number                a       b   b − a      95% interval      p             decision",
-            "iou 30x30 (%)    15.000  24.429  +9.429  [+8.934, +9.923]  0.016          b is better",
-            "iou 100x100 (%)  15.000  24.429  +9.429  [+8.934, +9.923]  0.047          b is better",
-            "vpq 30x30 (%)     0.000   0.000  +0.000                 –  1.000  the difference is 0",
-            "vpq 100x100 (%)   0.000   0.000  +0.000                 –  1.000  the difference is 0",
-            "min_ade (m)           –       –       –                 –      –   nothing to compare",
-            "min_fde (m)           –       –       –                 –      –   nothing to compare",
-            "miss_rate             –       –       –                 –      –   nothing to compare",
-            "",
-            *notes,
-        ]
-        whole = made.to_dict()
-        numbers = whole.pop("numbers")
-        assert whole == {
-            "a": str(made.a),
-            "b": str(made.b),
-            "task": "motion",
-            "protocol": "released",
-            "samples": 14,
-            "scenarios": 14,
-            "clusters": 7,
-            "left_out": 0,
-            "partial": [],
-            "swaps": 64,
-            "all_swaps": True,
-            "resampling": {"resamples": 1000, "confidence": 0.95, "seed": 0},
-            "notes": notes,
-        }
-        assert (len(numbers), numbers[1]["p"], numbers[1]["adjusted_p"]) == (12, 1 / 64, 3 / 64)
-
-    def test_json_and_csv_have_every_number(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
-        comparison = compare_bundles(*motion_bundles, FEW)
-        stated = json.loads(json.dumps(comparison.to_dict()))
-        (path,) = comparison.to_csv(tmp_path / "new")
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        assert len(rows) == len(stated["numbers"]) == len(comparison.numbers)
-        assert float(rows[0]["a"]) == stated["numbers"][0]["a"] == comparison.numbers[0].a
-        assert stated["resampling"] == {"resamples": 40, "confidence": 0.95, "seed": 0}
-
-    def test_the_release_is_not_needed(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
-        copies = [shutil.copytree(each, tmp_path / each.name) for each in motion_bundles]
-        for copy in copies:
-            path = copy / "metrics_summary.json"
-            path.write_text(path.read_text().replace(json.loads(path.read_text())["release"]["dataroot"], "/gone"))
-        assert compare_bundles(*copies, FEW).numbers == compare_bundles(*motion_bundles, FEW).numbers
+def test_pairs_are_compared(generated: Callable[..., Comparison]) -> None:
+    """Were the clusters of one run in another order, the same numbers would tell nothing."""
+    better = [each + 3 for each in HARD]
+    apart = by_name(generated(HARD, better[5:] + better[:5]))[MAIN]
+    assert apart.difference == pytest.approx(3)
+    assert not apart.real
+    assert apart.low < -5 < 10 < apart.high
 
 
-class TestSamples:
-    def test_others_are_refused_or_left_out(self, saved: Save) -> None:
-        a, b = saved("a"), saved("b", 1.0, agents=("ego_vehicle", "infrastructure"))
-        assert_refused(
-            (
-                lambda: compare_bundles(a, b, FEW),
-                EvaluationError,
-                r"2 samples only in .*a \(type1.*\); evaluate both at the same",
-            ),
-        )
-        comparison = compare_bundles(a, b, FEW, common=True)
-        assert (comparison.samples, comparison.left_out) == (4, 2)
-        assert "a, b: only the samples that both have; 2 left out" in comparison.to_text()
+def test_the_other_way_round_all_turns(generated: Callable[..., Comparison]) -> None:
+    better = [each + number % 4 for number, each in enumerate(HARD)]
+    forth, back = (by_name(generated(*runs)) for runs in ((HARD, better), (better, HARD)))
+    for name, each in forth.items():
+        other = back[name]
+        assert (other.a, other.b, other.real, other.p) == (each.b, each.a, each.real, each.p)
+        if each.low is not None:
+            assert (other.low, other.high) == pytest.approx((-each.high, -each.low))
+    assert back[MAIN].better == "a"
 
-    def test_a_partial_one_is_marked(
-        self, saved: Save, run: EvaluationRun, da_b: DeepAccident, write_accidents: Write, tmp_path: Path
-    ) -> None:
-        results = write_accidents(tmp_path / "some.json", run.selection.tokens(da_b)[1:])
-        part = evaluate_results(da_b, results, run.setup, run.selection, allow_partial=True, workers=1)
-        comparison = compare_bundles(saved("a"), save_run(part, tmp_path / "part"), FEW, common=True)
-        assert comparison.partial == ("b: PARTIAL: 5 of 6 samples",)
-        assert "b: PARTIAL: 5 of 6 samples" in comparison.to_text()
+
+def test_headlines_first_then_every_number(motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
+    numbers = compare_bundles(*motion_bundles, FEW).numbers
+    assert [each.headline for each in numbers][:2] == ["iou 30x30", "iou 100x100"]
+    families = [each.family for each in numbers]
+    assert families == ["main", *["headlines"] * families.count("headlines"), *["other"] * families.count("other")]
+    assert [each.headline is None for each in numbers] == [each == "other" for each in families]
+    assert "ranges/30x30/sq" in {each.number for each in numbers}
+    assert len({each.number for each in numbers}) == len(numbers) > 10
+    assert set(numbers_of(run.result)) != {each.number for each in numbers}
+
+
+def test_the_other_headlines_are_tested_together(generated: Callable[..., Comparison]) -> None:
+    """Both ranges have the same numbers: by itself one is real, of several it is not."""
+    numbers = by_name(generated([50] * 10, [50 + each for each in [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]]))
+    alone, together = numbers[MAIN], numbers["iou 100x100"]
+    assert alone.p == together.p == alone.adjusted_p <= 0.05 < together.adjusted_p
+    assert (alone.real, together.real, together.better) == (True, False, None)
+    tested = [each for each in numbers.values() if each.family == "headlines" and each.p is not None]
+    assert together.adjusted_p == pytest.approx(min(len(tested) * together.p, 1))
+    others = [each for each in numbers.values() if each.family == "other"]
+    assert {each.decision for each in others} == {"for exploration"}
+    assert not any(each.real for each in others)
+
+
+def test_itself_differs_in_nothing(generated: Callable[..., Comparison]) -> None:
+    for each in generated(HARD, HARD).numbers:
+        assert (each.real, each.better, each.low) == (False, None, None)
+        assert each.difference in (0.0, None)
+        assert each.decision in ("the difference is 0", "nothing to compare", "for exploration")
+
+
+def test_what_would_decide(generated: Callable[..., Comparison]) -> None:
+    iou = by_name(generated([50] * 20, [50 + 3 * (-1) ** number + 1 for number in range(20)]))[MAIN]
+    assert not iou.real
+    assert iou.decision == "not decided: about 75 scenarios would decide it"  # 7.849 · 9 · 20 / 19
+
+
+def test_without_resamples(generated: Callable[..., Comparison]) -> None:
+    comparison = generated(HARD, [each + 9 for each in HARD], Resampling(resamples=0))
+    assert {(each.p, each.low, each.real) for each in comparison.numbers} == {(None, None, False)}
+    assert comparison.notes() == ["no intervals and no tests: no resamples were asked for"]
+
+
+def test_all_of_a_small_one(generated: Callable[..., Comparison]) -> None:
+    """Of seven clusters all 64 swaps are tried: none of the others differs as much."""
+    made = generated(HARD[:7], [each + 9 + number % 2 for number, each in enumerate(HARD[:7])], twins=True)
+    chance = "between equally good runs about 0.2 would, by chance"
+    notes = [
+        "p: share of all 64 swaps of clusters between a and b after which they differ at least as much",
+        "tested at 5%: iou 30x30; and the other headlines together, whose p is adjusted by Holm's rule",
+        "scenarios that would decide: with a chance of 80 %, if the true difference is the observed one",
+        f"for exploration: 0 of 4 other numbers have a p of at most 5%; {chance}",
+    ]
+    assert made.to_text().splitlines() == [
+        "motion, protocol released: 14 samples of 14 scenarios",
+        "clusters: 7 (an accident and its twin are one)",
+        f"a: {made.a}",
+        f"b: {made.b}",
+        "",
+        "number                a       b   b − a      95% interval      p             decision",
+        "iou 30x30 (%)    15.000  24.429  +9.429  [+8.934, +9.923]  0.016          b is better",
+        "iou 100x100 (%)  15.000  24.429  +9.429  [+8.934, +9.923]  0.047          b is better",
+        "vpq 30x30 (%)     0.000   0.000  +0.000                 –  1.000  the difference is 0",
+        "vpq 100x100 (%)   0.000   0.000  +0.000                 –  1.000  the difference is 0",
+        "min_ade (m)           –       –       –                 –      –   nothing to compare",
+        "min_fde (m)           –       –       –                 –      –   nothing to compare",
+        "miss_rate             –       –       –                 –      –   nothing to compare",
+        "",
+        *notes,
+    ]
+    whole = made.to_dict()
+    numbers = whole.pop("numbers")
+    assert whole == {
+        "a": str(made.a),
+        "b": str(made.b),
+        "task": "motion",
+        "protocol": "released",
+        "samples": 14,
+        "scenarios": 14,
+        "clusters": 7,
+        "left_out": 0,
+        "partial": [],
+        "swaps": 64,
+        "all_swaps": True,
+        "resampling": {"resamples": 1000, "confidence": 0.95, "seed": 0},
+        "notes": notes,
+    }
+    assert (len(numbers), numbers[1]["p"], numbers[1]["adjusted_p"]) == (12, 1 / 64, 3 / 64)
+
+
+def test_json_and_csv_have_every_number(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
+    comparison = compare_bundles(*motion_bundles, FEW)
+    stated = json.loads(json.dumps(comparison.to_dict()))
+    (path,) = comparison.to_csv(tmp_path / "new")
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(stated["numbers"]) == len(comparison.numbers)
+    assert float(rows[0]["a"]) == stated["numbers"][0]["a"] == comparison.numbers[0].a
+    assert stated["resampling"] == {"resamples": 40, "confidence": 0.95, "seed": 0}
+
+
+def test_the_release_is_not_needed(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
+    copies = [shutil.copytree(each, tmp_path / each.name) for each in motion_bundles]
+    for copy in copies:
+        path = copy / "metrics_summary.json"
+        path.write_text(path.read_text().replace(json.loads(path.read_text())["release"]["dataroot"], "/gone"))
+    assert compare_bundles(*copies, FEW).numbers == compare_bundles(*motion_bundles, FEW).numbers
+
+
+def test_others_are_refused_or_left_out(saved: Save) -> None:
+    a, b = saved("a"), saved("b", 1.0, agents=("ego_vehicle", "infrastructure"))
+    assert_refused(
+        (
+            lambda: compare_bundles(a, b, FEW),
+            EvaluationError,
+            r"2 samples only in .*a \(type1.*\); evaluate both at the same",
+        ),
+    )
+    comparison = compare_bundles(a, b, FEW, common=True)
+    assert (comparison.samples, comparison.left_out) == (4, 2)
+    assert "a, b: only the samples that both have; 2 left out" in comparison.to_text()
+
+
+def test_a_partial_one_is_marked(
+    saved: Save, run: EvaluationRun, da_b: DeepAccident, write_accidents: Write, tmp_path: Path
+) -> None:
+    results = write_accidents(tmp_path / "some.json", run.selection.tokens(da_b)[1:])
+    part = evaluate_results(da_b, results, run.setup, run.selection, allow_partial=True, workers=1)
+    comparison = compare_bundles(saved("a"), save_run(part, tmp_path / "part"), FEW, common=True)
+    assert comparison.partial == ("b: PARTIAL: 5 of 6 samples",)
+    assert "b: PARTIAL: 5 of 6 samples" in comparison.to_text()
 
 
 def changed(path: Path, change: Callable[[Any], object]) -> None:
@@ -295,59 +278,58 @@ def changed(path: Path, change: Callable[[Any], object]) -> None:
     path.write_text(json.dumps(content))
 
 
-class TestRefused:
-    def test_other_samples_tasks_and_rules(
-        self, saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun
-    ) -> None:
-        a, other = saved("a"), saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
-        assert_refused(
-            (
-                lambda: compare_bundles(a, motion_bundles[0], FEW),
-                EvaluationError,
-                ("of the task accident", "one of motion"),
-            ),
-            (
-                lambda: compare_bundles(a, other, FEW),
-                EvaluationError,
-                r"switches/reading.danger_distance 'absent' and 0.5; settings/choices/reading/danger_distance 1.0",
-            ),
-            (
-                lambda: compare_bundles(a, saved("c", split="train"), FEW, common=True),
-                EvaluationError,
-                ("have no sample in common",),
-            ),
-        )
+def test_other_samples_tasks_and_rules(saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
+    a, other = saved("a"), saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
+    assert_refused(
+        (
+            lambda: compare_bundles(a, motion_bundles[0], FEW),
+            EvaluationError,
+            ("of the task accident", "one of motion"),
+        ),
+        (
+            lambda: compare_bundles(a, other, FEW),
+            EvaluationError,
+            r"switches/reading.danger_distance 'absent' and 0.5; settings/choices/reading/danger_distance 1.0",
+        ),
+        (
+            lambda: compare_bundles(a, saved("c", split="train"), FEW, common=True),
+            EvaluationError,
+            ("have no sample in common",),
+        ),
+    )
 
-    def test_other_cells(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
-        """Labels are made on the predictions' own cells: other cells are another truth."""
-        small, axis = copytree(motion_bundles[1], tmp_path / "small"), [-25.0, 25.0, 0.5]
-        changed(small / "metrics_summary.json", lambda summary: summary["results"]["form"].update(x=axis))
-        assert_refused(
-            (
-                lambda: compare_bundles(motion_bundles[0], small, FEW),
-                EvaluationError,
-                ("rules: cells/x '[-50.0, 50.0, 0.5]' and '[-25.0, 25.0, 0.5]'",),
-            ),
-        )
 
-    def test_other_labels_and_another_devkit(self, saved: Save, results: Results) -> None:
-        a, b, c = map(saved, "abc")
-        token = min(results.tokens).rsplit("/", 2)[0]
-        changed(b / "scenarios.json", lambda stored: stored["scenarios"][token].update(label="0"))
-        path = c / "counts.json"
-        path.write_text(path.read_text().replace("of devkit ", "of devkit 9."))
-        assert_refused(
-            (
-                lambda: compare_bundles(a, b, FEW),
-                EvaluationError,
-                (f"calib files of 1 scenarios are not the same ({token})",),
-            ),
-            (
-                lambda: compare_bundles(a, c, FEW),
-                EvaluationError,
-                ("counts.json: was saved by AccidentEvaluator of devkit 9.",),
-            ),
-        )
+def test_other_cells(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
+    """Labels are made on the predictions' own cells: other cells are another truth."""
+    small, axis = copytree(motion_bundles[1], tmp_path / "small"), [-25.0, 25.0, 0.5]
+    changed(small / "metrics_summary.json", lambda summary: summary["results"]["form"].update(x=axis))
+    assert_refused(
+        (
+            lambda: compare_bundles(motion_bundles[0], small, FEW),
+            EvaluationError,
+            ("rules: cells/x '[-50.0, 50.0, 0.5]' and '[-25.0, 25.0, 0.5]'",),
+        ),
+    )
+
+
+def test_other_labels_and_another_devkit(saved: Save, results: Results) -> None:
+    a, b, c = map(saved, "abc")
+    token = min(results.tokens).rsplit("/", 2)[0]
+    changed(b / "scenarios.json", lambda stored: stored["scenarios"][token].update(label="0"))
+    path = c / "counts.json"
+    path.write_text(path.read_text().replace("of devkit ", "of devkit 9."))
+    assert_refused(
+        (
+            lambda: compare_bundles(a, b, FEW),
+            EvaluationError,
+            (f"calib files of 1 scenarios are not the same ({token})",),
+        ),
+        (
+            lambda: compare_bundles(a, c, FEW),
+            EvaluationError,
+            ("counts.json: was saved by AccidentEvaluator of devkit 9.",),
+        ),
+    )
 
 
 @pytest.mark.slow
@@ -379,30 +361,29 @@ def test_counts_that_are_none_are_a_fault_of_the_bundle(tmp_path: Path, fault: s
     assert len(str(raised.value)) < 1000
 
 
-class TestNumbersThatAskForMemory:
-    """In stored counts that a stranger sends: such as a frame of a recording, which has a column each."""
+def test_counts_of_detections_that_ask_for_memory() -> None:
+    evaluator = EvaluationSetup(task="detection").evaluator()
+    columns = {name: [[], []] for name in ("tp", "spent", "matches")}
+    counts = {"token": "a", "truths": [], "scores": [0.5], "detections": [[10**12], [0]], "excused": [[]] * 3}
+    evaluator.add("a", counts | columns | {"errors": [[]] * 6})
+    assert_refused(
+        (evaluator.compute, EvaluationError, r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}"),
+    )
 
-    def test_of_detections(self) -> None:
-        evaluator = EvaluationSetup(task="detection").evaluator()
-        columns = {name: [[], []] for name in ("tp", "spent", "matches")}
-        counts = {"token": "a", "truths": [], "scores": [0.5], "detections": [[10**12], [0]], "excused": [[]] * 3}
-        evaluator.add("a", counts | columns | {"errors": [[]] * 6})
-        assert_refused(
-            (evaluator.compute, EvaluationError, r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}"),
-        )
 
-    def test_of_warnings(self) -> None:
-        evaluator = EvaluationSetup(task="warning", protocol="clean").evaluator()
-        nothing = {"alarms": [], "unjudged": [], "references": [], "involvement": None, "ahead": None, "to_end": None}
-        evaluator.add("a", {"recording": "s/t/a", "frame": 10**9, "kind": "others", "beyond": 0} | nothing)
-        assert_refused(
-            (evaluator.compute, EvaluationError, "s/t/a: expected frames up to 10,000, found 1000000000"),
-        )
+def test_counts_of_warnings_that_ask_for_memory() -> None:
+    evaluator = EvaluationSetup(task="warning", protocol="clean").evaluator()
+    nothing = {"alarms": [], "unjudged": [], "references": [], "involvement": None, "ahead": None, "to_end": None}
+    evaluator.add("a", {"recording": "s/t/a", "frame": 10**9, "kind": "others", "beyond": 0} | nothing)
+    assert_refused(
+        (evaluator.compute, EvaluationError, "s/t/a: expected frames up to 10,000, found 1000000000"),
+    )
 
-    @pytest.mark.parametrize("value", [math.nan, math.inf])
-    def test_of_accidents(self, value: float) -> None:
-        """Of which the remainders never end."""
-        assert len(exact_parts([[1.0, value]])) == 1
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_counts_of_accidents_whose_remainders_never_end(value: float) -> None:
+    """Of which the remainders never end."""
+    assert len(exact_parts([[1.0, value]])) == 1
 
 
 @pytest.mark.parametrize(("count", "shown"), [(1, 1), (3, 3), (4, 4)])
@@ -455,6 +436,7 @@ def test_cells_of_the_table() -> None:
         decision="why",
     )
     assert text_row(number) == ("y (m)", "1.000", "–", "–", "[-0.500, +0.250]", "–", "why")
+    assert text_row(replace(number, decision="no decision is possible with 1 cluster"))[-1] == "too few"
     shown = text_row(replace(number, unit="share", low=None, difference=0.25, adjusted_p=0.0625))
     assert shown == ("y", "1.000", "–", "+0.250", "–", "0.062", "why")
     assert text_row(replace(number, unit=None, high=None))[:5:4] == ("y", "–")
@@ -523,14 +505,6 @@ def test_half_of_the_ties_of_random_swaps_count() -> None:
     assert p_values(np.array([0.0]), swapped, swaps)[0] == 1
 
 
-def test_pairs_are_what_is_tested() -> None:
-    """Clusters differ by far more than the runs; were one run's in another order, nothing would be real."""
-    hard = np.linspace(0, 10, 12)
-    better = hard + 0.1 + np.linspace(0, 0.02, 12)
-    assert paired(hard, better).p[0] <= 2 / 1001
-    assert paired(hard, np.roll(better, 3)).p[0] > 0.5
-
-
 def test_clusters_that_do_not_differ_are_not_swapped() -> None:
     first = np.arange(40.0)
     made = paired(first, first + np.where(np.arange(40) % 5 == 0, 1.0, 0.0))
@@ -560,33 +534,26 @@ def test_the_interval_is_students() -> None:
     assert_allclose(made.errors, error)
 
 
-class TestUndecided:
-    def test_clusters_that_are_too_few(self) -> None:
-        made = paired(np.zeros(5), np.arange(5) + 1.0)
-        assert undecided(made, 0, 1, 5) == "no decision is possible with 5 clusters; at least 6 are needed"
-        assert undecided(made, 0, 4, 5) == "no decision is possible with 5 clusters; at least 8 are needed"
-        few = paired(np.zeros(30), np.eye(30)[0])
-        text = "no decision is possible with 1 of 30 clusters in which the two differ; at least 6 are needed"
-        assert undecided(few, 0, 1, 30) == text
+def test_clusters_that_are_too_few() -> None:
+    made = paired(np.zeros(5), np.arange(5) + 1.0)
+    assert undecided(made, 0, 1, 5) == "no decision is possible with 5 clusters; at least 6 are needed"
+    assert undecided(made, 0, 4, 5) == "no decision is possible with 5 clusters; at least 8 are needed"
+    few = paired(np.zeros(30), np.eye(30)[0])
+    text = "no decision is possible with 1 of 30 clusters in which the two differ; at least 6 are needed"
+    assert undecided(few, 0, 1, 30) == text
 
-    def test_resamples_that_are_too_few(self) -> None:
-        made = paired(np.zeros(30), np.arange(30) + 1.0, Resampling(resamples=10))
-        assert undecided(made, 0, 1, 30) == "no decision is possible with 10 resamples; at least 19 are needed"
-        assert undecided(paired(np.zeros(9), np.ones(9), Resampling(resamples=0)), 0, 1, 9).startswith("not tested: ")
 
-    def test_no_difference(self) -> None:
-        assert undecided(paired(np.zeros(8), np.tile([1.0, -1.0], 4)), 0, 1, 8) == "the difference is 0"
-        nothing = np.full(8, math.nan)
-        with np.errstate(all="ignore"), pytest.warns(RuntimeWarning):
-            assert undecided(paired(np.zeros(8), nothing), 0, 1, 8) == "nothing to compare"
+def test_resamples_that_are_too_few() -> None:
+    made = paired(np.zeros(30), np.arange(30) + 1.0, Resampling(resamples=10))
+    assert undecided(made, 0, 1, 30) == "no decision is possible with 10 resamples; at least 19 are needed"
+    assert undecided(paired(np.zeros(9), np.ones(9), Resampling(resamples=0)), 0, 1, 9).startswith("not tested: ")
 
-    def test_how_many_would_decide(self) -> None:
-        """A difference of 0.5 with a spread of 2: (1.96 + 0.84)² = 7.849 times the square of their ratio."""
-        made = paired(np.zeros(20), 0.5 + np.tile([2.0, -2.0], 10))
-        assert made.p[0] > 0.05
-        clusters = 7.849 * 20 / 19 * 4 / 0.5**2
-        needed = math.ceil(clusters * 2 / 10) * 10  # two scenarios each, with two digits
-        assert undecided(made, 0, 1, 40) == f"not decided: about {needed} scenarios would decide it"
+
+def test_no_difference_decides_nothing() -> None:
+    assert undecided(paired(np.zeros(8), np.tile([1.0, -1.0], 4)), 0, 1, 8) == "the difference is 0"
+    nothing = np.full(8, math.nan)
+    with np.errstate(all="ignore"), pytest.warns(RuntimeWarning):
+        assert undecided(paired(np.zeros(8), nothing), 0, 1, 8) == "nothing to compare"
 
 
 def test_all_swaps_or_random_ones() -> None:

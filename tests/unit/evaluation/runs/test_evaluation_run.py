@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,72 +53,83 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluation_run, "evaluate_samples", refused)
 
 
-class TestRun:
-    def test_equals_the_evaluator_by_hand(self, da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
-        by_hand = AccidentEvaluator("boxes")
-        for token in results.tokens:
-            by_hand.update(token, results.prediction(token), None, accident_context(da_b, token, 2.0))
-        assert (run.result, run.result.positives, run.partial) == (by_hand.compute(), 3, None)
-        assert run.attributes == sample_attributes(da_b, results.tokens)
-        assert set(run.times_to_impact.values()) == {0.5, None}
+def test_equals_the_evaluator_by_hand(da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
+    by_hand = AccidentEvaluator("boxes")
+    for token in results.tokens:
+        by_hand.update(token, results.prediction(token), None, accident_context(da_b, token, 2.0))
+    assert (run.result, run.result.positives, run.partial) == (by_hand.compute(), 3, None)
+    assert (run.attributes, set(run.times_to_impact.values())) == (sample_attributes(da_b, results.tokens), {0.5, None})
 
-    def test_says_what_it_depends_on(self, da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
-        assert run.release.scenarios == scenario_hashes(da_b, da_b.split_scenarios("val"))
-        assert (run.results.fingerprint, run.results.form) == (results.fingerprint, None)
-        assert run.results.meta == {"method": "truth", "moved": 0.1}
 
-    def test_prints_its_headlines(self, run: EvaluationRun) -> None:
-        assert repr(run) == f"EvaluationRun(accident, protocol boxes: {run.result!r})"
-        marked = replace(run, partial=Partial(missing=1, extra=0, expected=9, evaluated=8))
-        assert "boxes, PARTIAL: 8 of 9 samples: BoxAccidentResult(" in repr(marked)
+def test_says_what_it_depends_on(da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
+    assert run.release.scenarios == scenario_hashes(da_b, da_b.split_scenarios("val"))
+    assert (run.results.fingerprint, run.results.form) == (results.fingerprint, None)
+    assert run.results.meta == {"method": "truth", "moved": 0.1}
 
-    def test_a_path_and_the_name_of_a_split_will_do(self, da_motion: DeepAccident, tmp_path: Path) -> None:
-        with ResultsWriter(tmp_path / "none.json", "accident") as writer:
-            for token in da_motion.evaluation_samples("train"):
-                writer.add(token, [])
-        run = evaluate_results(da_motion, tmp_path / "none.json", SETUP, "train", workers=1)
-        assert (len(run.evaluator), run.result.apa) == (20, 0.0)
 
-    def test_breakdowns_on_two_workers_are_the_same(self, run: EvaluationRun) -> None:
-        one, two = (run.broken_down(["all", "agent"], Resampling(resamples=20), workers=workers) for workers in (1, 2))
-        assert one.summary() == two.summary() != run.summary()
+def test_prints_its_headlines(run: EvaluationRun) -> None:
+    assert repr(run) == f"EvaluationRun(accident, protocol boxes: {run.result!r})"
+    marked = replace(run, partial=Partial(missing=1, extra=0, expected=9, evaluated=8))
+    assert "boxes, PARTIAL: 8 of 9 samples: BoxAccidentResult(" in repr(marked)
 
-    def test_breakdowns(self, run: EvaluationRun) -> None:
-        broken = run.broken_down(["agent", "all", "agent"], Resampling(resamples=5))
-        assert [each.by for each in broken.breakdowns] == ["agent", "all"]
-        assert broken.breakdowns[1].groups[0].result == run.result
-        assert [each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns] == list(BREAKDOWNS)
-        assert_refused(
-            (
-                lambda: run.broken_down(["wether"]),
-                ChoiceError,
-                r"by: expected one of all, .*, found 'wether'; did you mean 'weather'",
-            ),
-        )
+
+def test_a_path_and_the_name_of_a_split_will_do(da_motion: DeepAccident, tmp_path: Path) -> None:
+    with ResultsWriter(tmp_path / "none.json", "accident") as writer:
+        for token in da_motion.evaluation_samples("train"):
+            writer.add(token, [])
+    run = evaluate_results(da_motion, tmp_path / "none.json", SETUP, "train", workers=1)
+    assert (len(run.evaluator), run.result.apa) == (20, 0.0)
+
+
+def test_breakdowns(run: EvaluationRun) -> None:
+    broken = run.broken_down(["agent", "all", "agent"], Resampling(resamples=5))
+    assert [each.by for each in broken.breakdowns] == ["agent", "all"]
+    assert broken.breakdowns[1].groups[0].result == run.result
+    assert [each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns] == list(BREAKDOWNS)
+    assert_refused(
+        (
+            lambda: run.broken_down(["wether"]),
+            ChoiceError,
+            r"by: expected one of all, .*, found 'wether'; did you mean 'weather'",
+        ),
+    )
 
 
 @pytest.mark.usefixtures("nothing_long")
 class TestRefused:
-    def test_a_kind_that_the_task_does_not_take(
-        self, da_b: DeepAccident, results: Results, selection: SampleSelection
+    def test_results_that_do_not_fit(
+        self,
+        da_b: DeepAccident,
+        selection: SampleSelection,
+        tmp_path: Path,
+        write_motion: Write,
+        write_accidents: Write,
     ) -> None:
+        """Of another kind, of too short a look ahead, with a damaged shard, missing samples, nothing in common."""
+        tokens, motion = selection.tokens(da_b), EvaluationSetup(task="motion")
+        accidents = write_accidents(tmp_path / "some.json", tokens[1:])
+        others = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
+        maps, damaged = (write_motion(tmp_path / name, tokens) for name in ("motion", "damaged"))
+        shard = next((tmp_path / "damaged" / "shards").iterdir())
+        shard.write_bytes(shard.read_bytes()[:-100])
+        evaluate = partial(evaluate_results, da_b)
         assert_refused(
+            (partial(evaluate, accidents, motion, selection), EvaluationError, ("accident results", "motion results")),
             (
-                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection),
+                partial(evaluate, maps, replace(motion, horizon=3.0), selection),
                 EvaluationError,
-                r"holds accident results; motion is evaluated from motion results",
+                ("look 2 s ahead (5 frames, 0.5 s apart",),
             ),
-        )
-
-    def test_predictions_that_do_not_look_far_enough(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
-    ) -> None:
-        results = write_motion(tmp_path / "motion", selection.tokens(da_b))
-        assert_refused(
+            (partial(evaluate, damaged, motion, selection), ResultsError, (shard.name,)),
             (
-                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection),
-                EvaluationError,
-                r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the",
+                partial(evaluate, accidents, SETUP, selection),
+                ResultsError,
+                (f"some.json: 1 of 6 samples have no prediction ({tokens[0]})",),
+            ),
+            (
+                partial(evaluate, others, SETUP, selection, allow_partial=True),
+                ResultsError,
+                ("of the splits train", "nothing is left to evaluate"),
             ),
         )
 
@@ -129,97 +141,58 @@ class TestRefused:
         silent = [scenario["token"] for scenario in da_b.find(split="train")][:1]
         for token in silent:
             (own_release / "train" / token.replace("/", "/meta/")).with_suffix(".txt").unlink()
-        partial = DeepAccident(dataroot=own_release, verbose=False)
+        release = DeepAccident(dataroot=own_release, verbose=False)
         with ResultsWriter(tmp_path / "none.json", "accident") as writer:
-            for sample in every.tokens(partial):
+            for sample in every.tokens(release):
                 writer.add(sample, [])
         assert_refused(
             (
                 lambda: evaluate_results(
-                    partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every
+                    release, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every
                 ),
                 EvaluationError,
                 r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'",
             ),
         )
-        save_selection(partial.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
+        save_selection(release.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
         chosen = replace(every, split=str(tmp_path / "mine.txt"))
-        check_metas(partial, chosen.tokens(partial), chosen.split)
-
-    def test_a_damaged_shard(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
-    ) -> None:
-        results = write_motion(tmp_path / "motion", selection.tokens(da_b))
-        shard = next((tmp_path / "motion" / "shards").iterdir())
-        shard.write_bytes(shard.read_bytes()[:-100])
-        assert_refused(
-            (
-                lambda: evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection),
-                ResultsError,
-                shard.name,
-            ),
-        )
-
-    def test_missing_samples(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
-    ) -> None:
-        results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
-        missing = selection.tokens(da_b)[0]
-        assert_refused(
-            (
-                lambda: evaluate_results(da_b, results, SETUP, selection),
-                ResultsError,
-                rf"some.json: 1 of 6 samples have no prediction \({missing}\); the pred",
-            ),
-        )
-
-    def test_nothing_in_common(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
-    ) -> None:
-        other = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
-        assert_refused(
-            (
-                lambda: evaluate_results(da_b, other, SETUP, selection, allow_partial=True),
-                ResultsError,
-                r"of the splits train .*; nothing is left to evaluate",
-            ),
-        )
+        check_metas(release, chosen.tokens(release), chosen.split)
 
 
-class TestPartial:
-    def test_only_what_is_in_both_and_marked(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
-    ) -> None:
-        tokens = selection.tokens(da_b)
-        extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
-        results = write_accidents(tmp_path / "some.json", [*tokens[2:], *extra])
-        run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
-        assert run.evaluator.tokens == set(tokens[2:])
-        assert run.partial is not None
-        assert run.partial.text() == "PARTIAL: 4 of 6 samples, 2 predictions left out"
-        assert run.summary()["partial"] == {
-            "missing": 2,
-            "extra": 2,
-            "expected": 6,
-            "evaluated": 4,
-            "mark": run.partial.text(),
-        }
+def test_only_what_is_in_both_and_marked(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
+) -> None:
+    tokens = selection.tokens(da_b)
+    extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
+    results = write_accidents(tmp_path / "some.json", [*tokens[2:], *extra])
+    run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
+    assert run.evaluator.tokens == set(tokens[2:])
+    assert run.partial is not None
+    assert run.partial.text() == "PARTIAL: 4 of 6 samples, 2 predictions left out"
+    assert run.summary()["partial"] == {
+        "missing": 2,
+        "extra": 2,
+        "expected": 6,
+        "evaluated": 4,
+        "mark": run.partial.text(),
+    }
 
-    def test_other_predictions_alone_do_not_mark(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
-    ) -> None:
-        tokens = selection.tokens(da_b)
-        extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
-        results = write_accidents(tmp_path / "more.json", [*tokens, *extra])
-        assert_refused(
-            (
-                lambda: evaluate_results(da_b, results, SETUP, selection),
-                ResultsError,
-                r"\); leave them out with --allow-partial .*; no sample",
-            ),
-        )
-        run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
-        assert (run.evaluator.tokens, run.partial) == (set(tokens), None)
+
+def test_other_predictions_alone_do_not_mark(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
+) -> None:
+    tokens = selection.tokens(da_b)
+    extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
+    results = write_accidents(tmp_path / "more.json", [*tokens, *extra])
+    assert_refused(
+        (
+            lambda: evaluate_results(da_b, results, SETUP, selection),
+            ResultsError,
+            r"\); leave them out with --allow-partial .*; no sample",
+        ),
+    )
+    run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
+    assert (run.evaluator.tokens, run.partial) == (set(tokens), None)
 
 
 class TestBrokenOff:

@@ -110,69 +110,74 @@ def test_warning(da_b: DeepAccident, results: Results, selection: SampleSelectio
     assert len(rows) == 6
 
 
-class TestParquet:
-    def test_columns_of_any_row_and_nothing(self, tmp_path: Path) -> None:
-        rows = [{"a": 1, "b": None, "c": True}, {"a": 2, "b": None, "d": "x"}, {"a": None, "e": 1}, {"e": 0.5}]
-        write_rows(tmp_path / "rows.parquet", rows, {"partial": None})
-        names = ("a", "b", "c", "d", "e")
-        read, stamp = read_rows(tmp_path / "rows.parquet")
-        assert (read, stamp) == ([{name: row.get(name) for name in names} for row in rows], {"partial": None})
+def test_columns_of_any_row_and_nothing(tmp_path: Path) -> None:
+    rows = [{"a": 1, "b": None, "c": True}, {"a": 2, "b": None, "d": "x"}, {"a": None, "e": 1}, {"e": 0.5}]
+    write_rows(tmp_path / "rows.parquet", rows, {"partial": None})
+    names = ("a", "b", "c", "d", "e")
+    read, stamp = read_rows(tmp_path / "rows.parquet")
+    assert (read, stamp) == ([{name: row.get(name) for name in names} for row in rows], {"partial": None})
 
-    def test_no_rows(self, tmp_path: Path) -> None:
-        write_rows(tmp_path / "rows.parquet", [], {})
-        assert read_rows(tmp_path / "rows.parquet") == ([], {})
 
-    @pytest.mark.parametrize("content", [b"", b"PAR1 and no more"])
-    def test_what_is_no_table(self, tmp_path: Path, content: bytes) -> None:
-        (tmp_path / "rows.parquet").write_bytes(content)
-        assert_refused(
-            (lambda: read_rows(tmp_path / "rows.parquet"), ResultsError, r"rows.parquet: is no table of samples"),
-        )
+def test_a_table_of_no_rows(tmp_path: Path) -> None:
+    write_rows(tmp_path / "rows.parquet", [], {})
+    assert read_rows(tmp_path / "rows.parquet") == ([], {})
 
-    def test_a_table_of_somebody_else(self, tmp_path: Path) -> None:
-        import pyarrow as pa
-        from pyarrow import parquet
 
-        parquet.write_table(pa.table({"token": ["a"]}), tmp_path / "rows.parquet")
-        assert_refused(
-            (
-                lambda: read_rows(tmp_path / "rows.parquet"),
-                ResultsError,
-                r"rows.parquet: is no table of samples \(b'deepaccident'\)",
-            ),
-        )
+@pytest.mark.parametrize("content", [b"", b"PAR1 and no more"])
+def test_what_is_no_table(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "rows.parquet").write_bytes(content)
+    assert_refused(
+        (lambda: read_rows(tmp_path / "rows.parquet"), ResultsError, r"rows.parquet: is no table of samples"),
+    )
 
-    @pytest.mark.parametrize("kind", BOMBS)
-    def test_what_would_not_fit_into_memory(self, tmp_path: Path, kind: str) -> None:
-        import pyarrow as pa
-        from pyarrow import parquet
 
-        column, told = BOMBS[kind]
-        table = pa.table({"token": column()}).replace_schema_metadata({"deepaccident": "{}"})
-        parquet.write_table(table, tmp_path / "rows.parquet", compression="zstd", store_schema=False)
-        del table
-        pool = pa.default_memory_pool()
-        before = pool.bytes_allocated()
-        with pytest.raises(ResultsError, match=rf"rows.parquet: is no table of samples \({told}") as raised:
-            read_rows(tmp_path / "rows.parquet")
-        assert len(str(raised.value)) < 1000
-        assert pool.bytes_allocated() - before < 100 << 20
+def test_a_table_of_somebody_else(tmp_path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
 
-    def test_a_text_that_is_none(self, tmp_path: Path) -> None:
-        path = tmp_path / "rows.parquet"
-        write_rows(path, [{"token": "é" * 20}], {})
-        path.write_bytes(path.read_bytes().replace("é".encode(), b"\xff\xff"))
-        assert_refused(
-            (lambda: read_rows(path), ResultsError, "is no table of samples"),
-        )
+    parquet.write_table(pa.table({"token": ["a"]}), tmp_path / "rows.parquet")
+    assert_refused(
+        (
+            lambda: read_rows(tmp_path / "rows.parquet"),
+            ResultsError,
+            r"rows.parquet: is no table of samples \(b'deepaccident'\)",
+        ),
+    )
 
-    def test_a_pipe_and_a_giant(self, tmp_path: Path) -> None:
-        os.mkfifo(tmp_path / "pipe")
-        assert_refused(
-            (lambda: read_rows(tmp_path / "pipe"), ResultsError, r"not a regular file \(a named pipe\)"),
-        )
-        with (tmp_path / "giant").open("wb") as file:
-            file.truncate(3 << 30)
-        assert_refused(
-            (lambda: read_rows(tmp_path / "giant"), ResultsError, "has 3,221,225,472 bytes"),
-        )
+
+@pytest.mark.parametrize("kind", BOMBS)
+def test_what_would_not_fit_into_memory(tmp_path: Path, kind: str) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    column, told = BOMBS[kind]
+    table = pa.table({"token": column()}).replace_schema_metadata({"deepaccident": "{}"})
+    parquet.write_table(table, tmp_path / "rows.parquet", compression="zstd", store_schema=False)
+    del table
+    pool = pa.default_memory_pool()
+    before = pool.bytes_allocated()
+    with pytest.raises(ResultsError, match=rf"rows.parquet: is no table of samples \({told}") as raised:
+        read_rows(tmp_path / "rows.parquet")
+    assert len(str(raised.value)) < 1000
+    assert pool.bytes_allocated() - before < 100 << 20
+
+
+def test_a_text_that_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "rows.parquet"
+    write_rows(path, [{"token": "é" * 20}], {})
+    path.write_bytes(path.read_bytes().replace("é".encode(), b"\xff\xff"))
+    assert_refused(
+        (lambda: read_rows(path), ResultsError, "is no table of samples"),
+    )
+
+
+def test_a_pipe_and_a_giant(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert_refused(
+        (lambda: read_rows(tmp_path / "pipe"), ResultsError, r"not a regular file \(a named pipe\)"),
+    )
+    with (tmp_path / "giant").open("wb") as file:
+        file.truncate(3 << 30)
+    assert_refused(
+        (lambda: read_rows(tmp_path / "giant"), ResultsError, "has 3,221,225,472 bytes"),
+    )

@@ -42,19 +42,18 @@ def lines_of(text: str) -> list[str]:
 
 def test_what_it_tells(run: EvaluationRun) -> None:
     lines = lines_of(summary_text(run.broken_down(["all", "agent"], Resampling(resamples=10)).summary(), ["agent"]))
-    assert lines[:2] == ["evaluated", "task accident, protocol boxes"]
-    assert lines[2].startswith(
-        "samples 6 of 2 scenarios: split val, list evaluate, scope all, ego_vehicle, other_vehicle, inf"
-    )
-    assert "number value" in lines
-    assert "position_error 0.283 m" in lines
-    assert "no intervals: of 1 cluster (an accident and its twin are one); at least 6 are needed" in lines
-    assert "samples 6, positives 3, negatives 3, unjudged 0, beyond 0, at_impact 0, unplaced 0" in lines
-    assert "within/5 tp 3, fp 0, fn 0" in lines
-    assert lines[lines.index("by agent") + 1].startswith(
-        "value samples scenarios apa precision recall false_alarm_rate"
-    )
-    assert "ego_vehicle 2 2 1.000 1.000 1.000 0.000 1.000" in lines
+    told = {
+        "evaluated",
+        "task accident, protocol boxes",
+        "number value",
+        "position_error 0.283 m",
+        "no intervals: of 1 cluster (an accident and its twin are one); at least 6 are needed",
+        "samples 6, positives 3, negatives 3, unjudged 0, beyond 0, at_impact 0, unplaced 0",
+        "within/5 tp 3, fp 0, fn 0",
+        "by agent",
+        "ego_vehicle 2 2 1.000 1.000 1.000 0.000 1.000",
+    }
+    assert told - {*lines} == set()
 
 
 def test_the_bundle_on_disk_reads_alike(run: EvaluationRun, tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """An accident of which no label shows both actors ends no evaluation: its samples are left out, and told."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -25,37 +24,17 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 ALARM = Accident(positions=[[5.0, 0.0], [8.0, 0.0]], time=1.0, score=0.5)
-Change = Callable[[list[str], list[str]], None]
 
 
-def named(which: int, actor: int, agents: str | None = None) -> Change:
-    """Another actor, and what `colliding agents:` says, in place of what meta has."""
-
-    def change(first: list[str], others: list[str]) -> None:
-        first[(1, 3)[which]] = str(actor)
-        if agents is not None:
-            others[0] = f" colliding agents: {agents}"
-
-    return change
-
-
-def twice(first: list[str], _others: list[str]) -> None:
-    first[3] = first[1]
-
-
-def no_other_lines(first: list[str], others: list[str]) -> None:
-    first[3] = "0"
-    others.clear()
-
-
-CHANGES = {
-    "id 0": named(1, 0, "ego none"),
-    "id 0 first": named(0, 0, "none ego"),
-    "nobody named": named(1, 0, "none none"),
-    "in no label": named(1, 424_242),
-    "one actor twice": twice,
-    "a first line alone": no_other_lines,
+CHANGES: dict[str, tuple[int, str, str | None]] = {
+    "id 0": (3, "0", "ego none"),
+    "id 0 first": (1, "0", "none ego"),
+    "nobody named": (3, "0", "none none"),
+    "in no label": (3, "424242", None),
+    "one actor twice": (3, "", None),
+    "a first line alone": (3, "0", ""),
 }
+"""Place in meta's first line, the actor there (the first one again), and its agents (no further lines at all)."""
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +51,10 @@ def unplaced(request: pytest.FixtureRequest, whole: Path, tmp_path_factory: pyte
     meta = min(root.glob("*_accident/meta/*.txt"))
     line, *others = meta.read_text().split("\n")
     first = line.split()
-    CHANGES[request.param](first, others)
+    place, actor, agents = CHANGES[request.param]
+    first[place] = actor or first[1]
+    if agents is not None:
+        others = [f" colliding agents: {agents}", *others[1:]] if agents else []
     meta.write_text("\n".join([" ".join(first), *others]))
     lines = [f"{each.parents[1].name} {each.stem}\n" for each in sorted(root.glob("*/meta/*.txt"))]
     (root / "mine.txt").write_text("".join(lines))

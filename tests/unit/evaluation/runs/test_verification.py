@@ -53,175 +53,183 @@ def found(verification: Verification) -> list[str]:
     return [each.where for each in verification.differences]
 
 
-class TestSame:
-    def test_nothing_differs(self, bundle: Path, da_b: DeepAccident) -> None:
-        verification = verify(bundle, da_b)
-        assert (verification.is_same, verification.samples, verification.notes) == (True, 6, ())
-        assert verification.to_text() == f"{bundle}: the same; 6 samples evaluated again, all numbers are equal"
-        assert verification.to_dict()["same"] is True
-
-    def test_with_results_inside_and_elsewhere(self, run: EvaluationRun, tmp_path: Path, own_release: Path) -> None:
-        bundle = save_run(run, tmp_path / "bundle", include_results=True)
-        moved = tmp_path / "moved"
-        shutil.move(bundle, moved)
-        (tmp_path / "accidents.json").unlink()
-        assert verify(moved, DeepAccident(dataroot=own_release, verbose=False)).is_same
-
-    def test_a_partial_one(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write, run: EvaluationRun
-    ) -> None:
-        results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
-        part = evaluate_results(da_b, results, run.setup, selection, allow_partial=True, workers=1)
-        assert verify(save_run(part, tmp_path / "bundle"), da_b, results=results).is_same
-
-    def test_one_whose_results_have_other_samples_too(
-        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, results: Results, run: EvaluationRun
-    ) -> None:
-        fewer = replace(selection, agents=("ego_vehicle",))
-        part = evaluate_results(da_b, results, run.setup, fewer, allow_partial=True, workers=1)
-        assert (part.partial, part.left_out) == (None, 4)
-        assert "; 4 predictions of other samples left out" in summary_text(part.summary())
-        assert verify(save_run(part, tmp_path / "bundle"), da_b).is_same
+def test_nothing_differs(bundle: Path, da_b: DeepAccident) -> None:
+    verification = verify(bundle, da_b)
+    assert (verification.is_same, verification.samples, verification.notes) == (True, 6, ())
+    assert verification.to_text() == f"{bundle}: the same; 6 samples evaluated again, all numbers are equal"
+    assert verification.to_dict()["same"] is True
 
 
-class TestNamed:
-    def test_a_number(self, bundle: Path, da_b: DeepAccident) -> None:
-        changed(bundle / "metrics_summary.json", lambda summary: summary["metrics"].update(apa=0.99))
-        verification = verify(bundle, da_b)
-        assert verification.to_text().splitlines()[2] == "  metrics_summary.json: metrics/apa: stored 0.99, found 1.0"
-        assert verification.to_dict()["differences"][1] == {
-            "where": "metrics_summary.json: metrics/apa",
-            "stored": 0.99,
-            "found": 1.0,
-        }
+def test_with_results_inside_and_elsewhere(run: EvaluationRun, tmp_path: Path, own_release: Path) -> None:
+    bundle = save_run(run, tmp_path / "bundle", include_results=True)
+    moved = tmp_path / "moved"
+    shutil.move(bundle, moved)
+    (tmp_path / "accidents.json").unlink()
+    assert verify(moved, DeepAccident(dataroot=own_release, verbose=False)).is_same
 
-    @pytest.mark.parametrize(
-        ("place", "stored", "named"),
-        [
-            ("metrics/apa", 0.99, ["metrics/apa"]),
-            ("breakdowns/all/groups/0/metrics/apa", 1 - 1e-16, ["breakdowns/all/groups/0/metrics/apa"]),
-            ("devkit_version", "0.0.9", ["devkit_version"]),
-            ("environment/numpy", "1.0", []),
-        ],
+
+def test_a_partial_one(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write, run: EvaluationRun
+) -> None:
+    results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
+    part = evaluate_results(da_b, results, run.setup, selection, allow_partial=True, workers=1)
+    assert verify(save_run(part, tmp_path / "bundle"), da_b, results=results).is_same
+
+
+def test_one_whose_results_have_other_samples_too(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, results: Results, run: EvaluationRun
+) -> None:
+    fewer = replace(selection, agents=("ego_vehicle",))
+    part = evaluate_results(da_b, results, run.setup, fewer, allow_partial=True, workers=1)
+    assert (part.partial, part.left_out) == (None, 4)
+    assert "; 4 predictions of other samples left out" in summary_text(part.summary())
+    assert verify(save_run(part, tmp_path / "bundle"), da_b).is_same
+
+
+def test_a_number(bundle: Path, da_b: DeepAccident) -> None:
+    changed(bundle / "metrics_summary.json", lambda summary: summary["metrics"].update(apa=0.99))
+    verification = verify(bundle, da_b)
+    assert verification.to_text().splitlines()[2] == "  metrics_summary.json: metrics/apa: stored 0.99, found 1.0"
+    assert verification.to_dict()["differences"][1] == {
+        "where": "metrics_summary.json: metrics/apa",
+        "stored": 0.99,
+        "found": 1.0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("place", "stored", "named"),
+    [
+        ("metrics/apa", 0.99, ["metrics/apa"]),
+        ("breakdowns/all/groups/0/metrics/apa", 1 - 1e-16, ["breakdowns/all/groups/0/metrics/apa"]),
+        ("devkit_version", "0.0.9", ["devkit_version"]),
+        ("environment/numpy", "1.0", []),
+    ],
+)
+def test_a_value_of_the_summary(bundle: Path, da_b: DeepAccident, place: str, stored: object, named: list[str]) -> None:
+    """To the last bit; another numpy is a note."""
+
+    def change(summary: Any) -> None:
+        *parts, last = place.split("/")
+        reduce(lambda at, part: at[int(part) if part.isdigit() else part], parts, summary)[last] = stored
+
+    changed(bundle / "metrics_summary.json", change)
+    verification = verify(bundle, da_b)
+    assert found(verification) == [SUMMARY_CHANGED, *(f"metrics_summary.json: {each}" for each in named)]
+    assert any("evaluated with numpy 1.0, verified with " in note for note in verification.notes) != bool(named)
+    assert verification.samples == 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["label", "meta", "calib"])
+def test_a_file_of_a_scenario(bundle: Path, own_release: Path, kind: str) -> None:
+    opened = DeepAccident(dataroot=own_release, verbose=False)
+    path = min(own_release.glob("val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*"))
+    path.write_bytes(path.read_bytes() + b"\n")
+    token, verification = min(opened.split_scenarios("val")), verify(bundle, opened)
+    assert found(verification) == ["metrics_summary.json: release/fingerprint", f"scenarios.json: {token}/{kind}"]
+    assert "edited in place" in verification.notes[0]
+
+
+def test_a_scenario_that_is_gone(bundle: Path, own_release: Path) -> None:
+    for folder in own_release.glob("val/*_normal"):
+        shutil.rmtree(folder)
+    verification = verify(bundle, DeepAccident(dataroot=own_release, verbose=False))
+    assert found(verification) == ["all numbers"]
+    assert "3 predictions are of no sample of this release" in verification.notes[0]
+    assert verification.samples == 0
+
+
+def test_a_scenario_that_the_bundle_does_not_state(bundle: Path, da_b: DeepAccident) -> None:
+    gone = min(read_scenarios(bundle, "_normal"))
+    changed(bundle / "scenarios.json", lambda stored: stored["scenarios"].pop(gone))
+    assert found(verify(bundle, da_b)) == ["files.json: scenarios.json", f"scenarios.json: {gone}"]
+
+
+def test_why_nothing_can_be_made_again_is_told_in_full(
+    bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
+) -> None:
+    other = write_accidents(tmp_path / "other.json", results.tokens[1:])
+    text = verify(bundle, da_b, results=other).to_text()
+    assert "all numbers: stored 'evaluated', found absent" in text
+    assert f"note: cannot be evaluated again: {other.path}: 1 of 6 samples have no pred" in text
+    assert "marks every number as partial" in text
+
+
+def test_other_results(
+    bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
+) -> None:
+    differing = found(
+        verify(bundle, da_b, results=write_accidents(tmp_path / "other.json", results.tokens, moved=1.0).path)
     )
-    def test_a_value_of_the_summary(
-        self, bundle: Path, da_b: DeepAccident, place: str, stored: object, named: list[str]
-    ) -> None:
-        """To the last bit; another numpy is a note."""
+    assert {each.split(": ")[0] for each in differing} == {"metrics_summary.json", "counts.json", "samples.parquet"}
+    assert "metrics_summary.json: results/fingerprint" in differing
 
-        def change(summary: Any) -> None:
-            *parts, last = place.split("/")
-            reduce(lambda at, part: at[int(part) if part.isdigit() else part], parts, summary)[last] = stored
 
-        changed(bundle / "metrics_summary.json", change)
-        verification = verify(bundle, da_b)
-        assert found(verification) == [SUMMARY_CHANGED, *(f"metrics_summary.json: {each}" for each in named)]
-        assert any("evaluated with numpy 1.0, verified with " in note for note in verification.notes) != bool(named)
-        assert verification.samples == 6
+def test_counts_of_a_sample(bundle: Path, da_b: DeepAccident) -> None:
+    token = min(json.loads((bundle / "counts.json").read_text())["counts"])
+    changed(bundle / "counts.json", lambda state: state["counts"][token].update(unjudged=7))
+    assert found(verify(bundle, da_b)) == [
+        "files.json: counts.json",
+        f"counts.json: {token}/unjudged",
+    ]
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize("kind", ["label", "meta", "calib"])
-    def test_a_file_of_a_scenario(self, bundle: Path, own_release: Path, kind: str) -> None:
-        opened = DeepAccident(dataroot=own_release, verbose=False)
-        path = min(own_release.glob("val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*"))
-        path.write_bytes(path.read_bytes() + b"\n")
-        token, verification = min(opened.split_scenarios("val")), verify(bundle, opened)
-        assert found(verification) == ["metrics_summary.json: release/fingerprint", f"scenarios.json: {token}/{kind}"]
-        assert "edited in place" in verification.notes[0]
 
-    def test_a_scenario_that_is_gone(self, bundle: Path, own_release: Path) -> None:
-        for folder in own_release.glob("val/*_normal"):
-            shutil.rmtree(folder)
-        verification = verify(bundle, DeepAccident(dataroot=own_release, verbose=False))
-        assert found(verification) == ["all numbers"]
-        assert "3 predictions are of no sample of this release" in verification.notes[0]
-        assert verification.samples == 0
+def test_a_row(bundle: Path, da_b: DeepAccident) -> None:
+    rows, stamp = read_rows(bundle / "samples.parquet")
+    rows[2]["tp_10m"] = 5
+    write_rows(bundle / "samples.parquet", rows[:-1], stamp)
+    assert found(verify(bundle, da_b)) == [
+        "files.json: samples.parquet",
+        f"samples.parquet: {rows[2]['token']}/tp_10m",
+        f"samples.parquet: {rows[-1]['token']}",
+    ]
 
-    def test_a_scenario_that_the_bundle_does_not_state(self, bundle: Path, da_b: DeepAccident) -> None:
-        gone = min(read_scenarios(bundle, "_normal"))
-        changed(bundle / "scenarios.json", lambda stored: stored["scenarios"].pop(gone))
-        assert found(verify(bundle, da_b)) == ["files.json: scenarios.json", f"scenarios.json: {gone}"]
 
-    def test_why_nothing_can_be_made_again_is_told_in_full(
-        self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
-    ) -> None:
-        other = write_accidents(tmp_path / "other.json", results.tokens[1:])
-        text = verify(bundle, da_b, results=other).to_text()
-        assert "all numbers: stored 'evaluated', found absent" in text
-        assert f"note: cannot be evaluated again: {other.path}: 1 of 6 samples have no pred" in text
-        assert "marks every number as partial" in text
+def test_files_foreign_missing_and_damaged(bundle: Path, da_b: DeepAccident) -> None:
+    (bundle / "mine.txt").touch()
+    (bundle / "counts.json").unlink()
+    (bundle / "samples.parquet").write_bytes(b"PAR1")
+    (bundle / "scenarios.json").write_text("{}")
+    verification = verify(bundle, da_b)
+    assert found(verification) == [
+        *("files.json: counts.json", "files.json: samples.parquet", "files.json: scenarios.json"),
+        *("files.json: mine.txt", "scenarios.json", "counts.json", "samples.parquet"),
+    ]
+    assert verification.notes == ()
+    assert "  counts.json: stored 'readable', found 'is missing; give a folder" in verification.to_text()
+    (bundle / "files.json").write_text("")
+    assert found(verify(bundle, da_b))[0] == "files.json"
 
-    def test_other_results(
-        self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
-    ) -> None:
-        differing = found(
-            verify(bundle, da_b, results=write_accidents(tmp_path / "other.json", results.tokens, moved=1.0).path)
-        )
-        assert {each.split(": ")[0] for each in differing} == {"metrics_summary.json", "counts.json", "samples.parquet"}
-        assert "metrics_summary.json: results/fingerprint" in differing
 
-    def test_counts_of_a_sample(self, bundle: Path, da_b: DeepAccident) -> None:
-        token = min(json.loads((bundle / "counts.json").read_text())["counts"])
-        changed(bundle / "counts.json", lambda state: state["counts"][token].update(unjudged=7))
-        assert found(verify(bundle, da_b)) == [
-            "files.json: counts.json",
-            f"counts.json: {token}/unjudged",
-        ]
+def test_another_protocol_claimed(bundle: Path, da_b: DeepAccident) -> None:
+    """With a smaller danger distance the pairs that pass close by in the normal scenario are no accidents."""
+    changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.danger_distance": 0.5}))
+    groups = {
+        "all/groups": 1,
+        "all/without_infrastructure": 1,
+        "agent/groups": 3,
+        "agent/without_infrastructure": 2,
+    }
+    parts = ["", *(f"breakdowns/{group}/{row}/" for group, rows in groups.items() for row in range(rows))]
+    samples = sorted(
+        token for token in json.loads((bundle / "counts.json").read_text())["counts"] if "_normal" in token
+    )
+    assert len(samples) == 3
+    assert found(verify(bundle, da_b)) == [
+        SUMMARY_CHANGED,
+        "metrics_summary.json: settings/choices/reading/danger_distance",
+        *(f"metrics_summary.json: {part}metrics/truths/{kind}" for part in parts for kind in ("another", "none")),
+        *(f"counts.json: {token}/named" for token in samples),
+        *(f"samples.parquet: {token}/truth" for token in samples),
+    ]
 
-    def test_a_row(self, bundle: Path, da_b: DeepAccident) -> None:
-        rows, stamp = read_rows(bundle / "samples.parquet")
-        rows[2]["tp_10m"] = 5
-        write_rows(bundle / "samples.parquet", rows[:-1], stamp)
-        assert found(verify(bundle, da_b)) == [
-            "files.json: samples.parquet",
-            f"samples.parquet: {rows[2]['token']}/tp_10m",
-            f"samples.parquet: {rows[-1]['token']}",
-        ]
 
-    def test_files_foreign_missing_and_damaged(self, bundle: Path, da_b: DeepAccident) -> None:
-        (bundle / "mine.txt").touch()
-        (bundle / "counts.json").unlink()
-        (bundle / "samples.parquet").write_bytes(b"PAR1")
-        (bundle / "scenarios.json").write_text("{}")
-        verification = verify(bundle, da_b)
-        assert found(verification) == [
-            *("files.json: counts.json", "files.json: samples.parquet", "files.json: scenarios.json"),
-            *("files.json: mine.txt", "scenarios.json", "counts.json", "samples.parquet"),
-        ]
-        assert verification.notes == ()
-        assert "  counts.json: stored 'readable', found 'is missing; give a folder" in verification.to_text()
-        (bundle / "files.json").write_text("")
-        assert found(verify(bundle, da_b))[0] == "files.json"
-
-    def test_another_protocol_claimed(self, bundle: Path, da_b: DeepAccident) -> None:
-        """With a smaller danger distance the pairs that pass close by in the normal scenario are no accidents."""
-        changed(
-            bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.danger_distance": 0.5})
-        )
-        groups = {
-            "all/groups": 1,
-            "all/without_infrastructure": 1,
-            "agent/groups": 3,
-            "agent/without_infrastructure": 2,
-        }
-        parts = ["", *(f"breakdowns/{group}/{row}/" for group, rows in groups.items() for row in range(rows))]
-        samples = sorted(
-            token for token in json.loads((bundle / "counts.json").read_text())["counts"] if "_normal" in token
-        )
-        assert len(samples) == 3
-        assert found(verify(bundle, da_b)) == [
-            SUMMARY_CHANGED,
-            "metrics_summary.json: settings/choices/reading/danger_distance",
-            *(f"metrics_summary.json: {part}metrics/truths/{kind}" for part in parts for kind in ("another", "none")),
-            *(f"counts.json: {token}/named" for token in samples),
-            *(f"samples.parquet: {token}/truth" for token in samples),
-        ]
-
-    def test_many_are_counted(self) -> None:
-        many = tuple(Difference(where=str(index), stored=0, found=1) for index in range(22))
-        text = Verification(folder=Path("b"), samples=3, differences=many, notes=("so",)).to_text().splitlines()
-        assert (text[0], text[-2:]) == ("b: 22 differences; 3 samples evaluated again", ["  and 2 more", "note: so"])
-        assert len(text) == 23
+def test_many_are_counted() -> None:
+    many = tuple(Difference(where=str(index), stored=0, found=1) for index in range(22))
+    text = Verification(folder=Path("b"), samples=3, differences=many, notes=("so",)).to_text().splitlines()
+    assert (text[0], text[-2:]) == ("b: 22 differences; 3 samples evaluated again", ["  and 2 more", "note: so"])
+    assert len(text) == 23
 
 
 def read_scenarios(bundle: Path, ending: str) -> list[str]:
@@ -251,120 +259,119 @@ def test_long_values_are_cut_in_a_line() -> None:
     assert Difference(where="x", stored="y" * 100, found=ABSENT).text() == f"x: stored '{'y' * 58}…, found absent"
 
 
-class TestStrangers:
-    """Bundles that somebody sent: faults are one ResultsError, findings are named, and nothing outside is opened."""
+def test_what_does_not_belong_is_named_and_not_opened(bundle: Path, da_b: DeepAccident, tmp_path: Path) -> None:
+    os.mkfifo(bundle / "a pipe")
+    (bundle / "loop").symlink_to("loop")
+    (bundle / "a link").symlink_to(tmp_path)
+    (bundle / "extra\x1b.bin").write_bytes(b"1")
+    (bundle / "scenarios.json").rename(tmp_path / "scenarios.json")
+    (bundle / "scenarios.json").symlink_to(tmp_path / "scenarios.json")
+    with (bundle / "counts.json").open("r+b") as file:
+        file.truncate(5 << 30)
+    verification = verify(bundle, da_b)
+    named = {each.where: each.found for each in verification.differences}
+    assert named["files.json: a pipe"] == "not a regular file (a named pipe)"
+    assert named["files.json: loop"] == named["files.json: a link"] == "a link"
+    assert named["files.json: extra\x1b.bin"] == "a file that is not listed"
+    assert "is a link, which is not followed" in named["scenarios.json"]
+    assert "has 5,368,709,120 bytes" in named["counts.json"]
+    assert "\x1b" not in verification.to_text()
 
-    def test_what_does_not_belong_is_named_and_not_opened(
-        self, bundle: Path, da_b: DeepAccident, tmp_path: Path
-    ) -> None:
-        os.mkfifo(bundle / "a pipe")
-        (bundle / "loop").symlink_to("loop")
-        (bundle / "a link").symlink_to(tmp_path)
-        (bundle / "extra\x1b.bin").write_bytes(b"1")
-        (bundle / "scenarios.json").rename(tmp_path / "scenarios.json")
-        (bundle / "scenarios.json").symlink_to(tmp_path / "scenarios.json")
-        with (bundle / "counts.json").open("r+b") as file:
-            file.truncate(5 << 30)
-        verification = verify(bundle, da_b)
-        named = {each.where: each.found for each in verification.differences}
-        assert named["files.json: a pipe"] == "not a regular file (a named pipe)"
-        assert named["files.json: loop"] == named["files.json: a link"] == "a link"
-        assert named["files.json: extra\x1b.bin"] == "a file that is not listed"
-        assert "is a link, which is not followed" in named["scenarios.json"]
-        assert "has 5,368,709,120 bytes" in named["counts.json"]
-        assert "\x1b" not in verification.to_text()
 
-    @pytest.mark.parametrize(
-        "name", ["metrics_summary.json", "files.json", "scenarios.json", "counts.json", "samples.parquet"]
-    )
-    def test_a_pipe_in_the_place_of_a_file(self, bundle: Path, da_b: DeepAccident, name: str) -> None:
-        (bundle / name).unlink()
-        os.mkfifo(bundle / name)
-        if name == "metrics_summary.json":
-            assert_refused(
-                (
-                    lambda: verify(bundle, da_b),
-                    ResultsError,
-                    r"metrics_summary.json: not a regular file \(a named pipe\)",
-                ),
-            )
-        else:
-            assert name in found(verify(bundle, da_b))
-
-    def test_paths_that_lead_out_are_opened_only_if_they_are_given(
-        self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path
-    ) -> None:
-        command = f"evaluate verify {bundle} --dataroot {da_b.dataroot} --results {results.path}"
-        assert_refused(
-            (
-                lambda: verify(bundle, da_b, results=None),
-                ResultsError,
-                f"are opened only if you give them: deepaccident {command}$",
-            ),
-        )
-        splits = tmp_path / "mine.txt"
-        os.mkfifo(splits)
-        changed(bundle / "metrics_summary.json", lambda summary: summary.update(split=str(splits)))
-        assert_refused(
-            (lambda: verify(bundle, da_b), ResultsError, f"{command} --split {splits}$"),
-        )
-        splits.unlink()
-        scenarios = sorted({token.rsplit("/", 2)[0] for token in results.tokens})
-        splits.write_text("".join(f"{token.replace('/', ' ')}\n" for token in scenarios))
-        assert found(verify(bundle, da_b, split=splits)) == [SUMMARY_CHANGED]
-
-    @pytest.mark.parametrize("kind", ["the folder", "the file", "a loop", "a pipe"])
-    def test_a_copy_of_the_results_that_leads_out_is_refused(
-        self, run: EvaluationRun, da_b: DeepAccident, tmp_path: Path, kind: str
-    ) -> None:
-        bundle = save_run(run, tmp_path / "bundle", include_results=True)
-        copy = bundle / "results" / "accidents.json"
-        if kind == "the folder":
-            (bundle / "results").rename(tmp_path / "moved")
-            (bundle / "results").symlink_to(tmp_path / "moved")
-        else:
-            copy.rename(tmp_path / "elsewhere.json")
-            copy.symlink_to({"the file": tmp_path / "elsewhere.json"}.get(kind, copy))
-        if kind == "a pipe":
-            copy.unlink()
-            os.mkfifo(copy)
+@pytest.mark.parametrize(
+    "name", ["metrics_summary.json", "files.json", "scenarios.json", "counts.json", "samples.parquet"]
+)
+def test_a_pipe_in_the_place_of_a_file(bundle: Path, da_b: DeepAccident, name: str) -> None:
+    (bundle / name).unlink()
+    os.mkfifo(bundle / name)
+    if name == "metrics_summary.json":
         assert_refused(
             (
                 lambda: verify(bundle, da_b),
                 ResultsError,
-                r"bundle: results(/accidents.json)? is (a link|not a regular file)",
+                r"metrics_summary.json: not a regular file \(a named pipe\)",
             ),
         )
+    else:
+        assert name in found(verify(bundle, da_b))
 
-    @pytest.mark.parametrize(
-        "resampling",
-        [
-            {"resamples": 10**9},
-            {"resamples": "9"},
-            {"seed": -1},
-            {"seed": []},
-            {"confidence": "x"},
-            {"depth": 1},
-            {"seed": 0.5},
-        ],
+
+def test_paths_that_lead_out_are_opened_only_if_they_are_given(
+    bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path
+) -> None:
+    command = f"evaluate verify {bundle} --dataroot {da_b.dataroot} --results {results.path}"
+    assert_refused(
+        (
+            lambda: verify(bundle, da_b, results=None),
+            ResultsError,
+            f"are opened only if you give them: deepaccident {command}$",
+        ),
     )
-    def test_counts_of_resamples_are_bounded(
-        self, bundle: Path, da_b: DeepAccident, resampling: dict[str, Any]
-    ) -> None:
-        changed(
-            bundle / "metrics_summary.json",
-            lambda summary: summary["breakdowns"]["all"].update(resampling=resampling),
-        )
-        assert "all numbers" in found(verify(bundle, da_b))
+    splits = tmp_path / "mine.txt"
+    os.mkfifo(splits)
+    changed(bundle / "metrics_summary.json", lambda summary: summary.update(split=str(splits)))
+    assert_refused(
+        (lambda: verify(bundle, da_b), ResultsError, f"{command} --split {splits}$"),
+    )
+    splits.unlink()
+    scenarios = sorted({token.rsplit("/", 2)[0] for token in results.tokens})
+    splits.write_text("".join(f"{token.replace('/', ' ')}\n" for token in scenarios))
+    assert found(verify(bundle, da_b, split=splits)) == [SUMMARY_CHANGED]
 
-    def test_no_results(self, bundle: Path, da_b: DeepAccident, results: Results) -> None:
-        results.path.unlink()
-        assert_refused((lambda: verify(bundle, da_b), ResultsError, ("accidents.json", "no such file or folder")))
 
-    def test_deep_nesting_is_refused(self, bundle: Path, da_b: DeepAccident) -> None:
-        (bundle / "counts.json").write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
-        assert "counts.json" in found(verify(bundle, da_b))
-        (bundle / "metrics_summary.json").write_text("[" * 900 + "]" * 900)
-        assert_refused(
-            (lambda: verify(bundle, da_b), ResultsError, "is nested more than 64 levels deep"),
-        )
+@pytest.mark.parametrize("kind", ["the folder", "the file", "a loop", "a pipe"])
+def test_a_copy_of_the_results_that_leads_out_is_refused(
+    run: EvaluationRun, da_b: DeepAccident, tmp_path: Path, kind: str
+) -> None:
+    bundle = save_run(run, tmp_path / "bundle", include_results=True)
+    copy = bundle / "results" / "accidents.json"
+    if kind == "the folder":
+        (bundle / "results").rename(tmp_path / "moved")
+        (bundle / "results").symlink_to(tmp_path / "moved")
+    else:
+        copy.rename(tmp_path / "elsewhere.json")
+        copy.symlink_to({"the file": tmp_path / "elsewhere.json"}.get(kind, copy))
+    if kind == "a pipe":
+        copy.unlink()
+        os.mkfifo(copy)
+    assert_refused(
+        (
+            lambda: verify(bundle, da_b),
+            ResultsError,
+            r"bundle: results(/accidents.json)? is (a link|not a regular file)",
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    "resampling",
+    [
+        {"resamples": 10**9},
+        {"resamples": "9"},
+        {"seed": -1},
+        {"seed": []},
+        {"confidence": "x"},
+        {"depth": 1},
+        {"seed": 0.5},
+    ],
+)
+def test_counts_of_resamples_are_bounded(bundle: Path, da_b: DeepAccident, resampling: dict[str, Any]) -> None:
+    changed(
+        bundle / "metrics_summary.json",
+        lambda summary: summary["breakdowns"]["all"].update(resampling=resampling),
+    )
+    assert "all numbers" in found(verify(bundle, da_b))
+
+
+def test_no_results(bundle: Path, da_b: DeepAccident, results: Results) -> None:
+    results.path.unlink()
+    assert_refused((lambda: verify(bundle, da_b), ResultsError, ("accidents.json", "no such file or folder")))
+
+
+def test_deep_nesting_is_refused(bundle: Path, da_b: DeepAccident) -> None:
+    (bundle / "counts.json").write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
+    assert "counts.json" in found(verify(bundle, da_b))
+    (bundle / "metrics_summary.json").write_text("[" * 900 + "]" * 900)
+    assert_refused(
+        (lambda: verify(bundle, da_b), ResultsError, "is nested more than 64 levels deep"),
+    )
