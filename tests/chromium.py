@@ -46,7 +46,27 @@ class Browser:
         """What JavaScript returns."""
         return self.driver.execute_script(code)
 
-    def wait(self, condition: str, seconds: float = 20.0) -> Any:
+    def value(self, expression: str) -> Any:
+        """What a JavaScript expression gives."""
+        return self.script(f"return {expression}")
+
+    def frame(self) -> int:
+        """The frame that a replay shows, from 0 on."""
+        return int(self.value("document.getElementById('scrubber').value"))
+
+    def faults(self) -> dict[str, Any]:
+        """What no page may have, by kind: what overflows, what the console says, pictures that are not loaded."""
+        pictures = "[...document.images].filter((each) => each.src && !each.naturalWidth).map((each) => each.outerHTML)"
+        wide = self.value("document.documentElement.scrollWidth - innerWidth")
+        found = {
+            "overflows": self.overflowing(),
+            "is wider than the window": max(0, wide),
+            "complains": self.complaints(),
+            "is not loaded": self.value(pictures),
+        }
+        return {kind: each for kind, each in found.items() if each}
+
+    def wait(self, condition: str, seconds: float = 60.0) -> Any:
         """What a JavaScript expression gives as soon as that is true; fails if it never is."""
         end = time.monotonic() + seconds
         while not (found := self.script(f"return {condition}")):

@@ -59,3 +59,25 @@ def words(ax: Axes) -> str:
 def picture(ax: Axes) -> Any:
     """The first image on the axes, as it was given."""
     return np.asarray(ax.images[0].get_array())
+
+
+def of_kind(ax: Axes, kind: type) -> list[Any]:
+    """The collections of a class, and of none that is derived from it."""
+    return [each for each in ax.collections if type(each) is kind]
+
+
+def texts(ax: Axes) -> list[str]:
+    return [text.get_text() for text in ax.texts]
+
+
+def legend_words(where: Any) -> list[str]:
+    """Of axes or of a figure."""
+    legend = where.legends[0] if isinstance(where, Figure) else where.get_legend()
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def footprints(drawn: Any) -> set[tuple[float, ...]]:
+    """The corners from above, to a micrometre, of boxes or of polygons on axes."""
+    if hasattr(drawn, "get_paths"):
+        return {tuple(np.round(path.vertices[:4].ravel(), 6)) for path in drawn.get_paths()}
+    return {tuple(np.round(corners[:, :2].ravel(), 6)) for corners in drawn.bottom_corners()}

@@ -32,7 +32,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 _log = logging.getLogger(__name__)
 _LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 _METHODS: Final = ("GET", "HEAD")
-_TICKET_SECONDS: Final = 60.0
+TICKET_SECONDS: Final = 60.0
 _SAFE: Final = "!$&'()*+,;=:@/?%[]|^`{}-._~"
 """What a relative address keeps as it is: all that cannot end it or a header."""
 HEADERS: Final[Mapping[bytes, bytes]] = {
@@ -280,7 +280,7 @@ class Gate:
     def ticket(self) -> str:
         """A token that is right once, and within a minute: other users see the command line that opens a browser."""
         ticket = secrets.token_urlsafe(32)
-        self._ticket = ticket, time.monotonic() + _TICKET_SECONDS
+        self._ticket = ticket, time.monotonic() + TICKET_SECONDS
         return ticket
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

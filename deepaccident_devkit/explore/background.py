@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 State = Literal["waiting", "running", "ready", "failed"]
 _DONE: Final = ("ready", "failed")
-_MOST: Final = 200
+MOST: Final = 200
 """Jobs that are kept: of more, the done one that was not asked for the longest goes, so that memory stays flat."""
 
 
@@ -96,7 +96,7 @@ class Jobs:
 
     def _make_room(self) -> None:
         done = [job for job in self._jobs.values() if job.is_done]
-        if done and len(self._jobs) >= _MOST:
+        if done and len(self._jobs) >= MOST:
             del self._jobs[min(done, key=lambda job: job.asked).name]
 
     def _run(self) -> None:

@@ -21,7 +21,7 @@ from deepaccident_devkit.explore.access import Access, App, Gate, HostPort, Root
 
 LOOPBACK: Final = "127.0.0.1"
 _NEEDED: Final = ("starlette", "uvicorn")
-_PORTS: Final = range(8765, 8785)
+PORTS: Final = range(8765, 8785)
 """Tried first; then the machine chooses one."""
 _LAST_PORT: Final = 0xFFFF
 _STOP_SECONDS: Final = 0.7
@@ -216,7 +216,7 @@ def _listen(host: str, port: int | None) -> socket.socket:
         raise ConfigError("host: expected a name or an address of this machine, found nothing")
     if port is not None and not 0 <= port <= _LAST_PORT:
         raise ConfigError(f"port: expected a number up to {_LAST_PORT}, found {port}")
-    for candidate in _PORTS if port is None else ():
+    for candidate in PORTS if port is None else ():
         with suppress(_TakenError):
             return _listener(host, candidate)
     return _listener(host, port or 0)

@@ -84,7 +84,7 @@ def observed_actors(
     boxes = _rows_of(annotations["sample_row"], of_scenario.start, of_scenario.stop)
     which, position = _boxes_of(dataset, boxes, actor_ids)
     at = annotations["sample_row"][boxes][which] - of_scenario.start
-    seen = _seen(dataset, boxes, which, codes[at] == AGENTS.index(INFRASTRUCTURE), rule)
+    seen = by_rule(dataset, boxes, which, codes[at] == AGENTS.index(INFRASTRUCTURE), rule)
     frame = (samples["frame_row"][of_scenario] - dataset.columns("scenario")["first_frame_row"][row])[at]
     observed[there.searchsorted(codes[at[seen]]), position[seen], frame[seen]] = True
     observed[_themselves(dataset, row, there, actor_ids)] = True
@@ -182,7 +182,7 @@ def _boxes_of(dataset: Dataset, boxes: slice, actor_ids: Sequence[int]) -> tuple
     return tracked[found], position
 
 
-def _seen(dataset: Dataset, boxes: slice, which: IntArray, by_pole: BoolArray, rule: ObservationRule) -> BoolArray:
+def by_rule(dataset: Dataset, boxes: slice, which: IntArray, by_pole: BoolArray, rule: ObservationRule) -> BoolArray:
     """Which of some of a scenario's annotations show an actor that their agent observes."""
     if rule.kind == "annotated":
         return np.ones(len(which), dtype=bool)

@@ -96,7 +96,7 @@ def save_safety_report(
     written = report.to_csv(folder)
     written.append(folder / "safety.json")
     write_bytes(written[-1], report.to_json().encode())
-    drawn, pictures = list(_figures(report)), place_in(folder, "figures", opened=True)
+    drawn, pictures = list(figures_of(report)), place_in(folder, "figures", opened=True)
     figures = [(each, write_figure(each.draw(), pictures / f"{each.name}.png", dpi=_DPI)) for each in drawn]
     names = {} if dataset is None else replay_names([row.scenario for row in by_severity(report.rows)][:replays])
     failed = {} if dataset is None else _make_replays(dataset, folder.absolute(), names, **how)
@@ -224,7 +224,8 @@ def _make_replay(dataset: Dataset, folder: Path, named: tuple[str, str]) -> str 
     return tried_replay(dataset, scenario, place_in(folder, name))
 
 
-def _figures(report: SafetyReport) -> Iterator[_Drawn]:
+def figures_of(report: SafetyReport) -> Iterator[_Drawn]:
+    """The page's figures: one of each group of accidents, and lead times."""
     if report.ledger.accidents:
         yield _Drawn(
             name="lead_times",

@@ -33,11 +33,11 @@ _LARGE: Final = 0.1
 _LAYERS: Final = as_floats([1, 2, 3]) / 3
 """Sizes of the nested boxes at whose corners an actor is looked for; 1 is the actor's own."""
 FRONT: Final = CAMERAS[0]
-_LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
+LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
 """Width in pixels and JPEG quality; the first pair that fits is taken."""
-_OTHERS: Final = (1, 2, 2, 2, 4)
+OTHERS: Final = (1, 2, 2, 2, 4)
 """For each step of the ladder, one of how many frames has a picture of the other cameras; the last is for the rest."""
-_LEAST_OTHER: Final = 256
+LEAST_OTHER: Final = 256
 """Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this."""
 _PROBED: Final = 12
 """The number of pictures from which the size of all is estimated."""
@@ -76,11 +76,11 @@ def follow_pair(
     frame whether there is a picture.
     """
     scores = {agent: _scores(recording, bit, seen, there) for bit, agent in enumerate(recording.agents)}
-    chosen = {agent: _steady(each) for agent, each in scores.items()}
+    chosen = {agent: steady(each) for agent, each in scores.items()}
     best = [each[np.arange(len(each)), chosen[agent]] for agent, each in scores.items()]
     return Followed(
         channels={agent: tuple(CAMERAS[channel] for channel in channels) for agent, channels in chosen.items()},
-        agents=tuple(recording.agents[number] for number in _steady(np.stack(best, axis=1))),
+        agents=tuple(recording.agents[number] for number in steady(np.stack(best, axis=1))),
     )
 
 
@@ -118,7 +118,7 @@ def _shown(recording: Recording, sample: str, channel: str, boxes: Boxes) -> Flo
     return as_floats(inside * size / (size + _LARGE))
 
 
-def _steady(scores: AnyArray) -> list[int]:
+def steady(scores: AnyArray) -> list[int]:
     """The choice of columns, one for each row, with the largest sum of scores less the cost of changes."""
     total, before = scores[0], []
     for each in scores[1:]:
@@ -151,7 +151,7 @@ class PictureSettings:
     @property
     def other_width(self) -> int:
         """Of the other cameras' pictures, pixels."""
-        return min(self.width, max(self.width // 2, _LEAST_OTHER))
+        return min(self.width, max(self.width // 2, LEAST_OTHER))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,8 +204,8 @@ def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePa
 
 def _ladder(frames: int) -> Iterator[PictureSettings]:
     """Ways to write pictures, each smaller than the one before."""
-    for number, (width, quality) in enumerate(_LADDER):
-        yield PictureSettings(width=width, quality=quality, others=_OTHERS[min(number, len(_OTHERS) - 1)])
+    for number, (width, quality) in enumerate(LADDER):
+        yield PictureSettings(width=width, quality=quality, others=OTHERS[min(number, len(OTHERS) - 1)])
     every = 1
     while every < 2 * frames:
         yield PictureSettings(width=width, quality=quality, every=every, others=0)
@@ -215,7 +215,7 @@ def _ladder(frames: int) -> Iterator[PictureSettings]:
 def _fitting(
     images: _Images, limit: float, ladder: Iterator[PictureSettings], *, progress: bool
 ) -> tuple[PictureSettings | None, Jpegs]:
-    probes = _probes(images)
+    probes = probes_of(images)
     for settings in ladder if probes else ():
         kept = _kept(images, settings)
         written = [image for each in kept.values() for image in each if image is not None]
@@ -228,7 +228,8 @@ def _fitting(
     return None, {}
 
 
-def _probes(images: _Images) -> list[ByteArray]:
+def probes_of(images: _Images) -> list[ByteArray]:
+    """The pictures from which the size of all is estimated."""
     there = [image for each in images.values() for image in each if image is not None]
     return [read_image(image.path) for image in there[:: max(1, len(there) // _PROBED)]]
 

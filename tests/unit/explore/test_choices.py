@@ -2,7 +2,11 @@
 
 import math
 import shlex
+import threading
+from collections.abc import Iterator
 from typing import Any
+from unittest.mock import Mock
+from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
@@ -20,27 +24,33 @@ from deepaccident_devkit.selection.fields import FIELDS
 FACETS = sorted(name for name, field in FIELDS.items() if field.groups)
 
 
-@pytest.fixture(scope="module")
-def scenarios(da: DeepAccident) -> Scenarios:
-    """With all columns."""
-    made = Scenarios(da, Jobs(), workers=1)
+def computed(da: DeepAccident) -> Scenarios:
+    jobs = Jobs()
+    made = Scenarios(da, jobs, workers=1)
     made.begin()
-    assert made._jobs.wait(60)
+    assert jobs.wait(60)
     return made
 
 
+@pytest.fixture(scope="module")
+def scenarios(da: DeepAccident) -> Scenarios:
+    """With all columns."""
+    return computed(da)
+
+
 @pytest.fixture
-def waiting(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> Scenarios:
+def waiting(da: DeepAccident) -> Iterator[Scenarios]:
     """Whose slow columns are never computed."""
-    jobs = Jobs()
-    monkeypatch.setattr(jobs, "_run", lambda: None)
-    return Scenarios(da, jobs, workers=1)
+    jobs, go_on = Jobs(), threading.Event()
+    jobs.ask("other", "something slow", go_on.wait)
+    yield Scenarios(da, jobs, workers=1)
+    jobs.end()
+    go_on.set()
 
 
 def tokens(scenarios: Scenarios, **chosen: Any) -> list[str]:
     found = found_by(scenarios, Choices(**chosen), {})
-    assert found.faults == ()
-    assert found.waiting == ()
+    assert (found.faults, found.waiting) == ((), ())
     return [scenarios.tokens[row] for row in found.rows.tolist()]
 
 
@@ -64,23 +74,22 @@ def test_facets_find_what_the_devkit_finds(da: DeepAccident, scenarios: Scenario
     """Any values of any facets; beside a value stands how many choosing it alone of its field would give."""
     facets = {each.name: each for each in scenarios.facets()}
     names = data.draw(st.lists(st.sampled_from(sorted(facets)), unique=True, max_size=3))
-    chosen = {
-        name: tuple(data.draw(st.lists(st.sampled_from(facets[name].values), unique=True, min_size=1)))
-        for name in names
-    }
+    some = {name: st.lists(st.sampled_from(facets[name].values), unique=True, min_size=1) for name in names}
+    chosen = {name: tuple(data.draw(values)) for name, values in some.items()}
     choices = Choices(facets=chosen)
     found = found_by(scenarios, choices, {})
     assert [scenarios.tokens[row] for row in found.rows] == [each["token"] for each in da.find(*choices.filters)]
-    for name, counts in found.counts.items():
-        for each in counts:
-            alone = Choices(facets={**chosen, name: (each["value"],)})
-            assert each["count"] == len(da.find(*alone.filters))
-            assert each["chosen"] == (each["value"] in chosen.get(name, ()))
+    for name, each in ((name, each) for name, counts in found.counts.items() for each in counts):
+        alone = Choices(facets={**chosen, name: (each["value"],)})
+        expected = len(da.find(*alone.filters)), each["value"] in chosen.get(name, ())
+        assert (each["count"], each["chosen"]) == expected
 
 
 @given(
     facets=st.dictionaries(
-        st.sampled_from(FACETS), st.lists(st.text(min_size=1), unique=True, min_size=1).map(tuple), max_size=3
+        st.sampled_from(FACETS),
+        st.lists(st.text(min_size=1, max_size=50), unique=True, min_size=1).map(tuple),
+        max_size=3,
     ),
     query=st.text(),
     order=st.sampled_from(["up", "down"]),
@@ -88,11 +97,8 @@ def test_facets_find_what_the_devkit_finds(da: DeepAccident, scenarios: Scenario
     page=st.integers(1, 999_999),
 )
 def test_an_address_says_all(facets: Any, query: str, order: Any, view: Any, page: int) -> None:
-    from urllib.parse import parse_qsl
-
     choices = Choices(facets=facets, query=query.strip(), sort="lead", order=order, view=view, page=page)
-    address = choices.address()
-    assert Choices.of(parse_qsl(address.removeprefix("?"), keep_blank_values=True)) == choices
+    assert Choices.of(parse_qsl(choices.address().removeprefix("?"), keep_blank_values=True)) == choices
 
 
 @pytest.mark.parametrize(
@@ -122,7 +128,6 @@ def test_an_address_asks_for_no_more_than_a_page_has(scenarios: Scenarios) -> No
 def test_a_sort_puts_unknown_values_last_in_both_orders(scenarios: Scenarios) -> None:
     for column in ("lead", "lead_all", "min_ttc", "accident_visibility", "num_frames"):
         numbers = scenarios.numbers(column)
-        assert numbers is not None
         for order in ("up", "down"):
             shown = numbers[[scenarios.row_of[each] for each in tokens(scenarios, sort=column, order=order)]]
             known = shown[~np.isnan(shown)]
@@ -136,54 +141,43 @@ def test_names_are_sorted_both_ways(scenarios: Scenarios) -> None:
 
 
 def test_a_fault_is_told_and_the_rest_counts(scenarios: Scenarios) -> None:
-    query = "bogus=1; town=Atlantis; length>>3; collision=true"
-    found = found_by(scenarios, Choices(query=query), {})
-    assert len(found.faults) == 3
-    assert "'bogus'" in found.faults[0]
-    assert "Atlantis" in found.faults[1]
+    found = found_by(scenarios, Choices(query="bogus=1; town=Atlantis; length>>3; collision=true"), {})
+    assert ["'bogus'" in found.faults[0], "Atlantis" in found.faults[1], len(found.faults)] == [True, True, 3]
     assert [scenarios.tokens[row] for row in found.rows] == tokens(scenarios, query="collision=true")
 
 
 def test_a_value_that_no_scenario_has_finds_nothing(scenarios: Scenarios) -> None:
     assert tokens(scenarios, facets={"collision": ("maybe",)}) == []
-    found = found_by(scenarios, Choices(facets={"velocity_frame": ("lidar",)}), {})
-    assert len(found.rows) == 0  # a field of one value is no facet, but counts
+    # a field of one value is no facet, but counts
+    assert len(found_by(scenarios, Choices(facets={"velocity_frame": ("lidar",)}), {}).rows) == 0
 
 
-def test_what_is_not_computed_yet_is_said(waiting: Scenarios) -> None:
-    for choices in (
-        Choices(query="min_ttc<2"),
-        Choices(facets={"accident_visibility": ("visible",)}),
-        Choices(sort="lead"),
-    ):
-        found = found_by(waiting, choices, {})
-        assert len(found.rows) == len(waiting)
-        (said,) = found.waiting
-        assert "is being computed" in said
+@pytest.mark.parametrize(
+    "choices",
+    [Choices(query="min_ttc<2"), Choices(facets={"accident_visibility": ("visible",)}), Choices(sort="lead")],
+)
+def test_what_is_not_computed_yet_is_said(waiting: Scenarios, choices: Choices) -> None:
+    found = found_by(waiting, choices, {})
+    (said,) = found.waiting
+    assert (len(found.rows), "is being computed" in said) == (len(waiting), True)
     assert "accident_visibility" not in {each.name for each in waiting.facets()}
     assert waiting.values("min_ttc") is None
 
 
 def test_what_cannot_be_computed_is_said(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: Any, **__: Any) -> None:
-        raise MemoryError("too little")
-
+    fails = Mock(side_effect=MemoryError("too little"))
     monkeypatch.setattr("deepaccident_devkit.explore.scenarios.interactions_of", fails)
-    scenarios = Scenarios(da, Jobs(), workers=1)
-    scenarios.begin()
-    assert scenarios._jobs.wait(60)
+    scenarios = computed(da)
     found = found_by(scenarios, Choices(query="min_ttc<2"), {})
     assert found.waiting == ("min_ttc<2: cannot be computed (MemoryError: too little)",)
     assert tokens(scenarios, query="closing_speed>=0") != []
 
 
 def test_the_code_finds_the_same(da: DeepAccident, scenarios: Scenarios, tmp_path: Any) -> None:
-    choices = Choices(facets={"collision": ("true",), "town": (da.scenario[0]["town"],)}, query="length>=2")
-    wanted = tokens(scenarios, facets=choices.facets, query=choices.query)
+    chosen = {"facets": {"collision": ("true",), "town": (da.scenario[0]["town"],)}, "query": "length>=2"}
+    choices, wanted = Choices(**chosen), tokens(scenarios, **chosen)
     assert [each["token"] for each in eval(choices.python(), {"da": da})] == wanted  # noqa: S307
-    program, *words = shlex.split(choices.command(str(da.dataroot)))
-    assert program == "deepaccident"
-    words[-1] = str(tmp_path / words[-1])
-    done = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
-    assert done.exit_code == 0
+    program, *words, name = shlex.split(choices.command(str(da.dataroot)))
+    done = CliRunner().invoke(deepaccident, [*words, str(tmp_path / name)], catch_exceptions=False)
+    assert (program, done.exit_code) == ("deepaccident", 0)
     assert (tmp_path / "selection.txt").read_text().split("\n")[:-1] == [each.replace("/", " ") for each in wanted]

@@ -3,8 +3,9 @@
 import io
 import shutil
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,37 +21,26 @@ from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR
 
 
 def test_several_threads_make_it_once() -> None:
-    kept, made, go = Kept[int](10), [], threading.Event()
-
-    def make() -> int:
-        go.wait(5)
-        made.append(1)
-        return 7
-
-    got: list[int] = []
-    threads = [threading.Thread(target=lambda: got.append(kept.get("a", make))) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    go.set()
-    for thread in threads:
-        thread.join()
-    assert (made, got) == ([1], [7] * 8)
+    kept, go, make = Kept[int](10), threading.Event(), Mock(return_value=7)
+    with ThreadPoolExecutor(8) as pool:
+        got = [pool.submit(kept.get, "a", lambda: go.wait(60) and make()) for _ in range(8)]
+        go.set()
+    assert ([each.result() for each in got], make.call_count) == ([7] * 8, 1)
 
 
 def test_what_was_not_asked_for_the_longest_goes() -> None:
     kept, made = Kept[bytes](10, len), []
 
-    def get(name: str, size: int = 4) -> None:
-        kept.get(name, lambda: made.append(name) or b"x" * size)
+    def get(*names: str, size: int = 4) -> list[str]:
+        """Those of some names whose content was made for it."""
+        made.clear()
+        for name in names:
+            kept.get(name, lambda name=name: made.append(name) or b"x" * size)
+        return made.copy()
 
-    for name in ("a", "b", "a", "c", "a", "b"):  # with c, b has to go
-        get(name)
-    assert made == ["a", "b", "c", "b"]
-    get("large", 99)
-    get("large", 99)
-    assert made[4:] == ["large"]  # larger than the bound, and alone
-    get("a")
-    assert made[5:] == ["a"]
+    assert get("a", "b", "a", "c", "a", "b") == ["a", "b", "c", "b"]  # with c, b has to go
+    assert get("large", "large", size=99) == ["large"]  # larger than the bound, and alone
+    assert get("a") == ["a"]
 
 
 def test_a_failure_is_not_kept() -> None:
@@ -61,16 +51,11 @@ def test_a_failure_is_not_kept() -> None:
 
 
 def test_files_lie_beside_the_index(da_b: DeepAccident) -> None:
-    files, made = KeptFiles(da_b), []
-
-    def make() -> bytes:
-        made.append(1)
-        return b"content"
-
+    make = Mock(return_value=b"content")
     for _ in range(2):
         assert KeptFiles(da_b).get("test of keeping", "thumbnail.jpg", make) == b"content"
-    assert made == [1]
-    assert files.folder.parent == da_b.tables_folder
+    files = KeptFiles(da_b)
+    assert (make.call_count, files.folder.parent) == (1, da_b.tables_folder)
     assert len([*files.folder.rglob("thumbnail.jpg")]) == 1
     assert files.get("another", "thumbnail.jpg", lambda: b"more") == b"more"
 
@@ -80,17 +65,12 @@ def test_where_the_index_cannot_be_written_the_users_cache_is_taken(
 ) -> None:
     monkeypatch.setattr(explorer, "is_writable_folder", lambda _: False)
     monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path / "cache" / "files"))
-    files = KeptFiles(da_b)
-    assert files.get("a", "thumbnail.jpg", lambda: b"1") == b"1"
-    assert files.folder == tmp_path / "cache" / "thumbnails"
-    assert len([*files.folder.rglob("thumbnail.jpg")]) == 1
+    assert KeptFiles(da_b).get("a", "thumbnail.jpg", lambda: b"1") == b"1"
+    assert [path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob("*.jpg")] == [("cache", "thumbnails")]
 
 
 def test_a_full_disk_keeps_nobody_from_the_picture(da_b: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Store, "keep", full)
+    monkeypatch.setattr(Store, "keep", Mock(side_effect=OSError(28, "No space left on device")))
     assert KeptFiles(da_b).get("full", "thumbnail.jpg", lambda: b"made") == b"made"
 
 
@@ -105,41 +85,44 @@ def near(shown: np.ndarray, color: str, off: int = 60) -> int:
     return int((np.abs(shown - ImageColor.getrgb(color)).max(axis=-1) < off).sum())
 
 
+def shown_of(da: DeepAccident, scenario: str) -> np.ndarray:
+    return pixels(thumbnail(da, da.get("scenario", scenario)))
+
+
+def reopened(da: DeepAccident, root: Path, *gone: str) -> DeepAccident:
+    """A copy of a release without some files."""
+    shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", *gone))
+    return DeepAccident("v1", root, verbose=False)
+
+
 def test_an_accident_has_red_boxes_and_a_normal_one_has_none(da: DeepAccident) -> None:
-    shown = pixels(thumbnail(da, da.get("scenario", accident(da))))
-    assert near(shown, COLLIDER_COLOR) > 40
-    assert near(pixels(thumbnail(da, da.get("scenario", normal(da)))), COLLIDER_COLOR) < 10
+    assert near(shown_of(da, accident(da)), COLLIDER_COLOR) > 40
+    assert near(shown_of(da, normal(da)), COLLIDER_COLOR) < 10
 
 
 def test_without_images_it_is_seen_from_above(da_b: DeepAccident) -> None:
-    shown = pixels(thumbnail(da_b, da_b.get("scenario", accident(da_b))))
+    shown = shown_of(da_b, accident(da_b))
     assert near(shown, COLLIDER_COLOR) > 40
-    assert near(shown, "#ffffff", 10) > shown.shape[0] * shown.shape[1] / 2
+    assert near(shown, "#ffffff", 10) > shown[..., 0].size / 2
 
 
-def test_without_labels_it_is_grey(own_release: Path) -> None:
-    for folder in sorted(own_release.rglob("label")):
-        shutil.rmtree(folder)
-    dataset = DeepAccident("v1", own_release, verbose=False)
-    shown = pixels(thumbnail(dataset, dataset.scenario[0]))
-    assert near(shown, MISSING_COLOR, 4) == shown.shape[0] * shown.shape[1]
+def test_without_labels_it_is_grey(da_b: DeepAccident, tmp_path: Path) -> None:
+    dataset = reopened(da_b, tmp_path / "r", "label")
+    shown = shown_of(dataset, dataset.scenario[0]["token"])
+    assert near(shown, MISSING_COLOR, 4) == shown[..., 0].size
 
 
 def test_a_damaged_image_does_not_matter(da: DeepAccident, tmp_path: Path) -> None:
-    root = tmp_path / "damaged"
-    shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident"))
-    for path in root.rglob("*.jpg"):
+    dataset = reopened(da, tmp_path / "r")
+    for path in (tmp_path / "r").rglob("*.jpg"):
         path.write_bytes(b"no picture")
-    dataset = DeepAccident("v1", root, verbose=False)
-    assert near(pixels(thumbnail(dataset, dataset.get("scenario", accident(dataset)))), "#ffffff", 10) > 1000
+    assert near(shown_of(dataset, accident(dataset)), "#ffffff", 10) > 1000
 
 
 def test_images_that_come_later_are_shown(da: DeepAccident, tmp_path: Path) -> None:
-    root = tmp_path / "later"
-    shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "Camera_*"))
-    explorer = Explorer(DeepAccident("v1", root, verbose=False))
-    token = accident(explorer.dataset)  # type: ignore[arg-type]
+    explorer, token = Explorer(reopened(da, tmp_path / "r", "Camera_*")), accident(da)
     before = explorer.thumbnail(token)
     assert explorer.thumbnail(token) == before
-    shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident"), dirs_exist_ok=True)
+    ignored = shutil.ignore_patterns(".deepaccident")
+    shutil.copytree(da.dataroot, tmp_path / "r", ignore=ignored, dirs_exist_ok=True)
     assert explorer.thumbnail(token) == thumbnail(da, da.get("scenario", token)) != before

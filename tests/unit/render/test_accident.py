@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import title_of, tokens_of
+from drawing import texts, title_of, tokens_of
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_hex, to_rgba
+from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose
+from refusals import assert_refused
+from wording import lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
@@ -22,7 +24,6 @@ from deepaccident_devkit.render.camera import best_view
 from deepaccident_devkit.render.styles import COLLIDER_COLOR
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
-from deepaccident_devkit.v2x import collision
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -36,6 +37,12 @@ def drawn(da: DeepAccident, scenario: Any, **how: Any) -> Any:
     return figure
 
 
+def countdown(da: DeepAccident, frame: str, agents: Sequence[str], layers: Sequence[str] | None) -> Any:
+    fig = detached_figure((12.8, 7.2))
+    draw_countdown(da, frame, agents=agents, layers=layers, fig=fig)
+    return fig
+
+
 @pytest.fixture(scope="module")
 def accident(da: DeepAccident) -> str:
     token: str = accident_of(da)["token"]
@@ -45,11 +52,12 @@ def accident(da: DeepAccident) -> str:
 def test_a_column_a_moment_and_a_row_an_agent(da: DeepAccident) -> None:
     scenario = accident_of(da)
     figure = drawn(da, scenario, seconds=(2.0, 0.4, 0.0), agents=["infrastructure", "ego_vehicle"])
+    cameras = figure.axes[:4]
     assert len(figure.axes) == 2 * 3  # 2 s before was not recorded
-    assert [ax.get_title() for ax in figure.axes[:2]] == ["0.4 s before", "the impact"]
-    assert [figure.axes[row * 2].texts[-1].get_text() for row in range(2)] == ["ego", "infrastructure"]
-    assert all(ax.images for ax in figure.axes[:4])
-    names = {text.get_text().split(":")[0] for ax in figure.axes[:4] for text in ax.texts}
+    assert [ax.get_title() for ax in cameras[:2]] == ["0.4 s before", "the impact"]
+    assert [texts(ax)[-1] for ax in cameras[::2]] == ["ego", "infrastructure"]
+    assert [len(ax.images) for ax in cameras] == [1] * 4
+    names = {words.split(":")[0] for ax in cameras for words in texts(ax)}
     assert names - {"ego", "infrastructure", "E", "O"} <= {camera_name(channel) for channel in CAMERAS}
     assert title_of(figure).endswith(" ".join(accident_words(da, da.collision(scenario)).split()))
     assert tokens_of(figure) == [scenario["token"]]
@@ -61,99 +69,80 @@ def test_the_title_says_that_a_recording_is_cut_short(da_motion: DeepAccident, t
     root, token = tmp_path / "cut", accident_of(da_motion)["token"]
     shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*_02?.*", "*_03?.*"))
     cut = DeepAccident(dataroot=root, verbose=False)
-    contact = cut.collision(token)
-    assert contact is not None
-    figure = drawn(cut, token, seconds=[0.5, 0.0], agents=[])
-    assert title_of(figure).endswith(
-        f" cut short? the pair are {contact.gap:.1f} m apart at frame 19 of 19, the last that shows both"
-    )
+    figure, gap = drawn(cut, token, seconds=[0.5, 0.0], agents=[]), cut.collision(token).gap
+    said = f" cut short? the pair are {gap:.1f} m apart at frame 19 of 19, the last that shows both"
+    assert title_of(figure).endswith(said)
     assert [ax.get_title().split("\n")[0] for ax in figure.axes] == ["0.5 s before", "the last frame"]
 
 
 def test_the_pair_is_where_it_is_and_red(da_motion: DeepAccident) -> None:
     scenario = accident_of(da_motion)
-    contact = da_motion.collision(scenario)
-    assert contact is not None
-    figure = drawn(da_motion, scenario, agents=[])
-    assert len(figure.axes) == 4
-    tracks = scenario_tracks(da_motion, scenario["token"])
-    for left, ax in zip((2.0, 1.0, 0.5, 0.0), figure.axes, strict=True):
+    contact, tracks = da_motion.collision(scenario), scenario_tracks(da_motion, scenario["token"])
+    for left, ax in zip((2.0, 1.0, 0.5, 0.0), drawn(da_motion, scenario, agents=[]).axes, strict=True):
         boxes = tracks.at(scenario["num_frames"] - round(left * 10))
+        corners, pair = boxes.bottom_corners()[..., :2], np.isin(boxes.actor_id, contact.actor_ids)
         shapes = next(each for each in ax.collections if isinstance(each, PolyCollection))
-        for row, path in enumerate(shapes.get_paths()):
-            assert_allclose(path.vertices[:4], boxes.bottom_corners()[row, :, :2])
-        red = [to_hex(color) == COLLIDER_COLOR for color in shapes.get_edgecolor()]
-        assert red == np.isin(boxes.actor_id, contact.actor_ids).tolist()
+        assert_allclose([path.vertices[:4] for path in shapes.get_paths()], corners)
+        assert [to_hex(color) == COLLIDER_COLOR for color in shapes.get_edgecolor()] == pair.tolist()
         crosses = [line for line in ax.lines if line.get_marker() == "x"]
         assert_allclose(crosses[0].get_xydata(), [contact.point[:2]])
-        speeds = np.linalg.norm(boxes.velocity[np.array(red)], axis=1)
+        speeds = np.linalg.norm(boxes.velocity[pair], axis=1)
         assert ax.get_title().endswith(f"O {speeds[0]:.1f}, E {speeds[1]:.1f} m/s")
         low, high = ax.viewLim.get_points()
-        assert (boxes.bottom_corners()[red, :, :2] >= low).all()
-        assert (boxes.bottom_corners()[red, :, :2] <= high).all()
+        assert ((corners[pair] >= low) & (corners[pair] <= high)).all()
 
 
 def test_trails_lead_from_where_the_pair_was_to_the_impact(da_motion: DeepAccident) -> None:
     scenario = accident_of(da_motion)
-    with_trails = drawn(da_motion, scenario, agents=[], seconds=[1.0], layers=["trajectories"]).axes[0]
+    trails, none = (
+        drawn(da_motion, scenario, agents=[], seconds=[1.0], layers=layers).axes[0].collections
+        for layers in (["trajectories"], [])
+    )
     tracks = scenario_tracks(da_motion, scenario["token"])
-    ends = np.concatenate([segment for each in with_trails.collections for segment in each.get_segments()])
+    ends = np.concatenate([segment for each in trails for segment in each.get_segments()])
     for actor in scenario["collision"]["ids"]:
         last = tracks.boxes.center[tracks.actor_id == actor][-1, :2]
         assert np.linalg.norm(ends - last, axis=1).min() < 1e-9
-    none = drawn(da_motion, scenario, agents=[], seconds=[1.0], layers=[]).axes[0]
-    assert len(none.collections) == 0
+    assert len(none) == 0
 
 
 def test_images_are_those_that_show_the_pair_best(da: DeepAccident) -> None:
     scenario = accident_of(da)
-    figure = drawn(da, scenario, seconds=[0.0], agents=["ego_vehicle_behind"], layers=["boxes"])
+    (panel, *_) = drawn(da, scenario, seconds=[0.0], agents=["ego_vehicle_behind"], layers=["boxes"]).axes
     sample = da.get_sample(scenario, "ego_vehicle_behind", scenario["num_frames"])["token"]
     boxes = scenario_tracks(da, scenario["token"]).at(scenario["num_frames"])
     view = best_view(da, [sample], boxes.select(np.isin(boxes.actor_id, scenario["collision"]["ids"])))
-    assert view is not None
-    panel = figure.axes[0]
-    assert camera_name(view.camera.rsplit("/", 1)[1]) in {text.get_text() for text in panel.texts}
+    assert camera_name(view.camera.rsplit("/", 1)[1]) in texts(panel)
     left, top, right, bottom = view.bounds
     assert panel.get_xlim()[0] <= left < right <= panel.get_xlim()[1]
     assert panel.get_ylim()[1] <= top < bottom <= panel.get_ylim()[0]
-    assert to_hex(COLLIDER_COLOR) in {
-        to_hex(color) for each in figure.axes[0].collections for color in each.get_edgecolor()
-    }
+    assert COLLIDER_COLOR in {to_hex(color) for each in panel.collections for color in each.get_edgecolor()}
 
 
 def test_the_words_say_who_hits_whom(da_motion: DeepAccident) -> None:
     contact = da_motion.collision(accident_of(da_motion))
-    assert contact is not None
     words = accident_words(da_motion, contact)
-    first, second = contact.sides
-    assert ("hits" in words) == ("front" in (first, second))
-    for actor in contact.actor_ids:
-        assert f" {actor})" in words
-    assert f"{contact.closing_speed:.1f} m/s" in words
-    assert f"{np.degrees(contact.impact_angle):.0f}°" in words
+    assert ("hits" in words) == ("front" in contact.sides)
+    actors = [f" {actor})" for actor in contact.actor_ids]
+    assert not lacking(words, *actors, f"{contact.closing_speed:.1f} m/s", f"{np.degrees(contact.impact_angle):.0f}°")
 
 
 def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccident, accident: str) -> None:
-    fig = detached_figure((12.8, 7.2))
-    draw_countdown(da, f"{accident}/004", agents=AGENTS, layers=None, fig=fig)
+    fig = countdown(da, f"{accident}/004", AGENTS, None)
     agents = [ax.get_title().split(":")[0] for ax in fig.axes if ":" in ax.get_title()]
     assert agents == ["ego", "ego behind", "other", "other behind", "infrastructure"]
     assert ": 0.2 s to the impact other (car" in title_of(fig)
     above = next(ax for ax in fig.axes if ax.get_title().startswith("from above"))
-    contact = collision(da, accident)
-    assert contact is not None
-    tracks = [da.track.get(f"{accident}/004/actor/{actor}") for actor in contact.actor_ids]
-    (boxes,) = [each for each in above.collections if isinstance(each, PolyCollection)][-1:]
-    red = [np.allclose(color[:3], to_rgba(COLLIDER_COLOR)[:3]) for color in boxes.get_edgecolor()]
+    boxes = [each for each in above.collections if isinstance(each, PolyCollection)][-1]
+    red = [to_hex(color) == COLLIDER_COLOR for color in boxes.get_edgecolor()]
     places = [path.vertices[:4].mean(axis=0) for path, is_red in zip(boxes.get_paths(), red, strict=True) if is_red]
-    wanted = sorted(tuple(track["translation"][:2]) for track in tracks)
-    np.testing.assert_allclose(sorted(map(tuple, places)), wanted, atol=0.05)
+    ids = da.collision(accident).actor_ids
+    wanted = [da.track.get(f"{accident}/004/actor/{actor}")["translation"][:2] for actor in ids]
+    assert_allclose(sorted(map(tuple, places)), sorted(map(tuple, wanted)), atol=0.05)
 
 
 def test_an_agent_that_is_not_asked_for_has_an_empty_place(da: DeepAccident, accident: str) -> None:
-    fig = detached_figure((12.8, 7.2))
-    draw_countdown(da, f"{accident}/006", agents=["infrastructure"], layers=["boxes"], fig=fig)
+    fig = countdown(da, f"{accident}/006", ["infrastructure"], ["boxes"])
     assert sum(ax.axison for ax in fig.axes) == 3  # a camera, from above, speeds
     assert not any(ax.images for ax in fig.axes)
     assert ": the impact other (car" in title_of(fig)
@@ -161,8 +150,11 @@ def test_an_agent_that_is_not_asked_for_has_an_empty_place(da: DeepAccident, acc
 
 def test_nothing_to_count_down_to_is_said(da: DeepAccident, tmp_path: Path) -> None:
     normal = next(record["token"] for record in da.scenario if not record["collision"])
-    with pytest.raises(NotAvailableError, match=r"nobody collides in it.*the view 'frame'"):
+
+    def render() -> None:
         render_scenario_video(da, normal, tmp_path / "v.gif", what="accident", workers=1, progress=False)
+
+    assert_refused((render, NotAvailableError, ("nobody collides in it", "the view 'frame'")))
     assert not list(tmp_path.iterdir())
 
 
@@ -177,19 +169,18 @@ def red_size(ax: Any) -> Any:
 
 def assert_pair_is_seen(da: DeepAccident, scenario: Any, seconds: Sequence[float], width: float = 3.3) -> None:
     """At every moment: in the cameras of three agents or more, and from above with both tags; no tag is left out."""
-    contact = da.collision(scenario)
-    assert contact is not None
-    tags, figure = Pair.of(da, contact).tags.values(), detached_figure((width * len(seconds), 4.2 * width))
+    tags = {*Pair.of(da, da.collision(scenario)).tags.values()}
+    figure = detached_figure((width * len(seconds), 4.2 * width))
     render_accident(da, scenario, seconds=seconds, agents=AGENTS, fig=figure)
     figure.draw_without_rendering()
-    panels = np.array(figure.axes).reshape(6, len(seconds))
-    for column in panels.T:
-        assert sum(red_size(ax).min() > 4 * width for ax in column[:-1]) >= 3
-        assert {*tags} <= {text.get_text() for text in column[-1].texts}
-        assert red_size(column[-1]).max() > 9 * width
+    for *cameras, above in np.array(figure.axes).reshape(6, len(seconds)).T:
+        assert sum(red_size(ax).min() > 4 * width for ax in cameras) >= 3
+        assert tags <= {*texts(above)}
+        assert red_size(above).max() > 9 * width
     for ax in figure.axes:
         named = [text for text in ax.texts if text.get_text() in tags]
-        assert all(text.get_visible() and ax.bbox.overlaps(text.get_window_extent()) for text in named)
+        hidden = [each for each in named if not each.get_visible() or not ax.bbox.overlaps(each.get_window_extent())]
+        assert hidden == []
         assert len(named) >= (red_size(ax).min() > 4 * width)
 
 
@@ -205,12 +196,9 @@ def test_the_pair_of_each_design_is_seen_up_to_the_impact(da_designs: DeepAccide
 
 
 def test_a_camera_that_saw_the_pair_is_kept(da: DeepAccident, accident: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    contact, at = da.collision(accident), Pair.at
-    assert contact is not None
-    pair, below = Pair.of(da, contact), SE3.from_rotation(np.eye(3), [0.0, 0.0, -500.0])
+    pair, at, below = Pair.of(da, da.collision(accident)), Pair.at, SE3.from_rotation(np.eye(3), [0.0, 0.0, -500.0])
     channel, view, last = pair.view("ego_vehicle_behind", 5)
-    assert view is not None
-    assert last == 5
+    assert (view is not None, last) == (True, 5)
 
     def gone_at_the_impact(self: Pair, index: int, seen_by: str | None = None) -> Boxes:
         boxes = at(self, index, seen_by)
@@ -219,7 +207,7 @@ def test_a_camera_that_saw_the_pair_is_kept(da: DeepAccident, accident: str, mon
     monkeypatch.setattr(Pair, "at", gone_at_the_impact)
     assert pair.view("ego_vehicle_behind", 6) == (channel, None, 5)
     figure = drawn(da, accident, seconds=[0.0], agents=["ego_vehicle_behind"])
-    assert "seen 0.1 s ago" in figure.axes[0].texts[0].get_text()
+    assert "seen 0.1 s ago" in texts(figure.axes[0])[0]
 
 
 def test_rows_are_columns_in_a_wide_figure(da: DeepAccident, accident: str) -> None:
@@ -232,21 +220,15 @@ def test_rows_are_columns_in_a_wide_figure(da: DeepAccident, accident: str) -> N
 def test_where_there_is_little_room_the_agents_that_see_the_pair_best_are_shown(
     da: DeepAccident, accident: str
 ) -> None:
-    contact = da.collision(accident)
-    assert contact is not None
-    pair, slide, seconds = Pair.of(da, contact), (8.0, 4.5), (0.3, 0.2, 0.1, 0.0)
-    figure = detached_figure(slide)
-    render_accident(da, accident, seconds=seconds, fig=figure)
-    named = [ax.texts[-1].get_text() for ax in figure.axes[::4]]
-    assert "the 2 of 5 agents that see the pair best" in title_of(figure)
-    shares = {}
-    for agent in AGENTS:
-        views = [pair.view(agent, index)[1] for index in (3, 4, 5, 6)]
-        shares[short_name(agent)] = sum(view.shown for view in views if view is not None)
-    assert len(named) == 3
-    assert named[-1] == "from above"
-    assert min(shares[name] for name in named[:2]) >= sorted(shares.values())[-2]
-    asked = detached_figure(slide)
-    render_accident(da, accident, seconds=seconds, agents=AGENTS, fig=asked)
-    assert len(asked.axes) == 4 * 6
-    assert "best" not in title_of(asked)
+    pair, seconds = Pair.of(da, da.collision(accident)), (0.3, 0.2, 0.1, 0.0)
+    few, asked = (
+        render_accident(da, accident, seconds=seconds, agents=agents, fig=detached_figure((8.0, 4.5)))
+        for agents in (None, AGENTS)
+    )
+    *named, above = [texts(ax)[-1] for ax in few.axes[::4]]
+    assert "the 2 of 5 agents that see the pair best" in title_of(few)
+    views = {agent: [pair.view(agent, index)[1] for index in (3, 4, 5, 6)] for agent in AGENTS}
+    shares = {short_name(agent): sum(each.shown for each in seen if each) for agent, seen in views.items()}
+    assert (len(named), above) == (2, "from above")
+    assert min(shares[name] for name in named) >= sorted(shares.values())[-2]
+    assert (len(asked.axes), "best" in title_of(asked)) == (4 * 6, False)

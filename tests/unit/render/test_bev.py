@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import has_color, new_axes, on_canvas, rendered
+from drawing import footprints, has_color, legend_words, new_axes, of_kind, on_canvas, rendered, texts
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
@@ -32,8 +32,9 @@ from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, short_name
 from deepaccident_devkit.v2x import Link, PoseNoise, cooperative_boxes
 
 
-def of_kind(ax: Any, kind: type) -> list[Any]:
-    return [one for one in ax.collections if type(one) is kind]
+def places(ax: Any, cloud: int = 0) -> Any:
+    """The points that are drawn of a cloud."""
+    return np.asarray(of_kind(ax, PathCollection)[cloud].get_offsets())
 
 
 def outlines(ax: Any) -> dict[tuple[float, ...], str]:
@@ -48,8 +49,7 @@ def test_boxes_and_points_are_where_the_sample_has_them(da: DeepAccident, approa
     assert render_bev(da, approach, view_range=30, ax=ax) is ax
     boxes, cloud = da.boxes(approach, "ego"), da.load_point_cloud(approach, "ego").xyz
     near = boxes.select((np.abs(boxes.center[:, :2]) < 35).all(axis=1))
-    expected = {tuple(np.round(corners[:, :2].ravel(), 6)) for corners in near.bottom_corners()}
-    assert set(outlines(ax)) == expected
+    assert set(outlines(ax)) == footprints(near)
     (points,) = of_kind(ax, PathCollection)
     assert_allclose(points.get_offsets(), cloud[(np.abs(cloud[:, :2]) < 30).all(axis=1), :2])
     assert to_hex(points.get_facecolor()[0]) == POINT_COLOR
@@ -58,48 +58,43 @@ def test_boxes_and_points_are_where_the_sample_has_them(da: DeepAccident, approa
 
 
 def test_the_outline_of_a_collider_is_red_within_two_pixels_of_its_corners(da: DeepAccident, approach: str) -> None:
-    ax = render_bev(da, approach, layers=("boxes",), ax=new_axes())
+    ax, boxes = render_bev(da, approach, layers=("boxes",), ax=new_axes()), da.boxes(approach, "ego")
+    (actor,) = collider_ids(da, approach) - {OWN_ACTOR_ID}
+    corners = boxes.bottom_corners()[boxes.actor_id == actor][0, :, :2]
     picture = rendered(ax)
-    boxes = da.boxes(approach, "ego")
-    other = boxes.select(boxes.actor_id == next(iter(collider_ids(da, approach) - {OWN_ACTOR_ID})))
-    for place in on_canvas(ax, other.bottom_corners()[0, :, :2]):
-        assert has_color(picture, place, COLLIDER_COLOR)
+    assert [has_color(picture, place, COLLIDER_COLOR) for place in on_canvas(ax, corners)] == [True] * 4
 
 
 def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAccident, approach: str) -> None:
     ax = render_bev(da, approach, agents=None, frame="world", view_range=80, ax=new_axes())
     scenario, _, number = approach.rsplit("/", 2)
-    clouds = of_kind(ax, PathCollection)
-    assert [to_hex(one.get_facecolor()[0]) for one in clouds] == list(AGENT_COLORS.values())
-    marks = of_kind(ax, PolyCollection)[-1]
-    assert [to_hex(color) for color in marks.get_facecolor()] == list(AGENT_COLORS.values())
+    marks, colors = of_kind(ax, PolyCollection)[-1], list(AGENT_COLORS.values())
+    assert [to_hex(one.get_facecolor()[0]) for one in of_kind(ax, PathCollection)] == colors
+    assert [to_hex(color) for color in marks.get_facecolor()] == colors
     assert [to_hex(color) for color in marks.get_edgecolor()] == [OWN_COLOR, *[CASING_COLOR] * 4]
-    for agent, path, text in zip(AGENTS, marks.get_paths(), ax.texts, strict=True):
-        world_from_ego = da.world_from(f"{scenario}/{agent}/{number}", "ego")
-        assert_allclose(path.vertices[0], world_from_ego.apply([[1.8, 0, 0]])[0, :2])
-        assert_allclose(text.xy, world_from_ego.translation[:2])
-        assert text.get_text() == short_name(agent)
-    entries = [one.get_text() for one in ax.get_legend().get_texts()]
+    world_from_ego = [da.world_from(f"{scenario}/{agent}/{number}", "ego") for agent in AGENTS]
+    tips = [pose.apply([[1.8, 0, 0]])[0, :2] for pose in world_from_ego]
+    assert_allclose([path.vertices[0] for path in marks.get_paths()], tips)
+    assert_allclose([text.xy for text in ax.texts], [pose.translation[:2] for pose in world_from_ego])
+    assert texts(ax) == [short_name(agent) for agent in AGENTS]
+    entries = legend_words(ax)
     assert entries[:2] == ["colliding pair", "car"]  # agents with a cloud are named once
-    assert entries[-5:] == ["ego", "ego behind", "other", "other behind", "infrastructure"]
-    center = np.mean([ax.get_xlim(), ax.get_ylim()], axis=1)
-    assert_allclose(center, da.world_from(approach, "ego").translation[:2])
+    assert entries[-5:] == texts(ax)
+    assert_allclose(np.mean([ax.get_xlim(), ax.get_ylim()], axis=1), world_from_ego[0].translation[:2])
 
 
 def test_several_agents_boxes_are_drawn_once_an_actor(da: DeepAccident, approach: str) -> None:
-    ax = render_bev(da, approach, agents=("ego_vehicle", "infrastructure"), layers=["boxes"], ax=new_axes())
-    union = cooperative_boxes(da, approach, agents=("ego_vehicle", "infrastructure"), frame="ego")
-    near = union.select((np.abs(union.center[:, :2]) < 55).all(axis=1))
-    assert set(outlines(ax)) == {tuple(np.round(one[:, :2].ravel(), 6)) for one in near.bottom_corners()}
+    agents = ("ego_vehicle", "infrastructure")
+    ax = render_bev(da, approach, agents=agents, layers=["boxes"], ax=new_axes())
+    union = cooperative_boxes(da, approach, agents=agents, frame="ego")
+    assert set(outlines(ax)) == footprints(union.select((np.abs(union.center[:, :2]) < 55).all(axis=1)))
 
 
 def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAccident, approach: str) -> None:
-    both = ("ego_vehicle", "infrastructure")
-    link = Link(pose_noise=PoseNoise(mean=3.0, std=0.0))
+    both, link = ("ego_vehicle", "infrastructure"), Link(pose_noise=PoseNoise(mean=3.0, std=0.0))
     true, wrong = (render_bev(da, approach, agents=both, link=one, ax=new_axes()) for one in (None, link))
-    before, after = (np.asarray(of_kind(ax, PathCollection)[0].get_offsets()) for ax in (true, wrong))
-    assert_allclose(before, after)
-    first, second = (np.asarray(of_kind(ax, PathCollection)[1].get_offsets()) for ax in (true, wrong))
+    assert_allclose(places(true), places(wrong))
+    first, second = places(true, 1), places(wrong, 1)
     assert first.shape != second.shape or np.abs(first - second).max() > 1
     marks = [of_kind(ax, PolyCollection)[-1].get_paths()[1].vertices for ax in (true, wrong)]
     assert_allclose(marks[0], marks[1])
@@ -110,15 +105,14 @@ def test_the_receiver_s_own_box_is_where_it_is_and_the_title_says_what_the_link_
 ) -> None:
     both, link = ("ego_vehicle", "other_vehicle"), Link(latency=0.2, pose_noise=PoseNoise(mean=2.0, std=0.0))
     ax = render_bev(da, approach, agents=both, link=link, sweeps=2, layers=["boxes"], ax=new_axes())
-    own = da.boxes(approach, "ego")
+    own, moved = da.boxes(approach, "ego"), cooperative_boxes(da, approach, agents=both, frame="ego", link=link)
     own = own.select(own.actor_id == OWN_ACTOR_ID)
-    assert tuple(np.round(own.bottom_corners()[0, :, :2].ravel(), 6)) in outlines(ax)
-    moved = cooperative_boxes(da, approach, agents=both, frame="ego", link=link)
+    assert footprints(own) <= set(outlines(ax))
     sent = moved.select(moved.actor_id == da.get("agent", approach.replace("/003", ""))["actor_id"])
     assert np.linalg.norm(sent.center[0, :2] - own.center[0, :2]) > 1  # where the partner's message has it
-    without = render_bev(da, approach, agents=both, link=Link(seed=3), ax=new_axes())
-    assert without.get_title() == render_bev(da, approach, link=link, ax=new_axes()).get_title()
-    assert "latency" not in without.get_title()
+    without = render_bev(da, approach, agents=both, link=Link(seed=3), ax=new_axes()).get_title()
+    assert without == render_bev(da, approach, link=link, ax=new_axes()).get_title()
+    assert "latency" not in without
     assert ax.get_title().rstrip().endswith("\nlatency 0.2 s, poses off by 2 m (σ 0 m), 2 sweeps")
 
 
@@ -126,23 +120,18 @@ def test_the_pair_is_named_and_a_pedestrian_that_is_hit_is_found(tmp_path: Path)
     make_release(tmp_path / "r", SynthConfig(scenarios=1, frames=3, unplanned=1.0, seed=0, sensors=False), workers=1)
     da = DeepAccident("v1", tmp_path / "r", verbose=False)
     sample = next(one for one in da.sample if one["agent"] == "ego_vehicle" and one["time_to_impact"] == 0)
-    ax = render_bev(da, sample, view_range=100, ax=new_axes())
-    assert [text.get_text() for text in ax.texts if text.get_text() == "pedestrian"] == ["pedestrian"]
-    picture, boxes = rendered(ax), da.boxes(sample, "ego")
-    hit = np.flatnonzero([name == "pedestrian" for name in boxes.category_names])
-    hit = hit[np.isin(boxes.actor_id[hit], [*collider_ids(da, sample)])]
-    place = on_canvas(ax, boxes.center[hit, :2])[0]
-    red = np.abs(picture - np.array(to_rgb(COLLIDER_COLOR)) * 255).max(axis=-1) < 40
-    rows, columns = np.nonzero(red)
-    assert (np.hypot(columns + 0.5 - place[0], rows + 0.5 - place[1]) < 4).sum() >= 12
+    ax, boxes = render_bev(da, sample, view_range=100, ax=new_axes()), da.boxes(sample, "ego")
+    assert texts(ax).count("pedestrian") == 1
+    walks = np.array(boxes.category_names) == "pedestrian"
+    hit = walks & np.isin(boxes.actor_id, [*collider_ids(da, sample)])
+    red = np.abs(rendered(ax) - np.array(to_rgb(COLLIDER_COLOR)) * 255).max(axis=-1) < 40
+    pixels = np.argwhere(red)[:, ::-1] + 0.5
+    assert (np.linalg.norm(pixels - on_canvas(ax, boxes.center[hit, :2])[0], axis=1) < 4).sum() >= 12
 
 
 def test_sweeps_add_the_points_of_the_frames_before(da: DeepAccident, approach: str) -> None:
-    counts = [
-        len(of_kind(render_bev(da, approach, sweeps=sweeps, ax=new_axes()), PathCollection)[0].get_offsets())
-        for sweeps in (1, 3)
-    ]
-    assert 2.5 * counts[0] < counts[1] < 3.5 * counts[0]
+    one, three = (len(places(render_bev(da, approach, sweeps=sweeps, ax=new_axes()))) for sweeps in (1, 3))
+    assert 2.5 * one < three < 3.5 * one
 
 
 def test_each_layer_draws_its_own_and_nothing_else(da: DeepAccident, approach: str) -> None:
@@ -164,23 +153,18 @@ def test_each_layer_draws_its_own_and_nothing_else(da: DeepAccident, approach: s
 def test_trajectories_fade_from_the_present_to_where_the_actors_were_and_will_be(
     da: DeepAccident, approach: str
 ) -> None:
-    ax = new_axes()
-    render_bev(da, approach, layers=["trajectories"], seconds=(0.2, 0.3), view_range=25, ax=ax)
-    past, future = of_kind(ax, LineCollection)
+    ax = render_bev(da, approach, layers=["trajectories"], seconds=(0.2, 0.3), view_range=25, ax=new_axes())
     scenario, _, number = approach.rsplit("/", 2)
     own = da.get("agent", f"{scenario}/ego_vehicle")["actor_id"]
     path = da.trajectory(f"{scenario}/actor/{own}", approach, "ego")
     there = {int(index): center[:2] for index, center in zip(path.index, path.center, strict=True)}
-    present = int(number)
-    ahead = [[there[one], there[one + 1]] for one in range(present, present + 3)]
-    back = [[there[one], there[one - 1]] for one in range(present, present - 2, -1)]
-    for lines, expected in ((future, ahead), (past, back)):
-        segments = np.array(lines.get_segments())
+    ways = [[there[int(number) + step] for step in steps] for steps in ((0, -1, -2), (0, 1, 2, 3))]
+    for lines, ends in zip(of_kind(ax, LineCollection), ways, strict=True):
+        expected, segments = np.stack([ends[:-1], ends[1:]], axis=1), np.array(lines.get_segments())
         start = next(row for row in range(len(segments)) if np.allclose(segments[row], expected[0]))
         assert_allclose(segments[start : start + len(expected)], expected)
         opacity = lines.get_color()[start : start + len(expected), 3]
-        assert opacity[0] == 1
-        assert (np.diff(opacity) < 0).all()
+        assert (opacity[0], (np.diff(opacity) < 0).all()) == (1, True)
 
 
 @pytest.mark.parametrize(
@@ -190,26 +174,23 @@ def test_the_bev_camera_lies_under_the_picture_the_right_way_round(x: float, y: 
     semantic = np.zeros((1200, 1200), dtype=np.uint8)
     row, column = round(599.5 - x / 0.1), round(599.5 - y / 0.1)
     semantic[row - 15 : row + 16, column - 15 : column + 16] = TAGS["vehicle"]
-    world_from_ego = SE3.from_yaw(yaw, (100.0, -50.0, 2.0))
-    ax = new_axes()
+    world_from_ego, ax = SE3.from_yaw(yaw, (100.0, -50.0, 2.0)), new_axes()
     ax.set(xlim=(70, 130), ylim=(-80, -20), aspect="equal")
     image = BevImage(semantic, np.zeros((1200, 1200), dtype=np.uint16))
     draw_underlay(image, ax, target_from_ego=world_from_ego, view_range=30)
     assert (ax.get_xlim(), ax.get_ylim()) == ((70, 130), (-80, -20))
-    picture = rendered(ax)
-    corners = np.array([[x - 1.0, y - 1.0, 0], [x - 1.0, y + 1.0, 0], [x + 1.0, y - 1.0, 0], [x + 1.0, y + 1.0, 0]])
-    for place in on_canvas(ax, world_from_ego.apply(corners)[:, :2]):
-        assert has_color(picture, place, BEV_COLORS["vehicle"], within=1.0, tolerance=3)
-    for place in on_canvas(ax, world_from_ego.apply([[x + 3.0, y, 0], [x, y - 3.0, 0]])[:, :2]):
-        assert not has_color(picture, place, BEV_COLORS["vehicle"], within=1.0, tolerance=3)
+    picture, corners = rendered(ax), [(-1, -1), (-1, 1), (1, -1), (1, 1)]
+    places = world_from_ego.apply([[x + dx, y + dy, 0] for dx, dy in (*corners, (3, 0), (0, -3))])[:, :2]
+    vehicle = {"color": BEV_COLORS["vehicle"], "within": 1.0, "tolerance": 3}
+    found = [has_color(picture, place, **vehicle) for place in on_canvas(ax, places)]
+    assert found == [True] * 4 + [False] * 2
 
 
 def test_a_picture_can_be_centred_elsewhere(da: DeepAccident, approach: str) -> None:
-    ax = new_axes()
-    colors, clouds = draw_bev(da, approach, BevView(view_range=8, center=(20.0, 5.0)), frozenset(("bev", "boxes")), ax)
+    ax, view = new_axes(), BevView(view_range=8, center=(20.0, 5.0))
+    drawn = draw_bev(da, approach, view, frozenset(("bev", "boxes")), ax)
     assert (ax.get_xlim(), ax.get_ylim()) == ((12, 28), (-3, 13))
-    assert colors == set(outlines(ax).values())
-    assert clouds == ()
+    assert drawn == (set(outlines(ax).values()), ())
 
 
 def test_a_release_without_sensor_files_is_drawn_from_its_labels(da_b: DeepAccident) -> None:

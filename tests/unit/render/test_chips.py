@@ -71,5 +71,4 @@ def test_a_line_leads_to_a_chip_that_is_far_away() -> None:
     for size, led in ((1, False), (14, True)):
         ax = new_view()
         place_chips(ax, [("ego", (0.0, 0.0))], avoid=[CAR * size])
-        picture = rendered(ax, 300)
-        assert has_color(picture, on_canvas(ax, [(0.0, 0.0)])[0], MUTED_COLOR) == led
+        assert has_color(rendered(ax, 300), on_canvas(ax, [(0.0, 0.0)])[0], MUTED_COLOR) == led

@@ -8,6 +8,7 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from picture_texts import text_faults
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError, TokenError
@@ -180,8 +181,7 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
 def test_what_cannot_be_rendered_is_refused(
     draw: Draw, error: type[Exception], sentence: str, da_motion: DeepAccident, sample: str
 ) -> None:
-    with pytest.raises(error, match=sentence):
-        draw(da_motion, sample)
+    assert_refused((lambda: draw(da_motion, sample), error, sentence))
     assert plt.get_fignums() == []
 
 
@@ -197,5 +197,10 @@ def test_a_panel_of_no_camera_or_frame_is_refused(
     da_motion: DeepAccident, sample: str, labels: MotionLabels, camera: str, frame: int | None, sentence: str
 ) -> None:
     verdict = sample_verdict(da_motion, sample, instances_of(labels.instance, labels.config.grid), label=labels)
-    with pytest.raises(ChoiceError, match=sentence.format(last=int(labels.label_valid.sum()) - 1)):
-        draw_outcome_in_camera(da_motion, verdict, camera, frame=frame)
+    assert_refused(
+        (
+            lambda: draw_outcome_in_camera(da_motion, verdict, camera, frame=frame),
+            ChoiceError,
+            sentence.format(last=int(labels.label_valid.sum()) - 1),
+        )
+    )

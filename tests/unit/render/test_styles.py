@@ -2,7 +2,7 @@
 
 import pickle
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -92,6 +92,10 @@ PICTURES: dict[str, Draw] = {
 }
 
 
+def curve() -> Any:
+    return render_curve([1, 2, 3], [-1.0, 2.0, -3.0], "loss")
+
+
 def pixels(drawn: Any) -> Any:
     canvas: Any = FigureCanvasAgg(drawn.figure)
     canvas.draw()
@@ -122,41 +126,35 @@ def test_no_setting_of_the_user_changes_a_picture(
 
 def test_no_setting_of_the_user_changes_a_file(tmp_path: Path) -> None:
     """Nor if it is other when the figure is saved; and a figure that went through a pickle stays one of ours."""
-    for name, settings in (("usual", {}), ("hostile", HOSTILE)):
-        drawn = render_curve([1, 2, 3], [-1.0, 2.0, -3.0], "loss")
+    written = []
+    for settings in ({}, HOSTILE):
+        drawn = curve()
         with mpl.rc_context(settings):
-            pickle.loads(pickle.dumps(drawn.figure)).savefig(tmp_path / f"{name}_own.png")
-            save_picture(drawn, tmp_path / f"{name}.png")
-    for name in (".png", "_own.png"):
-        assert (tmp_path / f"hostile{name}").read_bytes() == (tmp_path / f"usual{name}").read_bytes()
+            pickle.loads(pickle.dumps(drawn.figure)).savefig(tmp_path / "own.png")
+            save_picture(drawn, tmp_path / "a.png")
+        written.append([(tmp_path / name).read_bytes() for name in ("own.png", "a.png")])
+    assert written[0] == written[1]
 
 
 def test_a_video_and_what_a_notebook_shows_know_no_setting(da_motion: DeepAccident) -> None:
-    sample = da_motion.sample[40]
-    [(view, layers)] = views_of("bev", None)
-
-    def made() -> tuple[Any, bytes]:
-        scene = Scene(dataset=da_motion, views=((view, layers),), agents=None, width=160, height=160)
-        return scene.picture(sample["frame_token"]), png_of(da_motion.boxes(sample))
-
-    usual = made()
-    with mpl.rc_context(HOSTILE):
-        again = made()
-    np.testing.assert_array_equal(again[0], usual[0])
-    assert again[1] == usual[1]
+    sample, made = da_motion.sample[40], []
+    for settings in ({}, HOSTILE):
+        with mpl.rc_context(settings):
+            scene = Scene(dataset=da_motion, views=views_of("bev", None), agents=None, width=160, height=160)
+            made.append((scene.picture(sample["frame_token"]).tobytes(), png_of(da_motion.boxes(sample))))
+    assert made[0] == made[1]
 
 
 def test_axes_of_the_user_stay_theirs_but_images_stand_upright(da: DeepAccident, sample: str) -> None:
     with mpl.rc_context({"image.origin": "lower", "axes.facecolor": "black"}):
         _, ax = plt.subplots()
         da.render_sample_data(f"{sample}/Camera_Front", ax=ax)
-    assert ax.get_facecolor()[:3] == (0, 0, 0)
-    assert ax.images[0].origin == "upper"
+    assert (ax.get_facecolor()[:3], ax.images[0].origin) == ((0, 0, 0), "upper")
 
 
 def test_a_figure_keeps_the_style_that_it_was_made_in() -> None:
     with style("paper"):
-        paper = render_curve([1, 2, 3], [1.0, 2.0, 3.0], "loss")
+        paper = curve()
         inside = pixels(paper)
     assert paper.xaxis.label.get_fontsize() == 9
     np.testing.assert_array_equal(pixels(paper), inside)
@@ -165,6 +163,10 @@ def test_a_figure_keeps_the_style_that_it_was_made_in() -> None:
 PACKAGE = Path(deepaccident_devkit.__file__).parent
 PAINTED = ("synth", "testing")
 """These paint a world for cameras, not pictures for readers."""
+
+
+NAMING = (".py", ".js", ".css", ".html")
+"""Files that may name colours."""
 HEX = re.compile(r"#(?:[0-9a-fA-F]{8}|[0-9a-fA-F]{6}|[0-9a-fA-F]{3,4})\b")
 EYES = ("normal", "protanopia", "deuteranopia", "tritanopia")
 
@@ -201,13 +203,8 @@ def test_colours_that_stand_together_are_distinguished(script: ModuleType, group
 def test_saturation_is_the_agents_and_the_pairs_alone(script: ModuleType) -> None:
     vivid = script.GROUPS["agents and the pair"]
     muted = [*styles.OUTCOME_COLORS.values(), styles.PREDICTED_COLOR, styles.ESTIMATE_COLOR]
-    shades = [
-        *styles.CATEGORY_COLORS.values(),
-        *styles.INSTANCE_COLORS,
-        *styles.SERIES_COLORS,
-        *styles.SPLIT_COLORS.values(),
-        *styles.BEV_COLORS.values(),
-    ]
+    tables = (styles.CATEGORY_COLORS, styles.SPLIT_COLORS, styles.BEV_COLORS)
+    shades = [*(color for each in tables for color in each.values()), *styles.INSTANCE_COLORS, *styles.SERIES_COLORS]
     assert script.chroma(vivid).min() > 36
     assert script.chroma(muted).max() < 40
     assert script.chroma(shades).max() < 17
@@ -238,27 +235,16 @@ def test_words_can_be_read_and_marks_be_seen(script: ModuleType) -> None:
         assert script.contrast(styles.AGENT_COLORS.values(), script.GROUNDS[ground]).min() >= bound
 
 
-def sources(*suffixes: str) -> Iterator[tuple[str, str]]:
-    """Names and texts of the package's files that may name colours."""
-    for path in sorted(PACKAGE.rglob("*")):
-        name = path.relative_to(PACKAGE)
-        if path.suffix in suffixes and name.parts[0] not in PAINTED and name.as_posix() != "render/styles.py":
-            yield name.as_posix(), path.read_text(encoding="utf-8")
-
-
 def test_colours_come_from_the_one_table() -> None:
     """Pages may have greys of their own: of their lines, grounds and words."""
-    found = [
-        f"{name}: {color}"
-        for name, text in sources(".py", ".js", ".css", ".html")
-        for color in HEX.findall(text)
-        if not is_grey(color)
-    ]
-    found += [
-        f"{name}: {color}"
-        for name, text in sources(".js", ".css", ".html")
-        for color in re.findall(r"\brgba?\(|\bhsla?\(", text)
-    ]
+    found = []
+    for path in sorted(PACKAGE.rglob("*")):
+        name, text = path.relative_to(PACKAGE), ""
+        if name.parts[0] not in PAINTED and name.as_posix() != "render/styles.py" and path.suffix in NAMING:
+            text = path.read_text(encoding="utf-8")
+        functions = re.findall(r"\brgba?\(|\bhsla?\(", text) if path.suffix != ".py" else []
+        colors = [color for color in HEX.findall(text) if not is_grey(color)]
+        found += [f"{name}: {color}" for color in (*colors, *functions)]
     assert found == []
 
 

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.colors import to_rgba
 from PIL import Image
+from refusals import assert_refused
 from video_views import SIZE, STEP, colors, decoded, grey, greys
 
 from deepaccident_devkit import DeepAccident
@@ -24,25 +24,21 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 
 @pytest.mark.slow
+def test_two_workers_and_an_executor_write_the_same_bytes_as_one(video: Callable[..., Path]) -> None:
+    how = {"what": [grey, "bev"], "frames": slice(0, 3)}
+    one, two = (video(f"{count}.mp4", workers=count, **how) for count in (1, 2))
+    with ThreadPoolExecutor(3) as executor:
+        sent = video("sent.mp4", executor=executor, **how)
+    assert one.read_bytes() == two.read_bytes() == sent.read_bytes()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])
 def test_a_video_has_all_frames_in_order_at_its_size(video: Callable[..., Path], suffix: str) -> None:
     path = video(f"v{suffix}")
     assert greys(path) == [1, 2, 3, 4, 5, 6]
-    assert all(picture.shape == (SIZE[1], SIZE[0], 3) for picture in decoded(path))
+    assert {picture.shape for picture in decoded(path)} == {(SIZE[1], SIZE[0], 3)}
     assert [each.name for each in path.parent.iterdir()] == [path.name]
-
-
-@pytest.mark.slow
-def test_two_workers_write_the_same_bytes_as_one(video: Callable[..., Path]) -> None:
-    one, two = (video(f"{count}.mp4", what=[grey, "bev"], frames=slice(0, 3), workers=count) for count in (1, 2))
-    assert one.read_bytes() == two.read_bytes()
-
-
-@pytest.mark.slow
-def test_an_executor_writes_the_same_bytes(video: Callable[..., Path]) -> None:
-    with ThreadPoolExecutor(3) as executor:
-        sent = video("sent.mp4", what="bev", executor=executor)
-    assert sent.read_bytes() == video("own.mp4", what="bev", workers=1).read_bytes()
 
 
 @pytest.mark.slow
@@ -60,9 +56,12 @@ def test_the_same_pictures_are_the_same_bytes(da: DeepAccident, accident: str, t
 
 @pytest.mark.slow
 def test_frames_are_numbers_in_any_order_or_a_slice_of_all(video: Callable[..., Path]) -> None:
-    assert greys(video("a.gif", frames=range(5, 1, -2))) == [5, 3]
-    assert greys(video("b.gif", frames=slice(-2, None))) == [5, 6]
-    assert greys(video("c.gif", frames=slice(None, None, 5))) == [1, 6]
+    for frames, shown in (
+        (range(5, 1, -2), [5, 3]),
+        (slice(-2, None), [5, 6]),
+        (slice(None, None, 5), [1, 6]),
+    ):
+        assert greys(video("a.gif", frames=frames)) == shown
 
 
 @pytest.mark.slow
@@ -81,29 +80,26 @@ def test_what_is_interrupted_leaves_the_old_file_alone(
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(f"v{suffix}", "old")]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"name": "v.avi"}, r"path: expected a file that ends in \.mp4, \.gif, \.webp, found '.*v\.avi'"),
-        ({"size": (161, 90)}, "size: expected an even width and height, which MP4 needs"),
-        ({"size": (0, 90)}, "size: expected width and height of at least 16 pixels"),
-        ({"fps": 0}, "fps: expected frames a second, above 0"),
-        ({"what": "film"}, "what: expected one of frame, sample, accident, .*, found 'film'"),
-        ({"what": []}, "what: expected at least one of frame, "),
-        ({"what": "bev", "layers": ["image"]}, "layers: expected one of .*bev.*, found 'image'"),
-        ({"frames": [1, 7]}, "frames: expected numbers from 1 to 6, found 7"),
-        ({"frames": slice(9, None)}, "frames: expected numbers from 1 to 6, found none"),
-        ({"agents": ["pole"]}, "agent: expected one of ego_vehicle.*'pole'"),
-        ({"what": lambda *_: None, "workers": 2}, "cannot be sent to other processes; put it into a module"),
-    ],
-)
-def test_errors_come_before_anything_is_drawn(
-    video: Callable[..., Path], tmp_path: Path, options: dict[str, Any], sentence: str
-) -> None:
-    with pytest.raises(ChoiceError, match=sentence):
-        video(**{"name": "v.mp4", **options})
+def test_errors_come_before_anything_is_drawn(video: Callable[..., Path], tmp_path: Path) -> None:
+    def write(name: str = "v.mp4", **options: Any) -> Callable[[], object]:
+        return lambda: video(name, **options)
+
+    assert_refused(
+        (write("v.avi"), ChoiceError, ("path", ".mp4, .gif, .webp", "v.avi")),
+        (write(size=(161, 90)), ChoiceError, ("size", "even width and height", "MP4")),
+        (write(size=(0, 90)), ChoiceError, ("size", "at least 16 pixels")),
+        (write(fps=0), ChoiceError, ("fps", "above 0")),
+        (write(what="film"), ChoiceError, ("what", "frame, sample, accident", "'film'")),
+        (write(what=[]), ChoiceError, ("what", "at least one of frame")),
+        (write(what="bev", layers=["image"]), ChoiceError, ("layers", "bev", "'image'")),
+        (write(frames=[1, 7]), ChoiceError, ("frames", "1 to 6", "found 7")),
+        (write(frames=slice(9, None)), ChoiceError, ("frames", "1 to 6", "found none")),
+        (write(agents=["pole"]), ChoiceError, ("agent", "ego_vehicle", "'pole'")),
+        (write(what=lambda *_: None, workers=2), ChoiceError, ("cannot be sent to other processes", "a module")),
+    )
     assert not list(tmp_path.iterdir())
+    (tmp_path / "a.gif").mkdir()
+    assert_refused((write("a.gif"), ChoiceError, ("path", "the folder")))
 
 
 @pytest.fixture(scope="session")
@@ -123,13 +119,16 @@ def video(da: DeepAccident, accident: str, tmp_path: Path) -> Callable[..., Path
     return write
 
 
+def picture_of(da: DeepAccident, frame: str, what: Any, size: tuple[int, int], agents: Any = None) -> Any:
+    """A frame of a video."""
+    scene = Scene(dataset=da, views=views_of(what, None), agents=agents, width=size[0], height=size[1])
+    return scene.picture(frame)
+
+
 @pytest.mark.slow
 def test_views_side_by_side_have_their_shares_of_the_width(da: DeepAccident, accident: str) -> None:
-    frame = f"{accident}/004"
-    views = views_of(["bev", "frame", grey], None)
-    picture = Scene(dataset=da, views=views, agents=None, width=400, height=90).picture(frame)
-    assert picture.shape == (90, 400, 3)
-    assert VIEWS["frame"].share == 2
+    picture = picture_of(da, f"{accident}/004", ["bev", "frame", grey], (400, 90))
+    assert (picture.shape, VIEWS["frame"].share) == ((90, 400, 3), 2)
     assert (picture[:, 300:] == 4 * STEP).all()
     assert (picture[:, 299] != 4 * STEP).all()
     assert (picture[:, :100] != 255).any()
@@ -138,8 +137,7 @@ def test_views_side_by_side_have_their_shares_of_the_width(da: DeepAccident, acc
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(VIEWS) - set(CAMERAS[1:])))
 def test_every_view_draws(da: DeepAccident, accident: str, name: str) -> None:
-    scene = Scene(dataset=da, views=views_of(name, None), agents=None, width=320, height=180)
-    picture = scene.picture(f"{accident}/003")
+    picture = picture_of(da, f"{accident}/003", name, (320, 180))
     assert picture.shape == (180, 320, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
     assert not plt.get_fignums()
@@ -147,17 +145,15 @@ def test_every_view_draws(da: DeepAccident, accident: str, name: str) -> None:
 
 def test_a_camera_is_the_one_of_the_first_agent_named(da: DeepAccident, accident: str) -> None:
     frame, names = f"{accident}/003", ["other_vehicle", "ego_vehicle"]
-    assert names_at(da, frame, names) == ("other_vehicle", "ego_vehicle")
-    assert names_at(da, frame, None) == AGENTS
-    assert names_at(da, frame, "+other") == ("ego_vehicle", "other_vehicle")
-    scene = Scene(dataset=da, views=views_of("Camera_Back", None), agents=names, width=320, height=180)
+    for agents, named in ((names, tuple(names)), (None, AGENTS), ("+other", ("ego_vehicle", "other_vehicle"))):
+        assert names_at(da, frame, agents) == named
 
     def draw(dataset: Any, record: Any, fig: Any) -> None:
         camera = dataset.get("sample_data", f"{accident}/other_vehicle/003/Camera_Back")
         draw_camera(dataset, camera, CAMERA_DEFAULT, fig.add_subplot())
 
-    own = Scene(dataset=da, views=views_of(draw, None), agents=None, width=320, height=180)
-    np.testing.assert_array_equal(scene.picture(frame), own.picture(frame))
+    shown, own = (picture_of(da, frame, what, (320, 180), names) for what in ("Camera_Back", draw))
+    np.testing.assert_array_equal(shown, own)
 
 
 def test_each_view_draws_those_of_the_layers_that_it_has() -> None:
@@ -170,11 +166,9 @@ def test_each_view_draws_those_of_the_layers_that_it_has() -> None:
 @pytest.mark.parametrize("what", [("frame", "visibility", "bev"), ("frame", "sample", "labels")])
 def test_words_keep_their_room_beside_other_views(da: DeepAccident, accident: str, what: tuple[str, ...]) -> None:
     """Nothing is written over a view's left or right edge; matplotlib warns, which is an error here, if it gives up."""
-    scene = Scene(dataset=da, views=views_of(what, None), agents=None, width=1280, height=720)
-    picture, total = scene.picture(f"{accident}/002").astype(int), sum(VIEWS[name].share for name in what)
-    edges = np.cumsum([0, *(VIEWS[name].share for name in what)]) * 1280 // total
-    for left, right in pairwise(edges.tolist()):
-        assert (picture[:, [left, right - 1]] > 250).all()
+    picture, shares = picture_of(da, f"{accident}/002", what, (1280, 720)), [VIEWS[name].share for name in what]
+    edges = np.cumsum([0, *shares]) * 1280 // sum(shares)
+    assert (picture[:, [*edges[:-1], *(edges[1:] - 1)]] > 250).all()
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])
@@ -186,8 +180,7 @@ def test_colors_are_right_in_the_file(video: Callable[..., Path], suffix: str) -
 
 def test_few_pixels_keep_their_color_in_a_gif(tmp_path: Path) -> None:
     """A box is some pixels of a picture of thousands of other colours."""
-    rng = np.random.default_rng(0)
-    photo = rng.integers(60, 140, (90, 160, 3), dtype=np.uint8)
+    photo = np.random.default_rng(0).integers(60, 140, (90, 160, 3), dtype=np.uint8)
     marks = {(10, 20): COLLIDER_COLOR, (50, 60): AGENT_COLORS["ego_vehicle"]}
     for (row, column), color in marks.items():
         photo[row : row + 2, column : column + 12] = np.array(to_rgba(color)[:3]) * 255
@@ -223,12 +216,6 @@ def test_without_av_mp4_is_refused_before_anything_is_drawn(
     video: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(MissingExtraError, match=r"MP4 needs PyAV: .*\[video\]'; or choose \.gif or \.webp$"):
-        video(name, what=lambda *_: pytest.fail("drawn"))
+    told = ("MP4 needs PyAV", "[video]", ".gif or .webp")
+    assert_refused((lambda: video(name, what=lambda *_: pytest.fail("drawn")), MissingExtraError, told))
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_is_no_video(da: DeepAccident, accident: str, tmp_path: Path) -> None:
-    (tmp_path / "a.gif").mkdir()
-    with pytest.raises(ChoiceError, match="path: expected a file, found the folder"):
-        render_scenario_video(da, accident, tmp_path / "a.gif")

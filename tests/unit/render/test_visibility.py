@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawing import legend_words, texts
 from matplotlib.colors import to_hex, to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
+from wording import lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure
@@ -34,25 +36,22 @@ def dots(ax: Any) -> dict[str, Any]:
     return {each.get_label(): each.get_offsets() for each in ax.collections if each.get_label() in AGENTS}
 
 
-def words(ax: Any) -> list[str]:
-    return [text.get_text() for text in ax.texts]
+def lines_of(ax: Any) -> Any:
+    """The lines between who sees and who is seen."""
+    return next(each for each in ax.collections if each.get_alpha() == 0.8)
 
 
 def test_dots_are_at_who_is_visible_by_the_rule(hidden: DeepAccident) -> None:
     scenario = hidden.scenario[0]["token"]
     sample = hidden.get_sample(scenario, "other_vehicle", 10)
-    ax = panel(hidden, sample)
-    boxes = hidden.cooperative_boxes(sample, frame="ego")
+    ax, boxes = panel(hidden, sample), hidden.cooperative_boxes(sample, frame="ego")
     for agent in AGENTS:
         seen = hidden.visible_instances(f"{scenario}/{agent}/010", agents=[agent])
-        ids = [int(token.rsplit("/", 1)[1]) for token in seen]
-        seen_boxes = boxes.select(np.isin(boxes.actor_id, ids))
-        tops = seen_boxes.bottom_corners()[..., 1].max(axis=1)
-        assert_allclose(dots(ax)[agent], np.column_stack([seen_boxes.center[:, 0], tops]))
-    assert (
-        to_hex(next(each for each in ax.collections if each.get_label() == AGENTS[2]).get_facecolor()[0])
-        == (AGENT_COLORS[AGENTS[2]])
-    )
+        known = boxes.select(np.isin(boxes.actor_id, [int(token.rsplit("/", 1)[1]) for token in seen]))
+        tops = known.bottom_corners()[..., 1].max(axis=1)
+        assert_allclose(dots(ax)[agent], np.column_stack([known.center[:, 0], tops]))
+    (other,) = (each for each in ax.collections if each.get_label() == AGENTS[2])
+    assert to_hex(other.get_facecolor()[0]) == AGENT_COLORS[AGENTS[2]]
 
 
 def test_a_dot_is_drawn_right_above_its_actor(hidden: DeepAccident) -> None:
@@ -70,22 +69,16 @@ def test_the_hidden_collider_stands_out(hidden: DeepAccident) -> None:
     known = visibility_of(hidden, hidden.get_sample(scenario, "ego_vehicle", 2))
     other = known.boxes.actor_id == hidden.get("agent", f"{scenario['token']}/other_vehicle")["actor_id"]
     assert known.hidden_from("ego_vehicle")[other].all()
-    ax = panel(hidden, known.sample)
-    assert words(ax) == ["ego cannot see"]
-    dashed = [each for each in ax.collections if each.get_linestyle()[0][1] is not None and len(each.get_paths())]
-    corners = np.concatenate([path.vertices[:4] for path in dashed[0].get_paths()])
-    for corner in known.boxes.select(other).bottom_corners()[0, :, :2]:
-        assert np.linalg.norm(corners - corner, axis=1).min() < 1e-9
-    assert COLLIDER_COLOR in {to_hex(color) for color in dashed[0].get_edgecolor()}
-    lines = next(each for each in ax.collections if each.get_alpha() == 0.8)
-    assert_allclose(lines.get_colors()[:, :3], [to_rgba(AGENT_COLORS[name])[:3] for name in line_agents(known)])
-    later = panel(hidden, hidden.get_sample(scenario, "ego_vehicle", scenario["num_frames"]))
-    assert words(later) == []
-
-
-def line_agents(known: Any) -> list[str]:
+    ax, later = panel(hidden, known.sample), panel(hidden, hidden.get_sample(scenario, "ego_vehicle", 15))
+    assert (texts(ax), texts(later)) == (["ego cannot see"], [])
+    dashed = next(each for each in ax.collections if each.get_linestyle()[0][1] is not None and len(each.get_paths()))
+    corners = np.concatenate([path.vertices[:4] for path in dashed.get_paths()])
+    apart = known.boxes.select(other).bottom_corners()[0, :, None, :2] - corners
+    assert np.linalg.norm(apart, axis=-1).min(axis=1).max() < 1e-9
+    assert COLLIDER_COLOR in {to_hex(color) for color in dashed.get_edgecolor()}
     _, column = np.nonzero(known.seen & known.collides[:, None])
-    return [known.agents[each] for each in column]
+    hues = [AGENT_COLORS[known.agents[each]] for each in column]
+    assert [to_hex(color) for color in lines_of(ax).get_colors()] == hues
 
 
 def test_frames_agents_and_layers_are_the_callers(hidden: DeepAccident) -> None:
@@ -93,58 +86,48 @@ def test_frames_agents_and_layers_are_the_callers(hidden: DeepAccident) -> None:
     ax = panel(hidden, hidden.get("frame", token), agents=["infrastructure", "ego_vehicle"], frame="world")
     assert [*dots(ax)] == ["ego_vehicle", "infrastructure"]
     assert visibility_of(hidden, token).sample.endswith("ego_vehicle/010")  # the first agent there
-    bare = panel(hidden, token, layers=["ids"])
-    assert not dots(bare)
-    assert len(bare.texts) == len(visibility_of(hidden, token).boxes)
-    wide = panel(hidden, token, view_range=12.0)
+    bare, wide = panel(hidden, token, layers=["ids"]), panel(hidden, token, view_range=12.0)
+    assert (dots(bare), len(bare.texts)) == ({}, len(visibility_of(hidden, token).boxes))
     assert_allclose(np.diff([wide.get_xlim(), wide.get_ylim()]), 24.0)
 
 
 def test_the_matrix_has_a_cell_for_each_actor_and_agent(hidden: DeepAccident) -> None:
     sample = hidden.get_sample(hidden.scenario[0], "ego_vehicle", 10)
-    known = visibility_of(hidden, sample)
-    ax = detached_figure((5, 7)).add_subplot()
+    known, ax = visibility_of(hidden, sample), detached_figure((5, 7)).add_subplot()
     assert render_visibility_matrix(hidden, sample, ax=ax) is ax
-    rows = [label.get_text() for label in ax.get_yticklabels()]
-    assert [int(row.split()[1]) in known.pair for row in rows[:3]] == [True, True, False]
-    by_id = {int(row.split()[1]): number for number, row in enumerate(rows)}
-    full = np.zeros((len(rows), 5), dtype=bool)
+    actors = [int(label.get_text().split()[1]) for label in ax.get_yticklabels()]
+    assert [actor in known.pair for actor in actors[:3]] == [True, True, False]
+    full = np.zeros((len(actors), 5), dtype=bool)
     for each in ax.patches:
         column, row = np.rint(np.add(each.get_xy(), (0.3, 0.4))).astype(int).tolist()
         full[row, column] = to_rgba(each.get_facecolor())[3] > 0
-    for row, actor in enumerate(known.boxes.actor_id.tolist()):
-        if actor in by_id:
-            order = [known.agents.index(agent) for agent in AGENTS]
-            assert_array_equal(full[by_id[actor]], known.seen[row, order])
-    assert "0: none" in ax.get_xlabel()
-    assert "–: not in the agent's label" in ax.get_xlabel()
-    assert sum(text.get_text() == "itself" for text in ax.texts) == 4  # the pole has no body
+    rows = [known.boxes.actor_id.tolist().index(actor) for actor in actors]
+    order = [known.agents.index(agent) for agent in AGENTS]
+    assert_array_equal(full, known.seen[np.ix_(rows, order)])
+    assert not lacking(ax.get_xlabel(), "0: none", "–: not in the agent's label")
+    assert texts(ax).count("itself") == 4  # the pole has no body
 
 
 def test_a_normal_scenario_hides_nothing(da_motion: DeepAccident) -> None:
     normal = next(scenario for scenario in da_motion.scenario if not scenario["collision"])
-    ax = panel(da_motion, da_motion.get_sample(normal, "ego_vehicle", 5))
-    assert words(ax) == []
+    assert texts(panel(da_motion, da_motion.get_sample(normal, "ego_vehicle", 5))) == []
     assert not visibility_of(da_motion, f"{normal['token']}/005").hidden_from("ego_vehicle").any()
 
 
 def test_two_that_see_each_other_have_two_lines_and_the_legend_says_what_marks_mean(hidden: DeepAccident) -> None:
-    scenario = hidden.scenario[0]
-    ax = panel(hidden, hidden.get_sample(scenario, "ego_vehicle", scenario["num_frames"]))
-    lines = next(each for each in ax.collections if each.get_alpha() == 0.8)
+    ax = panel(hidden, hidden.get_sample(hidden.scenario[0], "ego_vehicle", 15))
+    lines = lines_of(ax)
     ways = {to_hex(color): line for color, line in zip(lines.get_colors(), lines.get_segments(), strict=True)}
     out, back = ways[AGENT_COLORS["ego_vehicle"]], ways[AGENT_COLORS["other_vehicle"]]
     assert_allclose(out[1] - out[0], back[0] - back[1], atol=0.5)  # a car's box is about its agent, not at it
     assert 0.3 < np.linalg.norm(out[0] - back[1]) < 2  # side by side
-    words = {text.get_text() for text in ax.get_legend().get_texts()}
-    assert words >= {"an agent", "whose view: ego", "sees one of the pair", "colliding pair"}
+    assert not lacking(legend_words(ax), "an agent", "whose view: ego", "sees one of the pair", "colliding pair")
 
 
 @pytest.mark.parametrize("index", [1, 5, 10, 15])
 def test_no_actor_of_the_view_is_cut(hidden: DeepAccident, index: int) -> None:
     sample = hidden.get_sample(hidden.scenario[0], "ego_vehicle", index)
-    ax = panel(hidden, sample)
+    ax, known = panel(hidden, sample), visibility_of(hidden, sample)
     low, high = np.array([ax.get_xlim(), ax.get_ylim()]).T
-    known = visibility_of(hidden, sample)
     corners = known.boxes.bottom_corners()[known.collides | known.records, :, :2].reshape(-1, 2)
     assert ((corners > low) & (corners < high)).all()

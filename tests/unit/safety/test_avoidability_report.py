@@ -5,12 +5,16 @@ import importlib
 import json
 import pickle
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from replayed_accidents import head_on, rear_end
+from wording import lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.accidents.outcomes import delta_v_ranges
@@ -27,6 +31,12 @@ from deepaccident_devkit.safety import (
 from deepaccident_devkit.safety.avoidability import SecondaryContact
 from deepaccident_devkit.safety.avoidability_report import group_of
 
+
+def report_of(accidents: Sequence[Avoidability], **more: Any) -> AvoidabilityReport:
+    told = {"dataroot": "/data", "version": "v1", "dropped": (), "skipped": (), "margins": {}, **more}
+    return AvoidabilityReport(accidents=tuple(accidents), **told)
+
+
 AVOIDED = OUTCOMES.index("avoided")
 
 
@@ -40,12 +50,9 @@ def accidents() -> list[Avoidability]:
 
 @pytest.fixture(scope="module")
 def report(accidents: list[Avoidability]) -> AvoidabilityReport:
-    gone = Skipped(scenario="far", reason="far: the outlines are 2.00 m apart")
-    return AvoidabilityReport(
-        dataroot="/data",
-        version="v1",
-        accidents=tuple(accidents),
-        dropped=(gone,),
+    return report_of(
+        accidents,
+        dropped=(Skipped(scenario="far", reason="far: the outlines are 2.00 m apart"),),
         skipped=(Skipped(scenario="bare", reason="bare has no labels"),),
         margins={f"s{number}": each.check.margin for number, each in enumerate(accidents)} | {"far": 2.0},
     )
@@ -61,20 +68,17 @@ def test_groups(accidents: list[Avoidability]) -> None:
 
 
 def test_shares_are_means_of_the_accidents_that_are_long_enough(accidents: list[Avoidability]) -> None:
-    shares = outcome_shares(accidents)[0]
-    first, second = accidents[:2]
-    assert shares.leads == pytest.approx(np.arange(51) / 10)
-    assert shares.accidents.tolist() == [2] * 31 + [1] * 20
+    shares, (first, second) = outcome_shares(accidents)[0], (each.outcomes[0] for each in accidents[:2])
+    assert (shares.leads, shares.accidents.tolist()) == (pytest.approx(np.arange(51) / 10), [2] * 31 + [1] * 20)
     np.testing.assert_allclose(shares.shares.sum(axis=2), 1)
-    both = [each.outcomes[0].outcome[:31] == AVOIDED for each in (first, second)]
-    np.testing.assert_allclose(shares.shares[:31, :, AVOIDED], np.mean(both, axis=0))
-    np.testing.assert_allclose(shares.shares[31:, :, AVOIDED], first.outcomes[0].outcome[31:] == AVOIDED)
-    assert shares.relative_speed[0] == pytest.approx(7)  # 10 and 4 m/s
-    assert shares.delta_v[0, 0, 0] == pytest.approx((7.5 + 2) / 2)  # of the lighter one, and of either
-    ranges = delta_v_ranges([1000, 3000], 10.0)[0], delta_v_ranges([1500, 1500], 4.0)[0]
-    assert shares.delta_v[0, 0, 1:] == pytest.approx(np.mean(ranges, axis=0))
-    extrapolated = [each.outcomes[0].extrapolated[:31] for each in (first, second)]
+    both = np.mean([each.outcome[:31] == AVOIDED for each in (first, second)], axis=0)
+    np.testing.assert_allclose(shares.shares[..., AVOIDED], [*both, *(first.outcome[31:] == AVOIDED)])
+    extrapolated = [each.extrapolated[:31] for each in (first, second)]
     np.testing.assert_allclose(shares.extrapolated[:31], np.mean(extrapolated, axis=0))
+    assert shares.relative_speed[0] == pytest.approx(7)  # 10 and 4 m/s
+    ranges = delta_v_ranges([1000, 3000], 10.0)[0], delta_v_ranges([1500, 1500], 4.0)[0]
+    expected = (7.5 + 2) / 2, *np.mean(ranges, axis=0)  # of the lighter one, and of either
+    assert shares.delta_v[0, 0] == pytest.approx(expected)
 
 
 def test_the_ego_is_warned_where_it_is_of_the_pair(accidents: list[Avoidability]) -> None:
@@ -88,23 +92,24 @@ def test_the_ego_is_warned_where_it_is_of_the_pair(accidents: list[Avoidability]
 
 def test_text(report: AvoidabilityReport) -> None:
     text = report.to_text()
-    assert "4 accidents; 1 dropped, as the two are too far apart at the end; 1 skipped" in text
-    assert "\n  far: the outlines are 2.00 m apart" in text
-    assert "\n  bare has no labels" in text
-    assert "1 m or more: 1" in text
-    assert "the largest: 2.000 m, far" in text
-    block = text.split("\n\n")[1].splitlines()
-    assert block[0] == "vehicles: 2 accidents; seconds of warning that 50% and 90% of them need"
+    assert not lacking(
+        text,
+        "4 accidents; 1 dropped, as the two are too far apart at the end; 1 skipped",
+        "\n  far: the outlines are 2.00 m apart",
+        "\n  bare has no labels",
+        "1 m or more: 1",
+        "the largest: 2.000 m, far",
+    )
+    heading, _, first, _, _, second, *_ = text.split("\n\n")[1].splitlines()
+    assert heading == "vehicles: 2 accidents; seconds of warning that 50% and 90% of them need"
     half, most = sorted(each.slack[0, 0] for each in report.accidents[:2])
     needed = " ".join(f"{half + reaction:.2f} / {most + reaction:.2f}" for reaction in (0.5, 1, 1.5))
-    assert block[2].split() == f"first 4 2 0 {needed}".split()
-    assert block[5].split() == ["second", "4", "0", "0", *["–", "/", "–"] * 3]
+    assert first.split() == f"first 4 2 0 {needed}".split()
+    assert second.split() == ["second", "4", "0", "0", *["–", "/", "–"] * 3]
 
 
 def test_head_on_answers_of_the_continuation_are_counted(report: AvoidabilityReport) -> None:
-    alone = AvoidabilityReport(
-        dataroot="", version="v1", accidents=report.accidents[2:3], dropped=(), skipped=(), margins={}
-    )
+    alone = report_of(report.accidents[2:3])
     line = next(line for line in alone.to_text().splitlines() if line.startswith("first"))
     count = int(report.accidents[2].last_moments.extrapolated[0])
     assert line.split()[:4] == ["first", "4", str(1 - count), str(count)]
@@ -112,32 +117,26 @@ def test_head_on_answers_of_the_continuation_are_counted(report: AvoidabilityRep
 
 def test_contacts_with_others_before_the_end_and_after_it(accidents: list[Avoidability]) -> None:
     told = {"actor_id": 11, "other_id": 30, "category": "car"}
-    contacts = (
-        SecondaryContact(replay=0, time=4.5, extrapolated=False, **told),
-        SecondaryContact(replay=0, time=4.7, extrapolated=False, **told),
-        SecondaryContact(replay=1, time=5.5, extrapolated=True, **told),
+    contacts = tuple(
+        SecondaryContact(replay=replay, time=time, extrapolated=time > 5, **told)
+        for replay, time in ((0, 4.5), (0, 4.7), (1, 5.5))
     )
-    crowded = replace(accidents[0], secondary=contacts)
-    alone = AvoidabilityReport(dataroot="", version="v1", accidents=(crowded,), dropped=(), skipped=(), margins={})
-    assert "touched in 1 of 6 replays" in alone.to_text()
-    assert "in 2 if all go straight on for 3 s" in alone.to_text()
+    alone = report_of([replace(accidents[0], secondary=contacts)])
+    assert not lacking(alone.to_text(), "touched in 1 of 6 replays", "in 2 if all go straight on for 3 s")
     rows = [row["secondary"] for row in alone.to_dict()["accidents"][0]["last_moments"]]
     assert [len(each) for each in rows] == [2, 1, 0, 0, 0, 0, 0, 0, 0]
 
 
 def test_an_empty_report() -> None:
-    empty = AvoidabilityReport(dataroot="/data", version="v1", accidents=(), dropped=(), skipped=(), margins={})
-    assert empty.to_text() == "DeepAccident v1 at /data\n0 accidents"
+    empty = report_of([])
+    assert (empty.to_text(), empty.shares) == ("DeepAccident v1 at /data\n0 accidents", [])
     assert json.loads(empty.to_json())["accidents"] == []
-    assert empty.shares == []
 
 
 def test_files(report: AvoidabilityReport, tmp_path: Path) -> None:
     paths = report.to_csv(tmp_path / "out")
-    tables = {
-        path.stem.removeprefix("avoidability_"): list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-        for path in paths
-    }
+    lines = {path.stem.removeprefix("avoidability_"): path.read_text(encoding="utf-8").splitlines() for path in paths}
+    tables = {name: list(csv.DictReader(each)) for name, each in lines.items()}
     assert {name: len(rows) for name, rows in tables.items()} == {
         "last_moments": 4 * 9,
         "secondary_contacts": 0,
@@ -145,36 +144,29 @@ def test_files(report: AvoidabilityReport, tmp_path: Path) -> None:
         "self_check": 4,
         "left_out": 2,
     }
-    first = tables["last_moments"][0]
-    slack = f"{report.accidents[0].slack[0, 0]:g}"
-    assert (first["brakers"], first["deceleration"], first["slack"]) == ("first", "4.0", slack)
-    assert tables["self_check"][0]["delta_v_first"] == "7.5"
-    least, most = (float(tables["self_check"][0][f"delta_v_first_{end}"]) for end in ("least", "most"))
-    assert (least, most) == pytest.approx(tuple(delta_v_ranges([1000, 3000], 10.0)[0]), abs=5e-4)
-    share = tables["outcome_shares"][0]
-    assert (share["lead"], share["accidents"], share["relative_speed"]) == ("0.0", "2", "7.0")
-    assert share["unchanged"] == "1.0"
-    assert [(row["why"], row["scenario"], row["margin"]) for row in tables["left_out"]] == [
-        ("dropped", "far", "2.0"),
-        ("skipped", "bare", ""),
-    ]
-    with pytest.raises(ConfigError, match="is a file; give a folder"):
-        report.to_csv(paths[0])
+    least, most = (f"{value:.4g}" for value in delta_v_ranges([1000, 3000], 10.0)[0])
+    for name, expected in {
+        "last_moments": {"brakers": "first", "deceleration": "4.0", "slack": f"{report.accidents[0].slack[0, 0]:g}"},
+        "self_check": {"delta_v_first": "7.5", "delta_v_first_least": least, "delta_v_first_most": most},
+        "outcome_shares": {"lead": "0.0", "accidents": "2", "relative_speed": "7.0", "unchanged": "1.0"},
+        "left_out": {"why": "dropped", "scenario": "far", "margin": "2.0"},
+    }.items():
+        assert {column: tables[name][0][column] for column in expected} == expected
+    assert tables["left_out"][1]["why"] == "skipped"
+    assert_refused((lambda: report.to_csv(paths[0]), ConfigError, ("is a file", "give a folder")))
 
 
 def test_json_and_pickle(report: AvoidabilityReport) -> None:
     told = json.loads(report.to_json())
-    assert set(told["dropped"]) == {"far"}
-    assert set(told["skipped"]) == {"bare"}
-    assert told["margins"]["far"] == 2
+    assert (set(told["dropped"]), set(told["skipped"]), told["margins"]["far"]) == ({"far"}, {"bare"}, 2)
     assert [each["group"] for each in told["accidents"]] == ["vehicles", "vehicles", "head-on", "pedestrians"]
     assert pickle.loads(pickle.dumps(report)).to_text() == report.to_text()
 
 
 def test_of_a_release(own_release: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One scenario has no meta file; of another the gap at the end is made too large; the rest is replayed."""
-    scenarios = DeepAccident("v1", own_release, verbose=False).find(collision=True)
-    bare, far = scenarios[0], scenarios[1]["token"]
+    bare, *scenarios = DeepAccident("v1", own_release, verbose=False).find(collision=True)
+    far, *rest = (each["token"] for each in scenarios)
     (own_release / bare["folder"] / bare["scenario_type"] / "meta" / f"{bare['name']}.txt").unlink()
     shutil.rmtree(own_release / ".deepaccident")
     dataset = DeepAccident("v1", own_release, verbose=False)
@@ -185,18 +177,13 @@ def test_of_a_release(own_release: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         accident = real(dataset, scenario)
         if accident is None or accident.scenario != far:
             return accident
-        paths = accident.paths.copy()
-        paths[1, :, :2] += 500.0
-        return replace(accident, paths=paths)
+        return replace(accident, paths=np.add(accident.paths, [[[0.0, 0, 0]], [[500.0, 500, 0]]]))
 
     monkeypatch.setattr(module, "accident_of", moved_apart)
     report = avoidability_report(dataset, workers=1)
-    assert [each.scenario for each in report.skipped] == [bare["token"]]
-    assert [each.scenario for each in report.dropped] == [far]
-    assert report.margins[far] > 400
-    assert [each.accident.scenario for each in report.accidents] == [each["token"] for each in scenarios[2:]]
-    assert set(report.margins) == {far, *(each["token"] for each in scenarios[2:])}
-    one = avoidability_report(dataset, [scenarios[2]], workers=1)
-    assert [each.accident.scenario for each in one.accidents] == [scenarios[2]["token"]]
-    with pytest.raises(TokenError, match="nowhere"):
-        avoidability_report(dataset, ["nowhere"])
+    assert [[each.scenario for each in each_] for each_ in (report.skipped, report.dropped)] == [[bare["token"]], [far]]
+    assert [each.accident.scenario for each in report.accidents] == rest
+    assert (set(report.margins), report.margins[far] > 400) == ({far, *rest}, True)
+    one = avoidability_report(dataset, rest[:1], workers=1)
+    assert [each.accident.scenario for each in one.accidents] == rest[:1]
+    assert_refused((lambda: avoidability_report(dataset, ["nowhere"]), TokenError, ("nowhere",)))

@@ -1,14 +1,24 @@
 """The picture of prevented accidents: its lines are the curves, its points the predictors."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from drawing import new_axes, words
 from numpy.testing import assert_allclose, assert_array_equal
+from wording import lacking
 
 from deepaccident_devkit.evaluation.warning import PreventedResult, PreventionCurve, PreventionFigures
 from deepaccident_devkit.render.evaluation import render_prevention
 from deepaccident_devkit.safety import OUTCOMES
 from deepaccident_devkit.safety.prevention_result import NOMINAL, SETTINGS, OutcomeFigures
+
+
+def result_of(**changes: Any) -> PreventedResult:
+    told = {"operating_by": "given", "alarms": "right", "groups": {}, "references": {}, "curves": {}}
+    return PreventedResult(**{**told, "dropped": (), "skipped": (), **changes})
+
 
 GROUP = "bystander"
 
@@ -34,29 +44,21 @@ def prevented() -> PreventedResult:
     cost = np.array([[0.0], [0.5], [20.0]]) + np.zeros(len(SETTINGS))
     threshold = np.array([np.inf, 0.9, 0.5])
     curve = PreventionCurve(threshold=threshold, braking_seconds_per_minute=cost, avoided=share, mitigated=share / 5)
-    return PreventedResult(
-        operating_by="given",
-        alarms="right",
-        groups={GROUP: figures(0.25, 0.5)},
-        references={"always": {GROUP: figures(1.0, 45.0)}, "never": {GROUP: figures(0.0, float("nan"))}},
-        curves={GROUP: curve},
-        dropped=(),
-        skipped=(),
-    )
+    references = {"always": {GROUP: figures(1.0, 45.0)}, "never": {GROUP: figures(0.0, float("nan"))}}
+    return result_of(groups={GROUP: figures(0.25, 0.5)}, references=references, curves={GROUP: curve})
 
 
 def test_lines_are_the_curves_and_points_the_predictors() -> None:
     result = prevented()
     ax = render_prevention(result, ax=new_axes())
-    curve, nominal = result.curves[GROUP], SETTINGS.index(NOMINAL)
+    avoided, nominal = result.curves[GROUP].avoided, SETTINGS.index(NOMINAL)
     lines = {line.get_label(): line for line in ax.lines}
-    assert_array_equal(lines[f"at {NOMINAL}"].get_ydata(), curve.avoided[:, nominal])
-    assert_array_equal(lines[f"at {NOMINAL}"].get_xdata(), [0, 0.5, 20])
-    assert_allclose(lines["or milder"].get_ydata(), 1.2 * curve.avoided[:, nominal])
+    at = lines[f"at {NOMINAL}"]
+    assert_array_equal(at.get_xydata(), np.column_stack([[0, 0.5, 20], avoided[:, nominal]]))
+    assert_allclose(lines["or milder"].get_ydata(), 1.2 * avoided[:, nominal])
     drawn = [np.asarray(line.get_ydata()).tolist() for line in ax.lines]
-    for setting in range(len(SETTINGS)):
-        assert curve.avoided[:, setting].tolist() in drawn
-    points = [(line.get_xdata()[0], line.get_ydata()[0]) for line in ax.lines if line.get_marker() == "o"]
+    assert not lacking(drawn, *avoided.T.tolist())
+    points = [tuple(line.get_xydata()[0]) for line in ax.lines if line.get_marker() == "o"]
     assert points == [(0.5, 0.25), (45.0, 1.0)]
     assert GROUP in words(ax)
 
@@ -64,24 +66,7 @@ def test_lines_are_the_curves_and_points_the_predictors() -> None:
 @pytest.mark.parametrize("group", [None, GROUP])
 def test_nothing_to_show_is_said(group: str | None) -> None:
     result = prevented()
-    empty = PreventedResult(
-        operating_by="given", alarms="right", groups={}, references={}, curves={}, dropped=(), skipped=()
-    )
-    assert "needs accidents and recordings without one" in words(render_prevention(empty, group, ax=new_axes()))
     curve = result.curves[GROUP]
-    unknown = PreventionCurve(
-        threshold=curve.threshold,
-        braking_seconds_per_minute=curve.braking_seconds_per_minute * np.nan,
-        avoided=curve.avoided,
-        mitigated=curve.mitigated,
-    )
-    result = PreventedResult(
-        operating_by="given",
-        alarms="right",
-        groups=result.groups,
-        references={},
-        curves={GROUP: unknown},
-        dropped=(),
-        skipped=(),
-    )
-    assert "needs accidents" in words(render_prevention(result, group, ax=new_axes()))
+    unknown = replace(curve, braking_seconds_per_minute=curve.braking_seconds_per_minute * np.nan)
+    for each in (result_of(), result_of(groups=result.groups, curves={GROUP: unknown})):
+        assert "needs accidents and recordings without one" in words(render_prevention(each, group, ax=new_axes()))

@@ -4,7 +4,7 @@ import csv
 import importlib
 import json
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -32,8 +32,8 @@ def report(da_motion: DeepAccident) -> SafetyReport:
 
 
 def test_its_parts_are_those_of_the_functions(da_motion: DeepAccident, report: SafetyReport) -> None:
-    assert report.avoidability.to_dict() == avoidability_report(da_motion, workers=1).to_dict()
-    assert report.ledger.to_dict() == lead_time_ledger(da_motion, workers=1).to_dict()
+    for part, function in ((report.avoidability, avoidability_report), (report.ledger, lead_time_ledger)):
+        assert part.to_dict() == function(da_motion, workers=1).to_dict()
     assert report.twins.to_dict() == twin_report(da_motion, workers=1).to_dict()
     assert [row.story for row in report.rows] + list(report.normal) == list(stories(da_motion, workers=1))
     assert (report.scenarios, len(report.rows), report.left_out) == (2, 1, [])
@@ -42,50 +42,39 @@ def test_its_parts_are_those_of_the_functions(da_motion: DeepAccident, report: S
 def test_a_row_has_the_numbers_of_its_accident(da_motion: DeepAccident, report: SafetyReport) -> None:
     (row,) = report.rows
     (replayed,), (times,), (twin,) = report.avoidability.accidents, report.ledger.accidents, report.twins.diffs
-    story = describe(da_motion, row.scenario).facts["accident"]
-    told = row.to_dict()
-    assert row.brakes == ["ego_vehicle"]
+    story, told = describe(da_motion, row.scenario).facts["accident"], row.to_dict()
     slack = replayed.slack[replayed.accident.agents.index("ego_vehicle")]
-    np.testing.assert_allclose(list(row.last_moments.values()), slack, atol=0.005)
-    assert list(row.last_moments) == [4.0, 6.0, 8.0]
-    assert told["last_moments"]["6"] == story["braking"]["slack"]
-    assert row.leads["all"] == pytest.approx(times.together)
-    assert row.leads["ego_vehicle"] == pytest.approx(times.alone)
-    assert {agent: lead for agent, lead in row.leads.items() if agent != "all"} == story["seen"]
-    assert row.parts == pytest.approx(twin.to_dict()["time_to_impact"])
-    assert row.severity == max(each["delta_v"] for each in story["pair"])
+    assert (row.brakes, told["last_moments"]["6"]) == (["ego_vehicle"], story["braking"]["slack"])
+    assert row.last_moments == pytest.approx(dict(zip((4.0, 6.0, 8.0), slack, strict=True)), abs=0.005)
+    known = {**story["seen"], "ego_vehicle": times.alone, "all": times.together}
+    assert row.leads == pytest.approx(known, abs=1e-6)
+    assert (row.parts, row.severity) == (
+        pytest.approx(twin.to_dict()["time_to_impact"]),
+        max(each["delta_v"] for each in story["pair"]),
+    )
     pairs = interactions(da_motion, row.scenario).pairs
     at = pairs.position(*times.actor_ids)
-    assert told["time_exposed"] == pytest.approx(pairs.tet[at, 0], abs=0.005)
-    assert (np.inf if told["pet"] is None else told["pet"]) == pytest.approx(abs(pairs.pet[at]), abs=0.005)
+    measures = told["time_exposed"], np.inf if told["pet"] is None else told["pet"]
+    assert measures == pytest.approx((pairs.tet[at, 0], abs(pairs.pet[at])), abs=0.005)
 
 
 def test_each_accident_is_replayed_once(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
-    replayed = []
-    once = report_module.looked_into
-
-    def counted(dataset: DeepAccident, scenario: Any) -> Any:
-        replayed.append(scenario["token"])
-        return once(dataset, scenario)
-
-    def never(*_: object, **__: object) -> None:
-        pytest.fail("the story replays the accident itself")
-
-    monkeypatch.setattr(report_module, "looked_into", counted)
+    looked = Mock(side_effect=report_module.looked_into)
+    never = Mock(side_effect=AssertionError("the story replays the accident itself"))
+    monkeypatch.setattr(report_module, "looked_into", looked)
     monkeypatch.setattr(importlib.import_module("deepaccident_devkit.safety.stories"), "avoidability", never)
     (row,) = safety_report(da_motion, da_motion.find(collision=True), workers=1).rows
-    assert replayed == [row.scenario]
+    assert [call.args[1]["token"] for call in looked.call_args_list] == [row.scenario]
     assert row.story.facts["accident"]["braking"] is not None
 
 
 def test_an_accident_that_cannot_be_replayed_keeps_its_row(
     da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def apart(_: object, scenario: Any) -> Dropped:
-        return Dropped(Skipped(scenario=scenario["token"], reason="2.00 m apart"), 2.0)
-
-    monkeypatch.setattr(report_module, "looked_into", apart)
-    report = safety_report(da_motion, da_motion.find(collision=True), workers=1)
+    (accident,) = da_motion.find(collision=True)
+    dropped = Dropped(Skipped(scenario=accident["token"], reason="2.00 m apart"), 2.0)
+    monkeypatch.setattr(report_module, "looked_into", lambda *_: dropped)
+    report = safety_report(da_motion, [accident], workers=1)
     (row,) = report.rows
     assert (row.replayed, row.last_moments, row.brakes, row.severity) == (None, {}, [], -1.0)
     assert row.leads["all"] is not None
@@ -99,13 +88,14 @@ def test_what_is_left_out_is_named(own_release: Path) -> None:
     report = safety_report(damaged.dataset, workers=1)
     shown = [row.scenario for row in report.rows] + [each.facts["scenario"] for each in report.normal]
     assert sorted(shown) == sorted(damaged.whole)
-    parts = {scenario: part for scenario, part, _ in report.left_out}
-    assert parts[damaged.without_meta] == "braking: skipped, lead times"
-    assert parts[damaged.without_labels].startswith("braking: skipped, lead times")
-    assert parts[damaged.broken] == "everything"
-    reasons = {(scenario, part): reason for scenario, part, reason in report.left_out}
-    assert "no meta file" in reasons[damaged.without_meta, parts[damaged.without_meta]]
-    assert "on_error='skip'" in reasons[damaged.broken, "everything"]
+    told = {scenario: (part, reason) for scenario, part, reason in report.left_out}
+    for scenario, part, reason in (
+        (damaged.without_meta, "braking: skipped, lead times", "no meta file"),
+        (damaged.without_labels, "braking: skipped, lead times", "no labels"),
+        (damaged.broken, "everything", "on_error='skip'"),
+    ):
+        assert told[scenario][0].startswith(part)
+        assert reason in told[scenario][1]
 
 
 def test_normal_scenarios_come_by_their_least_time_to_collision(da_b: DeepAccident) -> None:
@@ -118,16 +108,21 @@ def test_normal_scenarios_come_by_their_least_time_to_collision(da_b: DeepAccide
 def test_tables(report: SafetyReport, tmp_path: Path) -> None:
     accidents, left_out = report.to_csv(tmp_path)
     heading, line = csv.reader(accidents.read_text(encoding="utf-8").splitlines())
-    cells = dict(zip(heading, line, strict=True))
-    (row,) = report.rows
-    assert len(set(heading)) == len(heading)
-    assert cells["scenario"] == row.scenario
-    assert float(cells["closing_speed"]) == row.story.facts["accident"]["closing_speed"]
-    assert float(cells["lead_infrastructure"]) == row.leads["infrastructure"]
-    assert float(cells["last_moment_8"]) == row.last_moments[8.0]
-    assert float(cells["second_delta_v"]) == row.colliders[1]["delta_v"]
-    assert float(cells["twin_parts"]) == row.parts
-    assert cells["pet"] == ("" if row.measures.pet is None else str(row.measures.pet))
-    assert cells["story"] == row.story.text
+    cells, (row,) = dict(zip(heading, line, strict=True)), report.rows
+    expected = {
+        "scenario": row.scenario,
+        "story": row.story.text,
+        "pet": "" if row.measures.pet is None else str(row.measures.pet),
+    }
+    numbers = {
+        "closing_speed": row.story.facts["accident"]["closing_speed"],
+        "lead_infrastructure": row.leads["infrastructure"],
+        "last_moment_8": row.last_moments[8.0],
+        "second_delta_v": row.colliders[1]["delta_v"],
+        "twin_parts": row.parts,
+    }
+    assert len(cells) == len(heading)
+    assert {name: cells[name] for name in expected} == expected
+    assert {name: float(cells[name]) for name in numbers} == numbers
     assert left_out.read_text() == "scenario,part,reason\n"
     assert json.loads(report.to_json())["accidents"][0] == json.loads(json.dumps(row.to_dict()))

@@ -1,7 +1,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -44,13 +43,12 @@ def test_agents_are_matched_by_name_wherever_they_are() -> None:
 
 
 def test_ids_count_if_the_agents_have_equal_ones() -> None:
-    agents = {"ego_vehicle": 1, "other_vehicle": 2}
+    agents, away = {"ego_vehicle": 1, "other_vehicle": 2}, [(0, 0), (0, 9), (70, 70), (0, 30)]
     first = recording([(0, 0), (0, 9), (0, 20), (0, 30)], ids=[1, 2, 5, 6], agents=agents, categories=[0, 0, 0, 5])
-    second = recording([(0, 0), (0, 9), (70, 70), (0, 30)], ids=[1, 2, 5, 6], agents=agents, categories=[0, 0, 0, 4])
+    second = recording(away, ids=[1, 2, 5, 6], agents=agents, categories=[0, 0, 0, 4])
     assert matched_rows(first, second) == {0: (0, "agent"), 1: (1, "agent"), 2: (2, "id")}
-    one = recording([(0, 0), (0, 9), (70, 70), (0, 30)], ids=[1, 2, 5, 6], agents={"ego_vehicle": 1})
-    assert matched_rows(first, one)[1] == (1, "start")
-    assert 2 not in matched_rows(first, one)
+    of_one = matched_rows(first, recording(away, ids=[1, 2, 5, 6], agents={"ego_vehicle": 1}))
+    assert (of_one[1], 2 in of_one) == ((1, "start"), False)
 
 
 def test_starts_are_matched_with_the_least_distance_in_all() -> None:
@@ -64,10 +62,8 @@ def test_starts_are_compared_at_the_first_frame_that_shows_both() -> None:
     poses = second.poses.copy()
     poses[:, :12] = np.nan
     poses[:, 12:, 0] = first.poses[::-1, 12:, 0]
-    late = replace(second, poses=poses)
-    assert matched_rows(first, late) == {0: (1, "start"), 1: (0, "start")}
-    never = replace(recording([(0, 0)]), poses=np.full((1, 4, 3), np.nan))
-    assert matched_rows(first, never) == {}
+    assert matched_rows(first, replace(second, poses=poses)) == {0: (1, "start"), 1: (0, "start")}
+    assert matched_rows(first, replace(recording([(0, 0)]), poses=np.full((1, 4, 3), np.nan))) == {}
 
 
 @given(st.integers(-20, 20))
@@ -85,8 +81,7 @@ def test_the_shift_is_found_though_two_agents_go_their_own_ways(shift: int) -> N
 
 def test_without_moving_agents_there_is_no_shift() -> None:
     first = replace(recording([(0, 0)], agents={"ego_vehicle": 0}), poses=np.zeros((1, FRAMES, 3)))
-    assert shift_of(first, first) == 0
-    assert shift_of(recording([(0, 0)]), recording([(5, 0)])) == 0
+    assert shift_of(first, first) == shift_of(recording([(0, 0)]), recording([(5, 0)])) == 0
     assert shifted(first, 0) is first
 
 
@@ -94,9 +89,9 @@ def test_a_shifted_recording_keeps_its_values() -> None:
     plain = recording([(0, 0)])
     later, sooner = shifted(plain, 3), shifted(plain, -2)
     np.testing.assert_array_equal(later.poses, plain.poses[:, 3:])
-    np.testing.assert_array_equal(sooner.speeds[:, 2:], plain.speeds)
-    assert np.isnan(sooner.poses[:, :2]).all()
-    assert np.isnan(sooner.speeds[:, :2]).all()
+    for name in ("poses", "speeds"):
+        np.testing.assert_array_equal(getattr(sooner, name)[:, 2:], getattr(plain, name))
+        assert np.isnan(getattr(sooner, name)[:, :2]).all()
 
 
 def test_a_recording_has_the_tracks_values(da_motion: DeepAccident) -> None:
@@ -104,12 +99,9 @@ def test_a_recording_has_the_tracks_values(da_motion: DeepAccident) -> None:
     found, tracks = recording_of(da_motion, scenario["token"]), scenario_tracks(da_motion, scenario["token"])
     assert found.poses.shape == (len(found.actor_id), scenario["num_frames"], 3)
     assert np.count_nonzero(~np.isnan(found.poses[..., 0])) == len(tracks.index)
-    for number in (0, 100, len(tracks.index) - 1):
-        row = found.actor_id.tolist().index(tracks.actor_id[number])
-        frame = tracks.index[number] - 1
-        x, y, yaw = found.poses[row, frame]
-        assert (x, y, yaw) == pytest.approx((*tracks.boxes.center[number, :2], tracks.boxes.yaw[number]))
-        assert found.speeds[row, frame] == pytest.approx(np.linalg.norm(tracks.boxes.velocity[number, :2]))
-        assert found.category[row] == tracks.boxes.category[number]
-    assert found.agents["ego_vehicle"] == da_motion.get("agent", f"{scenario['token']}/ego_vehicle")["actor_id"]
-    assert "infrastructure" not in found.agents
+    rows, frames, boxes = np.searchsorted(found.actor_id, tracks.actor_id), tracks.index - 1, tracks.boxes
+    np.testing.assert_allclose(found.poses[rows, frames], np.column_stack([boxes.center[:, :2], boxes.yaw]))
+    np.testing.assert_allclose(found.speeds[rows, frames], np.linalg.norm(boxes.velocity[:, :2], axis=1))
+    np.testing.assert_array_equal(found.category[rows], boxes.category)
+    own = da_motion.get("agent", f"{scenario['token']}/ego_vehicle")["actor_id"]
+    assert (found.agents["ego_vehicle"], "infrastructure" in found.agents) == (own, False)

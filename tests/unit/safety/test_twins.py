@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -28,23 +28,19 @@ from deepaccident_devkit.safety import (
 def test_twins_have_the_same_name_and_subtype(da_b: DeepAccident) -> None:
     for scenario in da_b.scenario:
         twin = twin_of(da_b, scenario)
-        assert twin is not None
-        assert twin["name"] == scenario["name"]
-        assert twin["signalized"] == scenario["signalized"]
-        assert twin["designed_accident"] != scenario["designed_accident"]
+        assert [twin[name] == scenario[name] for name in ("name", "signalized", "designed_accident")] == [1, 1, 0]
         assert twin_of(da_b, twin["token"]) == scenario
 
 
 def test_a_scenario_may_have_no_twin(own_release: Path) -> None:
     for folder in own_release.glob("*/type1_subtype1_normal"):
         shutil.rmtree(folder)
-    da = DeepAccident("v1", own_release, verbose=False)
+    da = reopened(own_release)
     alone = da.find(signalized=True)
-    assert alone
-    assert all(twin_of(da, scenario) is None for scenario in alone)
+    assert {twin_of(da, scenario) is None for scenario in alone} == {True}
 
 
-def test_torn_twins_are_those_of_two_splits() -> None:
+def test_torn_twins_are_those_of_two_splits(da_b: DeepAccident) -> None:
     splits = {
         "type1_subtype1_accident/Town01_a": "train",
         "type1_subtype1_normal/Town01_a": "val",
@@ -53,24 +49,15 @@ def test_torn_twins_are_those_of_two_splits() -> None:
         "type1_subtype2_accident/Town01_b": "train",
         "type1_subtype2_normal/Town01_b": None,
         "type1_subtype1_accident/Town01_c": "val",
+        "type1_subtype1_normal/a": "train",
+        "type2_subtype1_accident/a": "val",
+        "type2_subtype1_odd/a": "val",
     }
-    torn = TornTwins(
-        scenarios=("type1_subtype1_accident/Town01_a", "type1_subtype1_normal/Town01_a"), splits=("train", "val")
-    )
-    assert torn_twins(splits) == (torn,)
-    assert torn_twins({}) == ()
-
-
-def test_the_synthetic_splits_keep_twins_together(da_b: DeepAccident) -> None:
-    assert torn_twins({record["token"]: record["split"] for record in da_b.scenario}) == ()
+    scenarios = ("type1_subtype1_accident/Town01_a", "type1_subtype1_normal/Town01_a")
+    assert torn_twins(splits) == (TornTwins(scenarios=scenarios, splits=("train", "val")),)
+    assert torn_twins({}) == torn_twins({record["token"]: record["split"] for record in da_b.scenario}) == ()
     apart = {record["token"]: str(record["designed_accident"]) for record in da_b.scenario}
     assert len(torn_twins(apart)) == len(da_b.scenario) // 2
-
-
-@pytest.mark.parametrize("kind", ["accident", "odd"])
-def test_other_types_are_no_twins(kind: str) -> None:
-    torn = torn_twins({"type1_subtype1_normal/a": "train", f"type2_subtype1_{kind}/a": "val"})
-    assert torn == ()
 
 
 TOKENS = {"accident": "type1_subtype1_accident/a", "twin": "type1_subtype1_normal/a"}
@@ -102,56 +89,54 @@ def made_diff(**changes: object) -> TwinDiff:
     return TwinDiff(**{**values, **changes})  # type: ignore[arg-type]
 
 
+def reopened(root: Path) -> DeepAccident:
+    shutil.rmtree(root / ".deepaccident", ignore_errors=True)
+    return DeepAccident("v1", root, verbose=False)
+
+
 def test_when_who_and_how_far() -> None:
     diff = made_diff()
     assert diff.distances[0].tolist()[:5] == [0, 0, 0, 0.5, 1.25]
-    assert diff.parting_frames.tolist() == [5, 0, 0]
-    assert diff.parting_frame == 5
-    assert replace(diff, parting=Parting(distance=0.49)).parting_frame == 4
-    assert replace(diff, parting=Parting(distance=0.5)).parting_frame == 5
-    assert replace(diff, parting=Parting(distance=9.0)).parting_frame is None
+    assert (diff.parting_frames.tolist(), diff.parting_frame) == ([5, 0, 0], 5)
+    limits = {limit: replace(diff, parting=Parting(distance=limit)).parting_frame for limit in (0.49, 0.5, 9.0)}
+    assert limits == {0.49: 4, 0.5: 5, 9.0: None}
     assert diff.in_both.tolist() == [True, True, False]
     told = diff.to_dict()
     assert (told["parting_time"], told["time_to_impact"]) == (0.4, 0.0)
-    ego, van, walker = told["actors"]
-    assert (ego["actor_id"], ego["twin_id"], ego["agent"], ego["parting_frame"]) == (5, 15, "ego_vehicle", 5)
-    assert (ego["position_at_parting"], ego["twin_position_at_parting"]) == ([4, 0], [2.75, 0])
-    assert (ego["largest_distance"], ego["largest_speed_difference"]) == (1.25, -2)
-    assert (van["parting_frame"], van["largest_distance"]) == (None, 0)
-    assert (walker["twin_id"], walker["largest_distance"], walker["collides"]) == (None, None, False)
+    expected: tuple[dict[str, object], ...] = (
+        {"actor_id": 5, "twin_id": 15, "agent": "ego_vehicle", "parting_frame": 5, "largest_distance": 1.25}
+        | {"position_at_parting": [4, 0], "twin_position_at_parting": [2.75, 0], "largest_speed_difference": -2},
+        {"parting_frame": None, "largest_distance": 0},
+        {"twin_id": None, "largest_distance": None, "collides": False},
+    )
+    for actor, values in zip(told["actors"], expected, strict=True):
+        assert {name: actor[name] for name in values} == values
 
 
 def test_twins_that_do_not_begin_together_are_told() -> None:
     diff = made_diff()
-    assert diff.begins_together
     poses = diff.poses.copy()
     poses[1, 0, :, 0] += 0.8
     apart = replace(diff, poses=poses)
-    assert not apart.begins_together
+    assert (diff.begins_together, apart.begins_together, apart.to_dict()["begins_together"]) == (True, False, False)
     report = TwinReport(dataroot="", version="v1", diffs=(diff, apart), skipped=(), torn=())
     assert "1 of them: the recordings do not begin together" in report.to_text()
-    assert apart.to_dict()["begins_together"] is False
     poses[1, 0] = np.nan
     assert replace(diff, poses=poses).begins_together, "no agent is there to tell"
 
 
-def test_turns_count_the_shorter_way() -> None:
+def test_turns_count_the_shorter_way_and_keep_their_sign() -> None:
     poses = made_diff().poses.copy()
     poses[1, 1, 2:, 2] = -math.pi + 0.08
+    poses[1, 0, 1:3, 2] = [0.05, -0.09]
     diff = made_diff(poses=poses)
-    assert diff.heading_differences[1, 3] == pytest.approx(0.08)
-    assert diff.parting_frames[1] == 0
-    assert replace(diff, parting=Parting(heading=0.07)).parting_frames[1] == 3
+    assert (diff.heading_differences[1, 3], diff.parting_frames[1]) == (pytest.approx(0.08), 0)
+    assert diff.to_dict()["actors"][0]["largest_heading_difference"] == pytest.approx(-0.09)
     assert diff.order.tolist() == [0, 1, 2]
-    assert replace(diff, parting=Parting(distance=5.0, heading=0.07)).order.tolist() == [1, 0, 2]
-
-
-def test_the_largest_difference_keeps_its_sign() -> None:
-    poses = made_diff().poses.copy()
-    poses[1, 0, 1:3, 2] = [0.05, -0.2]
-    ego = made_diff(poses=poses).to_dict()["actors"][0]
-    assert ego["largest_heading_difference"] == pytest.approx(-0.2)
-    assert ego["parting_frame"] == 3
+    turned = replace(diff, parting=Parting(distance=5.0, heading=0.085))
+    assert (turned.parting_frames.tolist(), turned.order.tolist()) == ([3, 0, 0], [0, 1, 2])
+    both = replace(diff, parting=Parting(distance=5.0, heading=0.07))
+    assert both.parting_frames.tolist() == [3, 3, 0]
 
 
 def test_the_pairs_least_gap_in_the_twin() -> None:
@@ -175,45 +160,35 @@ def test_an_accident_and_its_twin(da_motion: DeepAccident) -> None:
     accident, normal = (da_motion.find(collision=ends)[0] for ends in (True, False))
     diff = twin_diff(da_motion, accident)
     assert (diff.accident, diff.twin) == (accident["token"], normal["token"])
-    again = twin_diff(da_motion, normal["token"])
-    assert again.to_dict() == diff.to_dict()
+    assert twin_diff(da_motion, normal["token"]).to_dict() == diff.to_dict()
     assert diff.num_frames == (accident["num_frames"], normal["num_frames"])
-    pair = [int(diff.actor_ids[row, 0]) for row in diff.pair]
-    assert pair == accident["collision"]["ids"]
-    assert [diff.agents[row] for row in diff.pair] == accident["collision"]["agents"]
+    pair = [(int(diff.actor_ids[row, 0]), diff.agents[row]) for row in diff.pair]
+    assert pair == [*zip(accident["collision"]["ids"], accident["collision"]["agents"], strict=True)]
     gap = diff.gaps[0, accident["num_frames"] - 1]
     assert gap == pytest.approx(da_motion.collision(accident).gap, abs=1e-6)
-    assert diff.nearest_in_twin is not None
     assert diff.nearest_in_twin.gap > gap
     for row in np.flatnonzero(diff.parting_frames).tolist():
-        frame = diff.parting_frames[row]
-        places = [
-            da_motion.trajectory(f"{token}/actor/{actor}")
-            for token, actor in zip((diff.accident, diff.twin), diff.actor_ids[row].tolist(), strict=True)
-        ]
-        own = [
-            each.center[each.index == number][0, :2]
-            for each, number in zip(places, (frame, frame + diff.shift), strict=True)
-        ]
+        frame, own = diff.parting_frames[row], []
+        for token, actor, number in zip(
+            (diff.accident, diff.twin), diff.actor_ids[row].tolist(), (frame, frame + diff.shift), strict=True
+        ):
+            path = da_motion.trajectory(f"{token}/actor/{actor}")
+            own.append(path.center[path.index == number][0, :2])
         np.testing.assert_allclose(own, diff.poses[:, row, frame - 1, :2])
     assert json.loads(json.dumps(diff.to_dict(), allow_nan=False)) == diff.to_dict()
 
 
 def test_what_is_missing_is_said_and_counted(own_release: Path) -> None:
-    da = DeepAccident("v1", own_release, verbose=False)
-    first, second, third = da.find(collision=True)
-    twin = own_release / first["folder"] / first["scenario_type"].replace("accident", "normal")
-    for kind in ("*/label", "*/calib"):
-        for folder in twin.glob(f"{kind}/{first['name']}"):
+    """A twin without labels and calib is none; one without labels alone has nothing to compare."""
+    first, second, third = reopened(own_release).find(collision=True)
+    for scenario, kinds in ((first, ("label", "calib")), (second, ("label",))):
+        twin = own_release / scenario["folder"] / scenario["scenario_type"].replace("accident", "normal")
+        for folder in (each for kind in kinds for each in twin.glob(f"*/{kind}/{scenario['name']}")):
             shutil.rmtree(folder)
-    twin = own_release / second["folder"] / second["scenario_type"].replace("accident", "normal")
-    for folder in twin.glob("*/label"):
-        shutil.rmtree(folder / second["name"])
-    shutil.rmtree(own_release / ".deepaccident")
-    da = DeepAccident("v1", own_release, verbose=False)
+    da = reopened(own_release)
     assert_refused(
-        (lambda: twin_diff(da, first["token"]), NotAvailableError, "this release has no twin of it"),
-        (lambda: twin_diff(da, second["token"]), NotAvailableError, "has no labels"),
+        (lambda: twin_diff(da, first["token"]), NotAvailableError, ("no twin of it",)),
+        (lambda: twin_diff(da, second["token"]), NotAvailableError, ("has no labels",)),
     )
     report = twin_report(da)
     assert [each.accident for each in report.diffs] == [third["token"]]
@@ -222,39 +197,34 @@ def test_what_is_missing_is_said_and_counted(own_release: Path) -> None:
 
 
 def test_two_normal_scenarios_are_nothing_to_compare(own_release: Path) -> None:
-    da = DeepAccident("v1", own_release, verbose=False)
-    accident = da.find(collision=True)[0]
+    accident = reopened(own_release).find(collision=True)[0]
     meta = own_release / accident["folder"] / accident["scenario_type"] / "meta" / f"{accident['name']}.txt"
-    normal = Path(str(meta).replace("_accident", "_normal"))
-    meta.write_bytes(normal.read_bytes())
-    shutil.rmtree(own_release / ".deepaccident")
-    da = DeepAccident("v1", own_release, verbose=False)
-    with pytest.raises(NotAvailableError, match="neither it nor its twin ends in an accident"):
-        twin_diff(da, accident["token"])
+    meta.write_bytes(Path(str(meta).replace("_accident", "_normal")).read_bytes())
+    da = reopened(own_release)
+    assert_refused((lambda: twin_diff(da, accident["token"]), NotAvailableError, ("nor its twin", "an accident")))
 
 
 def test_the_command(da_motion: DeepAccident, tmp_path: Path) -> None:
     root, normal = str(da_motion.dataroot), da_motion.find(collision=False)[0]["token"]
-    all_of_them = CliRunner().invoke(deepaccident, ["safety", "twins", root], catch_exceptions=False)
-    assert all_of_them.exit_code == 0
-    chosen = ["--where", "collision=true", "--out", str(tmp_path)]
-    CliRunner().invoke(deepaccident, ["safety", "twins", root, *chosen], catch_exceptions=False)
+
+    def run(*words: str) -> Result:
+        return CliRunner().invoke(deepaccident, ["safety", "twins", root, *words])
+
+    results = run(), run("--where", "collision=true", "--out", str(tmp_path)), run(normal)
+    assert [each.exit_code for each in results] == [0, 0, 2]
+    assert "SCENARIO changes nothing with twins" in results[2].output
     names = {"twins.csv", "twin_actors.csv", "torn_twins.csv", "skipped.csv", "twins.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
-    told = json.loads((tmp_path / "twins.json").read_text(encoding="utf-8"))
     diff = twin_diff(da_motion, normal)
-    assert told["twins"] == [diff.to_dict()]
-    with (tmp_path / "twin_actors.csv").open(encoding="utf-8") as file:
-        assert len(list(csv.DictReader(file))) == len(diff.categories)
-    wrong = CliRunner().invoke(deepaccident, ["safety", "twins", root, normal])
-    assert (wrong.exit_code, "SCENARIO changes nothing with twins" in wrong.output) == (2, True)
+    assert json.loads((tmp_path / "twins.json").read_text(encoding="utf-8"))["twins"] == [diff.to_dict()]
+    rows = csv.DictReader((tmp_path / "twin_actors.csv").read_text(encoding="utf-8").splitlines())
+    assert len(list(rows)) == len(diff.categories)
 
 
 def test_a_report_of_several_lists_torn_twins(da_b: DeepAccident) -> None:
     report = twin_report(da_b)
     assert [each.accident for each in report.diffs] == [each["token"] for each in da_b.find(collision=True)]
-    assert report.torn == ()
-    assert "tears apart" not in report.to_text()
-    token = report.diffs[0].accident
-    line = next(each for each in report.to_text().splitlines() if each.startswith(token))
-    assert f"{report.diffs[0].nearest_in_twin.gap:.2f}" in line
+    assert (report.torn, "tears apart" in report.to_text()) == ((), False)
+    first = report.diffs[0]
+    line = next(each for each in report.to_text().splitlines() if each.startswith(first.accident))
+    assert f"{first.nearest_in_twin.gap:.2f}" in line

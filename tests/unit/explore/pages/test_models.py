@@ -6,9 +6,9 @@ import re
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, quote, urlencode, urljoin, urlsplit
@@ -16,17 +16,15 @@ from urllib.parse import parse_qs, quote, urlencode, urljoin, urlsplit
 import numpy as np
 import pytest
 from asgi import Answer, get
-from evaluation_runs import BREAKDOWNS, PARTIAL, stored_run
+from evaluation_runs import BREAKDOWNS, stored_run
+from wording import holding, lacking
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation import Resampling
+from deepaccident_devkit.evaluation import Accident, Resampling, ResultsWriter
 from deepaccident_devkit.evaluation.breakdowns import tokens_by_value
-from deepaccident_devkit.evaluation.predictions import Accident
-from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.explore import Explorer, make_app
-from deepaccident_devkit.explore.background import Jobs
 from deepaccident_devkit.explore.evaluations import verdict
 from deepaccident_devkit.explore.pages.samples import sample_path
 from deepaccident_devkit.render.outcomes.above import count_words
@@ -43,8 +41,8 @@ class Site:
     """The pages of an explorer, and the runs behind its bundles."""
 
     explorer: Explorer
-    runs: dict[str, EvaluationRun]
-    folder: Path
+    runs: dict[str, EvaluationRun] = field(default_factory=dict)
+    folder: Path = Path()
 
     def __post_init__(self) -> None:
         self.app = make_app(self.explorer)
@@ -64,23 +62,23 @@ class Site:
 
     def samples(self, address: str) -> list[str]:
         """The samples of all pages of a list, in order."""
-        found: list[str] = []
-        while True:
-            page = self.page(address)
-            found += [sample_of(urljoin(address, each)) for each in hrefs(page, "entry")]
-            after = hrefs(page, rel="next")
-            if not after:
-                return found
-            address = urljoin(address, after[0])
+        page = self.page(address)
+        found = [sample_of(urljoin(address, each)) for each in hrefs(page, "entry")]
+        return found + [token for each in hrefs(page, rel="next") for token in self.samples(urljoin(address, each))]
+
+    def rows(self, name: str) -> Any:
+        return self.explorer.models[name].rows
 
 
 def hrefs(page: str, kind: str = "", rel: str = "") -> list[str]:
     """Addresses of the links of a class or relation, or of all links in the content."""
-    content = page.partition('<main id="content">')[2]
-    tags = re.findall(r"<a [^>]*>", content)
-    wanted = [each for each in tags if f'class="{kind}"' in each or not kind]
-    wanted = [each for each in wanted if f'rel="{rel}"' in each or not rel]
+    tags = re.findall(r"<a [^>]*>", page.partition('<main id="content">')[2])
+    wanted = [each for each in tags if (f'class="{kind}"' in each or not kind) and (f'rel="{rel}"' in each or not rel)]
     return [html.unescape(re.findall(r'href="([^"]*)"', each)[0]) for each in wanted]
+
+
+def images(page: str) -> list[str]:
+    return [html.unescape(each) for each in re.findall(r'<img src="([^"]+)"', page)]
 
 
 def sample_of(address: str) -> str:
@@ -102,6 +100,20 @@ def written(path: Path, foreseen: Sequence[Accident], tokens: Sequence[str]) -> 
     return path
 
 
+def make_hostile(summary: dict[str, Any]) -> None:
+    method = {"method": "<script>alert(1)</script>"}
+    summary["results"] |= {"meta": method, "path": "<b onclick=x>", "fingerprint": "5e"}
+    summary["breakdowns"]["town"] = summary["breakdowns"]["agent"]
+    summary["breakdowns"]["town"]["groups"][0]["value"] = '"><svg onload=alert(1)>'
+
+
+def edit_summary(folder: Path, edit: Callable[[dict[str, Any]], object]) -> None:
+    path = folder / "metrics_summary.json"
+    summary = json.loads(path.read_text())
+    edit(summary)
+    path.write_text(json.dumps(summary))
+
+
 def bundle(da: DeepAccident, folder: Path, path: Path, setup: EvaluationSetup = BOXES, **how: Any) -> EvaluationRun:
     run = evaluate_results(da, path, setup, default_selection(setup, "train"), workers=1, allow_partial=True)
     run = run.broken_down(BREAKDOWNS, Resampling(resamples=20))
@@ -115,25 +127,15 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
     and of boxes; and results alone."""
     folder, da = tmp_path_factory.mktemp("models"), da_motion
     tokens = default_selection(BOXES, "train").tokens(da)
-    runs = {}
-    run, _ = stored_run(da, BOXES, folder / "first.json")
-    save_run(run, folder / "first", include_results=True)
-    runs["first"] = run
+    runs = {"first": stored_run(da, BOXES, folder / "first.json")[0]}
+    save_run(runs["first"], folder / "first", include_results=True)
     quiet = written(folder / "quiet.json", (), tokens)
     runs["second"] = bundle(da, folder / "second", quiet)
     runs["paper"] = bundle(da, folder / "paper", quiet, replace(BOXES, protocol="paper"))
     few = written(folder / "few.json", ELSEWHERE, tokens[::2])
     runs["part"] = bundle(da, folder / "part", few, include_results=True)
     shutil.copytree(folder / "second", folder / HOSTILE)
-    summary = json.loads((folder / HOSTILE / "metrics_summary.json").read_text())
-    summary["results"] |= {
-        "meta": {"method": "<script>alert(1)</script>"},
-        "path": "<b onclick=x>",
-        "fingerprint": "5e",
-    }
-    summary["breakdowns"]["town"] = summary["breakdowns"]["agent"]
-    summary["breakdowns"]["town"]["groups"][0]["value"] = '"><svg onload=alert(1)>'
-    (folder / HOSTILE / "metrics_summary.json").write_text(json.dumps(summary))
+    edit_summary(folder / HOSTILE, make_hostile)
     for task in ("motion", "detection", "warning"):
         setup = EvaluationSetup(task=task, protocol="clean" if task == "warning" else "released")
         runs[task], _ = stored_run(da, setup, folder / ("maps" if task == "motion" else f"{task}.json"))
@@ -146,6 +148,20 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
     explorer.jobs.end()
 
 
+@pytest.fixture
+def opened(da_motion: DeepAccident) -> Iterator[Callable[..., Site]]:
+    """Further explorers of bundles and results, which end with the test."""
+    sites: list[Site] = []
+
+    def other(dataset: DeepAccident = da_motion, **models: Any) -> Site:
+        sites.append(Site(Explorer(dataset, workers=1, **models)))
+        return sites[-1]
+
+    yield other
+    for each in sites:
+        each.explorer.jobs.end()
+
+
 def a_sample(site: Site, name: str = "first") -> str:
     return max(site.runs[name].evaluator.tokens)
 
@@ -156,15 +172,12 @@ def a_sample(site: Site, name: str = "first") -> str:
 @pytest.mark.parametrize("name", ["first", "second", "part", "motion", "detection"])
 @pytest.mark.parametrize("order", ["worst", "best"])
 def test_the_worst_samples_come_first(site: Site, name: str, order: str) -> None:
-    run = site.runs[name]
     shown = site.samples(of("model", name, "samples", order=order))
-    assert sorted(shown) == sorted(run.evaluator.tokens)
-    values = [main_number(run, token) for token in shown]
+    assert sorted(shown) == sorted(site.runs[name].evaluator.tokens)
+    values = [main_number(site.runs[name], token) for token in shown]
     known = [each for each in values if each is not None]
-    assert values[len(known) :] == [None] * (len(values) - len(known))  # nothing to count: last
-    assert all((one <= other) if order == "worst" else (one >= other) for one, other in pairwise(known))
-    if name in ("first", "motion"):
-        assert len(set(known)) > 1
+    assert values == sorted(known, reverse=order == "best") + [None] * (len(values) - len(known))
+    assert len(set(known)) > 1 or name not in ("first", "motion")
 
 
 def main_number(run: EvaluationRun, token: str) -> float | None:
@@ -182,25 +195,24 @@ def main_number(run: EvaluationRun, token: str) -> float | None:
 @pytest.mark.parametrize("name", ["first", "motion", "detection", "warning"])
 def test_each_bar_leads_to_the_samples_of_its_group(site: Site, name: str) -> None:
     run, address = site.runs[name], of("model", name)
-    page = site.page(address)
-    links = [each for each in hrefs(page) if each.startswith("samples?by=")]
-    found = {}
-    for link in links:
-        query = parse_qs(urlsplit(link).query)
-        found[query["by"][0], query["value"][0]] = site.samples(urljoin(address, link))
+    links = [each for each in hrefs(site.page(address)) if each.startswith("samples?by=")]
+    queries = [parse_qs(urlsplit(link).query) for link in links]
+    found = {
+        (query["by"][0], query["value"][0]): sorted(site.samples(urljoin(address, link)))
+        for query, link in zip(queries, links, strict=True)
+    }
     expected = {
         (broken.by, value or "unknown"): sorted(tokens)
         for broken in run.breakdowns
         if broken.by != "all"
         for value, tokens in tokens_by_value(run.attributes, broken.by).items()
     }
-    assert {group: sorted(tokens) for group, tokens in found.items()} == expected
+    assert found == expected
     assert len(expected) > 5
 
 
 def test_bars_are_as_long_as_their_numbers(site: Site) -> None:
-    page = site.page("/model/first/")
-    bars = re.findall(r'<rect class="value" width="([\d.]+)%"', page)
+    bars = re.findall(r'<rect class="value" width="([\d.]+)%"', site.page("/model/first/"))
     shown = [
         group.result.apa
         for broken in site.runs["first"].breakdowns
@@ -211,29 +223,23 @@ def test_bars_are_as_long_as_their_numbers(site: Site) -> None:
 
 
 def test_a_scenario_and_a_group_can_be_chosen_together(site: Site) -> None:
-    run = site.runs["detection"]
-    scenario = min(each.scenario for each in run.attributes.values())
+    tokens = site.runs["detection"].attributes
+    scenario = min(each.scenario for each in tokens.values())
     found = site.samples(of("model", "detection", "samples", by="agent", value="infrastructure", scenario=scenario))
-    assert sorted(found) == sorted(
-        token for token, each in run.attributes.items() if each.agent == "infrastructure" and each.scenario == scenario
-    )
-    assert not site.samples("/model/detection/samples?scenario=no/such")
-    assert not site.samples("/model/detection/samples?by=agent&value=nobody")
+    assert sorted(found) == sorted(each for each in tokens if each.startswith(f"{scenario}/infrastructure/"))
+    for nothing in ("scenario=no/such", "by=agent&value=nobody"):
+        assert not site.samples(f"/model/detection/samples?{nothing}")
 
 
-def test_warnings_are_listed_in_time(site: Site) -> None:
+def test_warnings_are_listed_in_time_sixty_a_page(site: Site) -> None:
     """Single samples of recordings have no numbers."""
-    assert site.samples("/model/warning/samples") == sorted(site.runs["warning"].evaluator.tokens)
-    assert "worst" not in site.page("/model/warning/samples")
-
-
-def test_a_list_has_sixty_samples_a_page(site: Site) -> None:
-    first = site.page("/model/warning/samples")
-    count = len(site.runs["warning"].evaluator.tokens)
-    assert len(hrefs(first, "entry")) == 60 < count
-    assert len(hrefs(site.page("/model/warning/samples?page=2"), "entry")) == count - 60
+    address, tokens = "/model/warning/samples", site.runs["warning"].evaluator.tokens
+    assert site.samples(address) == sorted(tokens)
+    assert "worst" not in site.page(address)
+    lengths = [len(hrefs(site.page(f"{address}?page={page}"), "entry")) for page in (1, 2)]
+    assert lengths == [60, len(tokens) - 60]
     for page in ("-1", "0", "x", "99999999999"):
-        assert hrefs(site.page(f"/model/warning/samples?page={page}"), "entry")
+        assert hrefs(site.page(f"{address}?page={page}"), "entry")
 
 
 # verdicts
@@ -241,23 +247,17 @@ def test_a_list_has_sixty_samples_a_page(site: Site) -> None:
 
 def test_accident_verdicts_are_those_of_the_evaluator(site: Site) -> None:
     seen = set()
-    for name in ("first", "second", "part"):
-        run, rows = site.runs[name], site.explorer.models[name].rows
-        for token in run.evaluator.tokens:
-            result = run.evaluator.compute([token])
-            words = count_words(result.within[15.0])
-            assert verdict("accident", rows[token]).split(",")[0] == words
-            whole = ", ".join(f"{distance:g} m: {count_words(each)}" for distance, each in result.within.items())
-            assert verdict("accident", rows[token], whole=True).startswith(whole)
-            seen.add(words)
-            if words == "TP":
-                assert f"places {result.within[15.0].position_error:.1f} m off" in verdict("accident", rows[token])
+    for name, token in ((each, token) for each in ("first", "second", "part") for token in site.rows(each)):
+        within, row = site.runs[name].evaluator.compute([token]).within, site.rows(name)[token]
+        words = count_words(within[15.0])
+        whole = ", ".join(f"{distance:g} m: {count_words(each)}" for distance, each in within.items())
+        assert verdict("accident", row).split(",")[0] == words
+        assert verdict("accident", row, whole=True).startswith(whole)
+        assert words != "TP" or f"places {within[15.0].position_error:.1f} m off" in verdict("accident", row)
+        seen.add(words)
     assert seen >= {"TP", "FN", "FP + FN"}
-    token = a_sample(site)
-    row = site.explorer.models["first"].rows[token]
-    assert verdict("accident", row, whole=True) in html.unescape(
-        site.page(of("model", "first", "sample", sample_path(token)))
-    )
+    page = site.page(of("model", "first", "sample", sample_path(a_sample(site))))
+    assert verdict("accident", site.rows("first")[a_sample(site)], whole=True) in html.unescape(page)
 
 
 def test_other_verdicts_are_those_of_the_evaluator(site: Site) -> None:
@@ -265,20 +265,18 @@ def test_other_verdicts_are_those_of_the_evaluator(site: Site) -> None:
         widest = site.runs["motion"].evaluator.compute([token]).ranges["100x100"]
         counts = f"{widest.true_positive} TP, {widest.false_positive} FP, {widest.false_negative} FN"
         expected = f"100x100 m: PQ {widest.pq:.1f} %, IoU {widest.iou:.1f} %, {counts}"
-        assert verdict("motion", site.explorer.models["motion"].rows[token]) == expected
-    counted = site.runs["detection"].evaluator.counts
-    for token, row in site.explorer.models["detection"].rows.items():
-        start = f"{sum(counted[token]['truths'])} true boxes, {len(counted[token]['detections'][0])} detections, "
-        assert verdict("detection", row).startswith(start)
-    assert "involvement " in verdict("warning", site.explorer.models["warning"].rows[a_sample(site, "warning")])
+        assert verdict("motion", site.rows("motion")[token]) == expected
+    for token, counted in site.runs["detection"].evaluator.counts.items():
+        start = f"{sum(counted['truths'])} true boxes, {len(counted['detections'][0])} detections, "
+        assert verdict("detection", site.rows("detection")[token]).startswith(start)
+    assert "involvement " in verdict("warning", site.rows("warning")[a_sample(site, "warning")])
 
 
 @pytest.mark.parametrize("task", ["accident", "motion", "detection", "warning"])
 def test_verdicts_of_a_strange_row_are_no_error(task: str) -> None:
     row = {"tp_5m": "<b>", "tp_..m": 1, "pq_1x1": "x", "pq_..x.": None, "iou_1x1": True, "truths": 1e400, "tp_.": [1]}
     for whole in (False, True):
-        assert isinstance(verdict(task, row, whole=whole), str)
-        assert verdict(task, {}, whole=whole) is not None
+        assert {type(verdict(task, each, whole=whole)) for each in (row, {})} == {str}
 
 
 # a sample
@@ -286,59 +284,49 @@ def test_verdicts_of_a_strange_row_are_no_error(task: str) -> None:
 
 @pytest.mark.parametrize("name", ["first", "motion", "detection", "warning", "alone"])
 def test_a_sample_shows_the_prediction_from_above_and_in_cameras(site: Site, name: str) -> None:
-    token = min(site.explorer.models[name].tokens)
-    address = of("model", name, "sample", sample_path(token))
-    pictures = re.findall(r'<img src="([^"]+)"', site.page(address))
-    assert len(pictures) == 2
-    for each in pictures:
-        answer = site.get(urljoin(address, html.unescape(each)))
-        assert answer.status == 200, answer.text
-        assert answer.body.startswith(b"\x89PNG")
-        assert answer.headers["content-type"] == "image/png"
+    address = of("model", name, "sample", sample_path(min(site.explorer.models[name].tokens)))
+    answers = [site.get(urljoin(address, each)) for each in images(site.page(address))]
+    told = [(each.status, each.headers["content-type"], each.body[:4]) for each in answers]
+    assert told == [(200, "image/png", b"\x89PNG")] * 2
 
 
 def test_motion_is_shown_frame_by_frame(site: Site) -> None:
-    token = min(site.runs["motion"].evaluator.tokens)
-    address = of("model", "motion", "sample", sample_path(token))
-    ahead = [each for each in hrefs(site.page(address)) if each.endswith("#ahead")]
-    assert len(ahead) == 5  # from now to 2 s
-    shown = {site.get(f"{address}/cameras.png?ahead={number}").body for number in (0, 4)}
-    assert len(shown) == 2
-    for wrong in ("5", "-1", "x", "999"):
-        assert site.get(f"{address}/cameras.png?ahead={wrong}").status == 404
-    late = max(site.runs["motion"].evaluator.tokens)
-    page = site.page(of("model", "motion", "sample", sample_path(late)))
-    assert len([each for each in hrefs(page) if each.endswith("#ahead")]) < 5  # the recording ends
+    def ahead(token: str) -> list[str]:
+        page = site.page(of("model", "motion", "sample", sample_path(token)))
+        return [each for each in hrefs(page) if each.endswith("#ahead")]
+
+    tokens = site.runs["motion"].evaluator.tokens
+    assert len(ahead(min(tokens))) == 5  # from now to 2 s
+    assert len(ahead(max(tokens))) < 5  # the recording ends
+    pictures = f"{of('model', 'motion', 'sample', sample_path(min(tokens)))}/cameras.png?ahead="
+    assert len({site.get(f"{pictures}{number}").body for number in (0, 4)}) == 2
+    assert [site.get(f"{pictures}{wrong}").status for wrong in ("5", "-1", "x", "999")] == [404] * 4
 
 
 def test_a_sample_leads_to_the_ones_before_and_after(site: Site) -> None:
     """In time those of the same agent, in the list those of the group."""
-    run, choices = site.runs["first"], {"by": "time_to_impact", "value": "1 s"}
-    group = site.samples(of("model", "first", "samples", **choices))
-    address = of("model", "first", "sample", sample_path(group[1]), **choices)
-    page = site.page(address)
-    same = sorted(each for each in run.evaluator.tokens if each.rsplit("/", 1)[0] == group[1].rsplit("/", 1)[0])
-    at = same.index(group[1])
-    expected = same[at - 1 : at] + same[at + 1 : at + 2]
+    choices = {"by": "time_to_impact", "value": "1 s"}
+    worse, token, better, *others = site.samples(of("model", "first", "samples", **choices))
+    address = of("model", "first", "sample", sample_path(token), **choices)
+    page, (scenario, agent, frame) = site.page(address), token.rsplit("/", 2)
+    same = sorted(each for each in site.rows("first") if each.startswith(f"{scenario}/{agent}/"))
+    at = same.index(token)
     links = [*hrefs(page, rel="prev"), *hrefs(page, rel="next")]
+    links += [re.findall(f'<a id="{name}" href="([^"]+)"', page)[0] for name in ("worse", "better")]
+    expected = [*same[at - 1 : at], *same[at + 1 : at + 2], worse, better]
     assert [sample_of(urljoin(address, each)) for each in links] == expected
-    neighbours = [re.findall(f'<a id="{name}" href="([^"]+)"', page)[0] for name in ("worse", "better")]
-    assert [sample_of(urljoin(address, each)) for each in neighbours] == [group[0], group[2]]
-    assert f"2 of {len(group)}" in page
-    scenario, agent, frame = group[1].rsplit("/", 2)
+    assert f"2 of {3 + len(others)}" in page
     here = [urljoin(address, each) for each in hrefs(page)]
-    assert f"/scenario/{scenario}/?frame={int(frame)}&model=first" in here
-    assert f"/scenario/{scenario}/moment/{agent}/{int(frame)}" in here
+    moment = f"/scenario/{scenario}/moment/{agent}/{int(frame)}"
+    assert not lacking(here, f"/scenario/{scenario}/?frame={int(frame)}&model=first", moment)
 
 
 def test_a_sample_that_is_not_evaluated_is_a_sentence(site: Site) -> None:
     missed = max(site.runs["first"].evaluator.tokens - site.runs["part"].evaluator.tokens)
     address = of("model", "part", "sample", sample_path(missed))
     page = site.page(address)
-    assert "predicts nothing for this sample" in page
-    assert "is not in the evaluation" in page
-    assert "<img" not in page
-    assert site.get(f"{address}/above.png").status == 404
+    assert not lacking(page, "predicts nothing for this sample", "is not in the evaluation")
+    assert (images(page), site.get(f"{address}/above.png").status) == ([], 404)
 
 
 # results that are not given, and what is not opened
@@ -356,40 +344,28 @@ class _Opened:
             self.paths.append(str(arguments[0]))
 
 
-def test_the_results_that_a_bundle_names_are_not_opened(site: Site, da_motion: DeepAccident) -> None:
+def test_the_results_that_a_bundle_names_are_not_opened(site: Site, opened: Callable[..., Site]) -> None:
     """They are there, and the release has all samples; yet a bundle may come from anywhere."""
-    named = site.explorer.models["second"].bundle
-    assert named is not None
-    path = named.summary["results"]["path"]
+    path = site.explorer.models["second"].bundle.summary["results"]["path"]  # type: ignore[union-attr]
     assert Path(path).is_file()
+    address = of("model", "second", "sample", sample_path(a_sample(site, "second")))
     seen = _Opened()
     seen.on = True
-    explorer = Explorer(da_motion, bundles=[site.folder / "second"], workers=1)
-    other = Site(explorer, {}, site.folder)
-    token = a_sample(site, "second")
-    address = of("model", "second", "sample", sample_path(token))
-    page = other.page(address)
+    other = opened(bundles=[site.folder / "second"])
+    page, of_model, _ = (other.page(each) for each in (address, "/model/second/", "/model/second/samples"))
     assert other.get(f"{address}/above.png").status == 404
-    other.page("/model/second/")
-    other.page("/model/second/samples")
     seen.on = False
-    explorer.jobs.end()
-    assert any(each.endswith("samples.parquet") for each in seen.paths)
-    assert path not in seen.paths
-    assert not any(Path(each).name == Path(path).name for each in seen.paths)
-    assert "--results PATH" in page
-    assert html.escape(path) in page
-    assert "<img" not in page
-    assert "--results PATH" in other.page("/model/second/")
+    names = {Path(each).name for each in seen.paths}
+    assert "samples.parquet" in names
+    assert Path(path).name not in names
+    assert not lacking(page, "--results PATH", html.escape(path))
+    assert (images(page), "--results PATH" in of_model) == ([], True)
 
 
-def test_given_results_join_their_bundle(site: Site, da_motion: DeepAccident) -> None:
-    explorer = Explorer(da_motion, bundles=[site.folder / "second"], results=[site.folder / "quiet.json"], workers=1)
-    other = Site(explorer, {}, site.folder)
-    page = other.page(of("model", "second", "sample", sample_path(a_sample(site, "second"))))
-    explorer.jobs.end()
-    assert [*explorer.models] == ["second"]
-    assert "<img" in page
+def test_given_results_join_their_bundle(site: Site, opened: Callable[..., Site]) -> None:
+    other = opened(bundles=[site.folder / "second"], results=[site.folder / "quiet.json"])
+    assert [*other.explorer.models] == ["second"]
+    assert images(other.page(of("model", "second", "sample", sample_path(a_sample(site, "second")))))
 
 
 # the command
@@ -402,43 +378,36 @@ def test_results_without_an_evaluation_show_how_to_make_one(site: Site, da_motio
     assert shlex.split(html.unescape(shown[0])) == words
 
 
-def test_results_of_other_scenarios_are_told(da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_results_of_other_scenarios_are_told(opened: Callable[..., Site], tmp_path: Path) -> None:
     path = written(tmp_path / "few.json", (), ["type9/none/ego_vehicle/001"])
-    page = Site(Explorer(da_motion, results=[path], workers=1), {}, tmp_path).page("/model/few/")
-    assert "1 scenario of these results is not in this release" in page
+    assert "1 scenario of these results is not in this release" in opened(results=[path]).page("/model/few/")
 
 
 # names and addresses of strangers
 
 
 def test_names_are_escaped_and_lead_to_their_pages(site: Site) -> None:
-    pages = [site.page("/models/")]
-    link = next(each for each in hrefs(pages[0], "entry") if "onerror" in each)
+    link = next(each for each in hrefs(site.page("/models/"), "entry") if "onerror" in each)
     address = urljoin("/models/", link)
-    pages += [site.page(address), site.page(urljoin(address, "samples"))]
-    assert "All 20 samples" in pages[1]
-    sample = urljoin(urljoin(address, "samples"), hrefs(pages[2], "entry")[0])
-    pages += [site.page(sample), site.page(of("compare", "first", HOSTILE_PART, ""))]
-    for page in pages:
-        assert "<img src=x" not in page
-        assert "<script>alert" not in page
-        assert "<svg onload" not in page
-        assert "<b onclick" not in page
-    assert html.escape("<b onclick=x>") in pages[1]
-    bars = [each for each in hrefs(pages[1]) if "onload" in each]
-    assert urljoin(address, bars[0]).startswith(address)
+    own, listed = site.page(address), site.page(urljoin(address, "samples"))
+    sample = site.page(urljoin(urljoin(address, "samples"), hrefs(listed, "entry")[0]))
+    for page in (site.page("/models/"), own, listed, sample, site.page(of("compare", "first", HOSTILE_PART, ""))):
+        assert not holding(page, "<img src=x", "<script>alert", "<svg onload", "<b onclick")
+    assert not lacking(own, "All 20 samples", html.escape("<b onclick=x>"))
+    assert urljoin(address, next(each for each in hrefs(own) if "onload" in each)).startswith(address)
 
 
 HOSTILE_PART = "%3Cimg%20src%3Dx%20onerror%3Dalert%281%29%3E%20%22a%22%20%26%20%27b%27%20..%252e%252e%3F%23%3B"
 
 
 def test_a_folders_address_gets_its_slash(site: Site) -> None:
-    answer = site.get("/model/first?a=b")
-    assert answer.status == 307
-    assert urljoin("/model/first", answer.headers["location"]) == "/model/first/?a=b"
-    hostile = site.get(f"/model/{HOSTILE_PART}")
-    assert urljoin("/model/x", hostile.headers["location"]) == f"/model/{HOSTILE_PART}/"
-    assert site.get("/models").headers["location"] == "./models/"
+    for address, location in {
+        "/model/first?a=b": "/model/first/?a=b",
+        f"/model/{HOSTILE_PART}": f"/model/{HOSTILE_PART}/",
+        "/models": "/models/",
+    }.items():
+        answer = site.get(address)
+        assert (answer.status, urljoin(address, answer.headers["location"])) == (307, location)
 
 
 @pytest.mark.parametrize(
@@ -470,140 +439,110 @@ def test_what_is_not_there_is_not_found(site: Site, address: str) -> None:
 )
 def test_pages_keep_to_the_policy(site: Site, address: str) -> None:
     """No style and script in the page, and only relative addresses."""
-    page = site.page(address)
-    assert " style=" not in page
-    assert "<style" not in page
-    assert not re.search(r"<script(?![^>]* src=)", page)
-    assert not re.search(r"""(?:href|src|action)=["'](?:/|https?:)""", page)
+    forbidden = r""" style=|<style|<script(?![^>]* src=)|(?:href|src|action)=["'](?:/|https?:)"""
+    assert re.findall(forbidden, site.page(address)) == []
 
 
-def test_a_damaged_summary_is_a_sentence(site: Site, da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_a_damaged_summary_is_a_sentence(site: Site, opened: Callable[..., Site], tmp_path: Path) -> None:
     shutil.copytree(site.folder / "second", tmp_path / "broken")
-    path = tmp_path / "broken" / "metrics_summary.json"
-    summary = json.loads(path.read_text())
-    summary["headlines"][0]["name"] = {"a": 1}
-    path.write_text(json.dumps(summary))
-    other = Site(Explorer(da_motion, bundles=[tmp_path / "broken"], workers=1), {}, tmp_path)
-    answer = other.get("/model/broken/")
-    other.explorer.jobs.end()
-    assert answer.status == 500
-    assert "evaluate again" in answer.text
+    edit_summary(tmp_path / "broken", lambda summary: summary["headlines"][0].update(name={"a": 1}))
+    answer = opened(bundles=[tmp_path / "broken"]).get("/model/broken/")
+    assert (answer.status, "evaluate again" in answer.text) == (500, True)
 
 
 # marks and warnings
 
 
 def test_what_is_partial_says_so(site: Site) -> None:
-    run = site.runs["part"]
-    assert run.partial is not None
-    assert PARTIAL.text().startswith("PARTIAL")
+    words = site.runs["part"].partial.text()  # type: ignore[union-attr]
+    assert words.startswith("PARTIAL")
     for address in ("/models/", "/model/part/", "/compare/part/part/"):
-        assert run.partial.text() in site.page(address)
+        assert words in site.page(address)
     assert "PARTIAL" not in site.page("/model/first/")
 
 
-def test_another_release_lacks_the_samples(site: Site, da: DeepAccident) -> None:
-    explorer = Explorer(da, bundles=[site.folder / "first"], workers=1)
-    other = Site(explorer, {}, site.folder)
-    page = other.page("/model/first/")
-    assert "1 scenario of this evaluation is not in this release" in page
+def test_another_release_lacks_the_samples(site: Site, da: DeepAccident, opened: Callable[..., Site]) -> None:
+    other = opened(da, bundles=[site.folder / "first"])
+    assert "1 scenario of this evaluation is not in this release" in other.page("/model/first/")
     assert sorted(other.samples("/model/first/samples")) == sorted(site.runs["first"].evaluator.tokens)
     group = other.page("/model/first/samples?by=agent&value=ego_vehicle")
     assert "20 samples are not in this release" in group
     sample = other.page(of("model", "first", "sample", sample_path(a_sample(site))))
-    explorer.jobs.end()
-    assert "This sample is not in this release." in sample
-    assert "5 m: " in sample
+    assert not lacking(sample, "This sample is not in this release.", "5 m: ")
 
 
-def test_without_models_the_page_says_how_to_give_some(da_motion: DeepAccident) -> None:
-    explorer = Explorer(da_motion, workers=1)
-    page = Site(explorer, {}, Path()).page("/models/")
-    assert "--results PATH" in page
-    assert "deepaccident evaluate" in page
+def test_without_models_the_page_says_how_to_give_some(opened: Callable[..., Site]) -> None:
+    assert not lacking(opened().page("/models/"), "--results PATH", "deepaccident evaluate")
 
 
-def test_pages_wait_for_scores(site: Site, da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Jobs, "_run", lambda _: None)
-    explorer = Explorer(da_motion, bundles=[site.folder / "first", site.folder / "second"], workers=1)
-    other = Site(explorer, {}, site.folder)
+def test_pages_wait_for_scores(site: Site, opened: Callable[..., Site]) -> None:
+    go_on, other = threading.Event(), opened(bundles=[site.folder / "first", site.folder / "second"])
+    other.explorer.jobs.ask("other", "something slow", go_on.wait)
     for address in ("/model/first/", "/model/first/samples", "/compare/first/second/"):
         answer = other.get(address)
-        assert answer.status == 200
         titles = json.loads(html.unescape(re.findall("data-titles='([^']*)'", answer.text)[0]))
+        assert (answer.status, titles != []) == (200, True)
         assert set(titles) <= set(json.loads(other.get("/waiting.json").text))
-        assert titles
+    go_on.set()
 
 
 # side by side
 
 
 def test_a_comparison_has_the_largest_differences_first(site: Site) -> None:
-    a, b = (site.runs[name] for name in ("first", "second"))
-    shown = site.samples("/compare/first/second/")
-    assert sorted(shown) == sorted(a.evaluator.tokens)
-
     def difference(token: str) -> float:
-        one, other = (main_number(run, token) for run in (a, b))
+        one, other = (main_number(site.runs[name], token) for name in ("first", "second"))
         return (1.0 if other is None else other) - (1.0 if one is None else one)
 
+    shown = site.samples("/compare/first/second/")
+    assert sorted(shown) == sorted(site.runs["first"].evaluator.tokens)
     sizes = [abs(difference(token)) for token in shown]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[0] > sizes[-1]
     better = site.samples("/compare/first/second/?better=a")
     assert sorted(better) == sorted(token for token in shown if difference(token) < 0)
     assert site.samples("/compare/second/first/?better=b") == better
-    page = site.page("/compare/first/second/")
-    assert ">apa</th>" in page
-    assert "b − a" in page
+    assert not lacking(site.page("/compare/first/second/"), ">apa</th>", "b − a")
 
 
-def test_quiet_where_nothing_comes_is_better_than_a_false_alarm(da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_quiet_where_nothing_comes_is_better_than_a_false_alarm(
+    da_motion: DeepAccident, opened: Callable[..., Site], tmp_path: Path
+) -> None:
     setup = replace(BOXES, switches={"reading.danger_distance": 0.5})
     selection = default_selection(setup, "train", scope="all")
     tokens = selection.tokens(da_motion)
     for name, foreseen in (("quiet", ()), ("loud", ELSEWHERE)):
         path = written(tmp_path / f"{name}.json", foreseen, tokens)
         save_run(evaluate_results(da_motion, path, setup, selection, workers=1), tmp_path / name)
-    site = Site(Explorer(da_motion, bundles=[tmp_path / "quiet", tmp_path / "loud"], workers=1), {}, tmp_path)
-    better = site.samples("/compare/quiet/loud/?better=a")
-    site.explorer.jobs.end()
+    better = opened(bundles=[tmp_path / "quiet", tmp_path / "loud"]).samples("/compare/quiet/loud/?better=a")
     assert sorted(better) == sorted(token for token in tokens if "_normal/" in token)
 
 
 def test_what_cannot_be_compared_says_why(site: Site) -> None:
-    page = html.unescape(site.page("/compare/second/paper/"))
-    assert "cannot be compared" in page
-    assert "not evaluated by the same rules" in page
+    why = "not evaluated by the same rules"
+    assert not lacking(html.unescape(site.page("/compare/second/paper/")), "cannot be compared", why)
+    assert why in html.unescape(site.page("/compare/first/motion/"))
     assert site.samples("/compare/second/paper/")  # the samples can be, by their own numbers
-    assert "not evaluated by the same rules" in html.unescape(site.page("/compare/first/motion/"))
 
 
 def test_samples_that_only_one_has_can_be_left_out(site: Site) -> None:
     page = site.page("/compare/second/part/")
     assert "samples only in" in page
     (link,) = (each for each in hrefs(page) if "common=1" in each)
-    page = site.page(urljoin("/compare/second/part/", link))
-    assert "cannot be compared" not in page
-    assert "10 that only one has are left out" in page
+    common = site.page(urljoin("/compare/second/part/", link))
+    assert ("cannot be compared" in common, "10 that only one has are left out" in common) == (False, True)
 
 
 def test_two_models_at_the_same_moment(site: Site) -> None:
     token = site.samples("/compare/first/second/?better=a")[0]
     address = of("compare", "first", "second", "sample", sample_path(token), better="a")
     page = site.page(address)
-    assert len(re.findall("<section", page)) == 2
-    for name in ("first", "second"):
-        assert verdict("accident", site.explorer.models[name].rows[token], whole=True) in html.unescape(page)
-    pictures = [urljoin(address, html.unescape(each)) for each in re.findall(r'<img src="([^"]+)"', page)]
-    assert [urlsplit(each).path.rsplit("/", 1)[1] for each in pictures] == [
-        "above.png",
-        "cameras.png",
-    ]  # second has none
-    assert "--results PATH" in page
-    assert all(site.get(each).status == 200 for each in pictures)
-    swapped = [urljoin(address, each) for each in hrefs(page) if "/second/first/" in each]
-    assert swapped == [of("compare", "second", "first", "sample", sample_path(token), better="b")]
-    assert "1 of " in page
-    assert site.page(swapped[0])
+    verdicts = [verdict("accident", site.rows(name)[token], whole=True) for name in ("first", "second")]
+    assert not lacking(html.unescape(page), *verdicts, "--results PATH", "1 of ")
+    pictures = [urlsplit(each).path.rsplit("/", 1)[1] for each in images(page)]
+    assert (page.count("<section"), pictures) == (2, ["above.png", "cameras.png"])  # second has none
+    assert [site.get(urljoin(address, each)).status for each in images(page)] == [200, 200]
+    (swapped,) = [urljoin(address, each) for each in hrefs(page) if "/second/first/" in each]
+    assert swapped == of("compare", "second", "first", "sample", sample_path(token), better="b")
+    assert site.page(swapped)
     assert any("better=a" in each for each in hrefs(page, rel="next") + hrefs(page, rel="prev"))

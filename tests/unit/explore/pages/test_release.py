@@ -5,17 +5,19 @@ import re
 import shutil
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from urllib.parse import urljoin
 
 import pytest
 from asgi import get
 from damaged_releases import Damaged, damaged_release
 from shown_page import Shown
+from wording import lacking
 
-from deepaccident_devkit import DeepAccident
-from deepaccident_devkit._version import __version__
+from deepaccident_devkit import DeepAccident, __version__
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.explore import Explorer, make_app
 from deepaccident_devkit.explore.pages import release
@@ -33,9 +35,9 @@ class Reader:
         self.explorer = Explorer(dataset, workers=1)
         self.app: Any = make_app(self.explorer)
 
-    def page(self, address: str, status: int = 200) -> Shown:
+    def page(self, address: str) -> Shown:
         answer = get(self.app, address)
-        assert answer.status == status
+        assert answer.status == 200
         return Shown(answer.text)
 
     def ready(self, address: str) -> Shown:
@@ -43,16 +45,18 @@ class Reader:
         assert self.explorer.jobs.wait(60)
         return self.page(address)
 
-    @property
-    def begun(self) -> list[str]:
-        return [job.name for job in self.explorer.jobs.all()]
+
+@contextmanager
+def reading(dataset: DeepAccident) -> Iterator[Reader]:
+    reader = Reader(dataset)
+    yield reader
+    reader.explorer.jobs.end()
 
 
 @pytest.fixture
 def reader(da_b: DeepAccident) -> Iterator[Reader]:
-    reader = Reader(da_b)
-    yield reader
-    reader.explorer.jobs.end()
+    with reading(da_b) as reader:
+        yield reader
 
 
 @pytest.fixture(scope="module")
@@ -64,20 +68,17 @@ def damaged(release_root_b: Path, tmp_path_factory: pytest.TempPathFactory) -> D
 
 @pytest.fixture(scope="module")
 def of_damaged(damaged: Damaged) -> Iterator[Reader]:
-    reader = Reader(damaged.dataset)
-    yield reader
-    reader.explorer.jobs.end()
+    with reading(damaged.dataset) as reader:
+        yield reader
 
 
 @pytest.fixture
 def mapped(da: DeepAccident, tmp_path: Path) -> Iterator[Reader]:
     """Of a release with BEV cameras and without a kept map."""
-    shutil.copytree(
-        da.dataroot, tmp_path / "release", ignore=shutil.ignore_patterns("Camera_*", "town_map-*", "lidar01")
-    )
-    reader = Reader(DeepAccident("v1", tmp_path / "release", verbose=False))
-    yield reader
-    reader.explorer.jobs.end()
+    ignored = shutil.ignore_patterns("Camera_*", "town_map-*", "lidar01")
+    shutil.copytree(da.dataroot, tmp_path / "release", ignore=ignored)
+    with reading(DeepAccident("v1", tmp_path / "release", verbose=False)) as reader:
+        yield reader
 
 
 # all of them
@@ -86,14 +87,12 @@ def mapped(da: DeepAccident, tmp_path: Path) -> Iterator[Reader]:
 def test_all_links_lead_somewhere(of_damaged: Reader) -> None:
     seen: set[str] = set()
     for tab in TABS:
-        here = f"/release/{tab}"
-        page = of_damaged.ready(here)
+        page = of_damaged.ready(f"/release/{tab}")
         named = [address for address, _ in page.links if not address.startswith("#")]
         assert not [address for address in named if re.match(r"[a-z]+:|/", address)]
-        found = {urljoin(here, address) for address in [*named, *page.loads] if not address.startswith("data:")}
-        for address in sorted(found - seen):
-            assert get(of_damaged.app, address).status in (200, 307), address
-        seen |= found
+        loads = [address for address in page.loads if not address.startswith("data:")]
+        seen |= {urljoin(f"/release/{tab}", address) for address in (*named, *loads)}
+    assert [each for each in sorted(seen) if get(of_damaged.app, each).status not in (200, 307)] == []
     assert "/release/" in seen
     assert any("/scenario/" in address for address in seen)
 
@@ -101,17 +100,15 @@ def test_all_links_lead_somewhere(of_damaged: Reader) -> None:
 def test_a_page_waits_for_its_work(reader: Reader) -> None:
     go_on = threading.Event()
     reader.explorer.jobs.ask("other", "something slow", go_on.wait)
-    try:
-        page = reader.page("/release/")
-        assert "This page loads itself again" in page.text
-        (place,) = (each for _, each in page.tags if "data-titles" in each)
-        (title,) = json.loads(place["data-titles"])
-        assert place["data-waiting"] == "../waiting.json"
-        assert json.loads(get(reader.app, "/waiting.json").body) == ["something slow", title]
-        assert any("waiting.js" in each for each in page.loads)
-        assert not page.tables
-    finally:
-        go_on.set()
+    page, waiting = reader.page("/release/"), json.loads(get(reader.app, "/waiting.json").body)
+    go_on.set()
+    assert ("This page loads itself again" in page.text, page.tables) == (True, [])
+    (place,) = (each for _, each in page.tags if "data-titles" in each)
+    assert (place["data-waiting"], waiting) == (
+        "../waiting.json",
+        ["something slow", *json.loads(place["data-titles"])],
+    )
+    assert any("waiting.js" in each for each in page.loads)
     ready = reader.ready("/release/")
     assert "loads itself again" not in ready.text
     assert not [each for _, each in ready.tags if "data-titles" in each]
@@ -119,10 +116,7 @@ def test_a_page_waits_for_its_work(reader: Reader) -> None:
 
 
 def test_what_fails_is_told(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(_: object) -> None:
-        raise NotAvailableError("the disk <is> gone")
-
-    monkeypatch.setattr(release, "overview", fails)
+    monkeypatch.setattr(release, "overview", Mock(side_effect=NotAvailableError("the disk <is> gone")))
     page = reader.ready("/release/")
     assert "This cannot be told: the disk <is> gone" in page.text
     assert not page.all("is")
@@ -133,13 +127,12 @@ def test_what_fails_is_told(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_contents_are_the_overviews(of_damaged: Reader, damaged: Damaged) -> None:
     told, page = overview(damaged.dataset), of_damaged.ready("/release/")
-    for text in (told.dataroot, told.version, told.layout, told.index, __version__):
-        assert text in page.text
-    assert page.table("split") == [[name, str(count), str(told.expected[name])] for name, count in told.splits.items()]
-    assert page.table("agent") == [[name, str(count), str(told.labelled[name])] for name, count in told.agents.items()]
-    assert [row[:3] for row in page.table("channel")] == [
-        [name, str(count), str(told.files[name])] for name, count in told.channels.items()
-    ]
+    assert not lacking(page.text, told.dataroot, told.version, told.layout, told.index, __version__)
+    assert {heading: [row[:3] for row in page.table(heading)] for heading in ("split", "agent", "channel")} == {
+        "split": [[name, str(count), str(told.expected[name])] for name, count in told.splits.items()],
+        "agent": [[name, str(count), str(told.labelled[name])] for name, count in told.agents.items()],
+        "channel": [[name, str(count), str(told.files[name])] for name, count in told.channels.items()],
+    }
     assert {row[3] for row in page.table("channel")} == {str(told.samples)}
     assert page.table("table") == [[name, f"{count:,}"] for name, count in told.tables.items()]
     assert page.address_of(damaged.broken) == f"../scenario/{damaged.broken}/"
@@ -148,61 +141,55 @@ def test_the_contents_are_the_overviews(of_damaged: Reader, damaged: Damaged) ->
 
 def test_its_counts_lead_to_as_many_scenarios(of_damaged: Reader, damaged: Damaged) -> None:
     page, told = of_damaged.ready("/release/"), overview(damaged.dataset)
-    checked = 0
+    counted, found = {}, {}
     for field, values in {"split": told.splits, **told.attributes}.items():
-        for value, count in values.items():
-            if count:
-                address = page.address_of("unknown" if value == "none" else value)
-                if field in ("weather", "time_of_day", "road_type", "accident_type"):
-                    links = [each for each, _ in page.links if each.startswith(f"../?{field}=")]
-                    assert len(links) == len(values)
-                    address = links[[*values].index(value)]
-                found = get(of_damaged.app, urljoin("/release/", address)).text
-                assert re.search(r'<b id="count">(\d+)</b>', found)[1] == str(count), (field, value)
-                checked += 1
-    assert checked > 12
+        links = [each for each, _ in page.links if each.startswith(f"../?{field}=")]
+        for value in (each for each, count in values.items() if count):
+            address = page.address_of("unknown" if value == "none" else value)
+            if field in ("weather", "time_of_day", "road_type", "accident_type"):
+                assert len(links) == len(values)
+                address = links[[*values].index(value)]
+            (shown,) = re.findall(r'<b id="count">(\d+)</b>', get(of_damaged.app, urljoin("/release/", address)).text)
+            counted[field, value], found[field, value] = values[value], int(shown)
+    assert found == counted
+    assert len(counted) > 12
 
 
 def test_hostile_names_are_text(own_release: Path) -> None:
     hostile = "<script>alert(1)</script>'\"&"
     first = DeepAccident("v1", own_release, verbose=False).scenario[0]
     meta = own_release / first["folder"] / first["scenario_type"] / "meta" / f"{first['name']}.txt"
-    words = meta.read_text().split(" ", 1)
-    meta.write_text(f"{hostile.replace(' ', '')}Noon {words[1]}")
+    meta.write_text(f"{hostile.replace(' ', '')}Noon {meta.read_text().split(' ', 1)[1]}")
     for path in sorted(own_release.rglob(f"*{first['name']}*"), reverse=True):
         path.rename(path.with_name(path.name.replace("Town", "<i>&Town")))
     for path in own_release.rglob("*.txt"):
         if path.parent.name in ("split_txt_files", own_release.name):
             path.write_text(path.read_text().replace(first["name"], first["name"].replace("Town", "<i>&Town")))
-    reader = Reader(DeepAccident("v1", own_release, verbose=False))
-    for tab in ("", "maps"):
-        page = reader.ready(f"/release/{tab}")
-        assert not page.all("i")
-        assert all("src" in each for each in page.all("script"))
-        assert "<i>&Town" in page.text
-    page = reader.page("/release/")
+    with reading(DeepAccident("v1", own_release, verbose=False)) as reader:
+        page, maps = (reader.ready(f"/release/{tab}") for tab in ("", "maps"))
+        found = reader.page(urljoin("/release/", page.address_of(hostile)))
+    for each in (page, maps):
+        assert (each.all("i"), [script for script in each.all("script") if "src" not in script]) == ([], [])
+        assert "<i>&Town" in each.text
     assert hostile in page.text
-    found = reader.page(urljoin("/release/", page.address_of(hostile)))
     assert "1 of 6 scenarios" in " ".join(found.text.split())
 
 
 # maps
 
 
-def test_maps_that_are_kept_are_shown(mapped: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = mapped.explorer.dataset
-    town, *others = towns_of(dataset)
-    page = mapped.page("/release/maps")
-    assert page.text.count("Not made yet") == len(others) + 1
-    assert get(mapped.app, f"/release/map/{town}.png").status == 404
-    made = town_map(dataset, town)
+def test_maps_that_are_kept_are_shown(mapped: Reader) -> None:
+    town, *others = towns_of(mapped.explorer.dataset)
+    before, picture = mapped.page("/release/maps"), f"/release/map/{town}.png"
+    assert (before.text.count("Not made yet"), get(mapped.app, picture).status) == (len(others) + 1, 404)
+    made = town_map(mapped.explorer.dataset, town)
     page = mapped.page("/release/maps")
     assert page.text.count("Not made yet") == len(others)
     assert f"Read: {made.looks} pictures of {made.scenarios} scenario" in page.text
     assert f"map/{town}.png" in page.loads
-    assert get(mapped.app, f"/release/map/{town}.png").headers["content-type"] == "image/png"
+    assert get(mapped.app, picture).headers["content-type"] == "image/png"
     assert get(mapped.app, "/release/map/Town99.png").status == 404
-    assert mapped.begun == []
+    assert mapped.explorer.jobs.all() == []
 
 
 # conventions
@@ -211,7 +198,7 @@ def test_maps_that_are_kept_are_shown(mapped: Reader, monkeypatch: pytest.Monkey
 def test_conventions_name_what_is_there(reader: Reader) -> None:
     page = reader.page("/release/conventions")
     names = {*re.findall(r"\bda\.(\w+)", page.text)}
-    assert names >= {"world_from", "ego_from", "transform", "boxes", "load_bev"}
+    assert not lacking(names, "world_from", "ego_from", "transform", "boxes", "load_bev")
     assert [name for name in names if not hasattr(DeepAccident, name)] == []
     assert [row[0] for row in page.table("orientation")] == ["devkit", "released", "fiery"]
     assert {"world", "ego", "lidar"} < {row[0] for row in page.table("name")}

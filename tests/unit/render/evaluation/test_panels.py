@@ -7,10 +7,9 @@ from drawing import new_axes
 from numpy.testing import assert_allclose, assert_array_equal
 from picture_texts import text_faults
 
-from deepaccident_devkit.evaluation import Resampling
+from deepaccident_devkit.evaluation import DetectionEvaluator, Resampling
 from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
-from deepaccident_devkit.evaluation.detection import DetectionEvaluator
-from deepaccident_devkit.evaluation.detection.result import DetectionResult
+from deepaccident_devkit.evaluation.detection import DetectionResult
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.evaluation import render_breakdown, render_comparison

@@ -27,7 +27,6 @@ def data(page: Path) -> dict[str, Any]:
 def foreseen(dataset: DeepAccident, token: str, *, away: float = 0.0, **other: Any) -> Accident:
     """The true accident of a sample, so many metres away, or with other numbers."""
     truth = box_truth(dataset, token).accident
-    assert truth is not None
     told = {"positions": truth.positions + np.array([away, 0.0]), "time": truth.time, "ids": truth.ids, **other}
     return Accident(**told)
 

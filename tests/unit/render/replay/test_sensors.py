@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from replay_page import accident, data_of, normal, picture
+from wording import lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
@@ -22,10 +23,10 @@ from deepaccident_devkit.render.replay.sensors import (
     Followed,
     Jpegs,
     PictureSettings,
-    _steady,
     camera_files,
     camera_pictures,
     follow_pair,
+    steady,
 )
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -45,25 +46,24 @@ def test_points_lie_on_those_of_the_lidar(da: DeepAccident, data: dict[str, Any]
 
 
 def test_each_agent_has_six_cameras(da: DeepAccident, data: dict[str, Any]) -> None:
-    shown, true = {}, {}
-    for agent, cameras in zip(AGENTS, data["cameras"], strict=True):
-        assert [camera["title"] for camera in cameras] == [channel.removeprefix("Camera_") for channel in CAMERAS]
-        for camera in cameras:
-            token = f"{accident(da)}/{agent}/006/Camera_{camera['title']}"
-            shown[token] = np.asarray(picture(camera["pictures"][5]), dtype=float)
-            true[token] = da.load_image(token)
-    assert len(shown) == 30
-    for token, pixels in shown.items():
-        assert min(true, key=lambda other: np.abs(true[other] - pixels).mean()) == token
+    shown = {
+        f"{accident(da)}/{agent}/006/Camera_{camera['title']}": np.asarray(picture(camera["pictures"][5]), dtype=float)
+        for agent, cameras in zip(AGENTS, data["cameras"], strict=True)
+        for camera in cameras
+    }
+    assert [token.rsplit("/", 1)[1] for token in shown] == [*CAMERAS] * 5
+    true = {token: da.load_image(token) for token in shown}
+    nearest = {token: min(true, key=lambda each: np.abs(true[each] - shown[token]).mean()) for token in shown}
+    assert nearest == {token: token for token in shown}
     assert any("have smaller pictures, up to 480 pixels wide, of every frame." in note for note in data["notes"])
 
 
 def test_agents_are_as_asked(da: DeepAccident, tmp_path: Path) -> None:
     data = data_of(render_replay(da, accident(da), tmp_path / "a.html", agents=["infrastructure"]))
     assert [agent["name"] for agent in data["agents"]] == ["infrastructure"]
-    assert [camera["title"] for camera in data["cameras"][0]] == [each.removeprefix("Camera_") for each in CAMERAS]
-    assert "Pictures are up to 960 pixels wide, of JPEG quality 80." in data["notes"]
-    assert "Agents not shown: ego, ego behind, other, other behind." in data["notes"]
+    assert [f"Camera_{camera['title']}" for camera in data["cameras"][0]] == list(CAMERAS)
+    absent = "Agents not shown: ego, ego behind, other, other behind."
+    assert not lacking(data["notes"], "Pictures are up to 960 pixels wide, of JPEG quality 80.", absent)
 
 
 def taken(dataset: DeepAccident, limit: float) -> tuple[PictureSettings | None, Jpegs]:
@@ -82,38 +82,31 @@ def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident) -> N
     sizes = []
     for limit in (math.inf, 145_000, 45_000, 20_000, 12_000):
         settings, jpegs = taken(da, limit)
-        assert settings is not None
-        assert weight(jpegs) <= limit
         sizes.append(weight(jpegs))
-        assert set(jpegs) == set(AGENTS)
+        assert (set(jpegs), sizes[-1] <= limit) == (set(AGENTS), True)
         given = {channel: [each is not None for each in all_] for channel, all_ in jpegs["infrastructure"].items()}
-        assert given[CAMERAS[0]] == [frame % settings.every == 0 for frame in range(6)]
+        follows = [frame % settings.every == 0 for frame in range(6)]
         others = [bool(settings.others) and frame % settings.others == 0 for frame in range(6)]
-        assert given.get("Camera_BackLeft", [False] * 6) == others
-        follows = [frame % settings.every == 0 for frame in range(3, 6)]
-        assert given.get("Camera_Back", [False] * 6) == others[:3] + follows
+        expected = {CAMERAS[0]: follows, "Camera_BackLeft": others, "Camera_Back": others[:3] + follows[3:]}
+        assert {channel: given.get(channel, [False] * 6) for channel in expected} == expected
     assert sizes == sorted(sizes, reverse=True)
     assert (settings.others, settings.every > 1) == (0, True)
     assert taken(da, 10)[1] == {}
 
 
 def test_other_cameras_have_smaller_pictures(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sensors, "_LEAST_OTHER", 8)
-    monkeypatch.setattr(sensors, "_LADDER", [(40, 60)])
+    monkeypatch.setattr(sensors, "LEAST_OTHER", 8)
+    monkeypatch.setattr(sensors, "LADDER", [(40, 60)])
     jpegs = taken(da, math.inf)[1]["other_vehicle"]
-    assert [size_of(each) for each in jpegs["Camera_Front"]] == [(40, 22)] * 6
-    assert [size_of(each) for each in jpegs["Camera_Back"]] == [(20, 11)] * 3 + [(40, 22)] * 3
-    assert [size_of(each) for each in jpegs["Camera_FrontRight"]] == [(20, 11)] * 6
-
-
-def size_of(jpeg: bytes | None) -> tuple[int, int]:
-    assert jpeg is not None
-    return Image.open(io.BytesIO(jpeg)).size
+    large, small = (40, 22), (20, 11)
+    expected = {"Front": [large] * 6, "Back": [small] * 3 + [large] * 3, "FrontRight": [small] * 6}
+    sizes = {name: [Image.open(io.BytesIO(each)).size for each in jpegs[f"Camera_{name}"]] for name in expected}
+    assert sizes == expected
 
 
 def test_a_wrong_estimate_does_not_break_the_limit(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
     """The size of all is estimated from a black picture, which is smaller than any other."""
-    monkeypatch.setattr(sensors, "_probes", lambda _: [np.zeros((36, 64, 3), dtype=np.uint8)])
+    monkeypatch.setattr(sensors, "probes_of", lambda _: [np.zeros((36, 64, 3), dtype=np.uint8)])
     assert 70_000 < weight(taken(da, 100_000)[1]) <= 100_000
 
 
@@ -121,14 +114,18 @@ def test_a_missing_picture_leaves_a_hole(da: DeepAccident, tmp_path: Path) -> No
     root = tmp_path / "release"
     shutil.copytree(da.dataroot, root, copy_function=os.link, ignore=shutil.ignore_patterns(".deepaccident"))
     part = DeepAccident("v1", root, verbose=False)
-    gone = part.get_sample_data_path(f"{accident(part)}/other_vehicle/003/Camera_Front")
-    gone.unlink()
-    part.get_sample_data_path(f"{accident(part)}/ego_vehicle/002/lidar01").unlink()
+    for gone in ("other_vehicle/003/Camera_Front", "ego_vehicle/002/lidar01"):
+        part.get_sample_data_path(f"{accident(part)}/{gone}").unlink()
     data = data_of(render_replay(part, None, tmp_path / "replay.html"))
-    there = [coded is not None for coded in data["cameras"][2][0]["pictures"]]
-    assert there == [True, True, False, True, True, True]
-    assert [cloud is not None for cloud in data["points"]] == [True, False, True, True, True, True]
+    holes = [[each is None for each in row].index(True) for row in (data["cameras"][2][0]["pictures"], data["points"])]
+    assert holes == [2, 1]
+    assert [sum(each is None for each in row) for row in (data["cameras"][2][0]["pictures"], data["points"])] == [1, 1]
     assert "1 of 180 camera files are missing in the release; unpack the cameras' archives." in data["notes"]
+
+
+@pytest.fixture(scope="module")
+def recording(da_motion: DeepAccident) -> Recording:
+    return recording_of(da_motion, accident(da_motion), None)
 
 
 def followed(recording: Recording, missing: tuple[str, str] = ("", "")) -> Followed:
@@ -141,24 +138,20 @@ def changes(names: tuple[str, ...]) -> int:
     return sum(one != other for one, other in itertools.pairwise(names))
 
 
-def test_the_pair_is_in_the_picture_at_the_impact(da_motion: DeepAccident) -> None:
-    recording = recording_of(da_motion, accident(da_motion), None)
+def test_the_pair_is_in_the_picture_at_the_impact(da_motion: DeepAccident, recording: Recording) -> None:
     found = followed(recording)
     assert {agent: len(channels) for agent, channels in found.channels.items()} == dict.fromkeys(AGENTS, 35)
     assert max(map(changes, [*found.channels.values(), found.agents])) <= 3  # in 3.5 s: it does not flicker
     for frame in range(26, 36):
         agent = found.agents[frame - 1]
         sample, channel = recording.sample(agent, frame), found.channels[agent][frame - 1]
-        boxes = scenario_tracks(da_motion, recording.scenario).at(frame)
+        boxes, lens = scenario_tracks(da_motion, recording.scenario).at(frame), da_motion.camera(sample, channel)
         pair = boxes.select(np.isin(boxes.actor_id, recording.pair))
         centers = pair.transform(da_motion.world_from(sample, channel).inverse(), channel).center
-        lens = da_motion.camera(sample, channel)
-        shown = lens.in_image(*lens.project(centers), min_depth=IN_FRONT_DEPTH)
-        assert shown.any(), (frame, agent, channel)
+        assert lens.in_image(*lens.project(centers), min_depth=IN_FRONT_DEPTH).any(), (frame, agent, channel)
 
 
-def test_a_camera_without_pictures_is_not_chosen(da_motion: DeepAccident) -> None:
-    recording = recording_of(da_motion, accident(da_motion), None)
+def test_a_camera_without_pictures_is_not_chosen(recording: Recording) -> None:
     before = followed(recording)
     agent, channel = before.agents[-1], before.channels[before.agents[-1]][-1]
     after = followed(recording, missing=(agent, channel))
@@ -182,4 +175,4 @@ def test_where_nobody_collides_the_front_cameras_are_shown(da_motion: DeepAccide
     ],
 )
 def test_changes_are_worth_their_cost(scores: list[list[float]], chosen: list[int]) -> None:
-    assert _steady(np.array(scores)) == chosen
+    assert steady(np.array(scores)) == chosen
