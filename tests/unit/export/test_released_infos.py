@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.export import export
@@ -144,20 +145,16 @@ def test_infos_without_boxes(
 ) -> None:
     path = next(own_release.glob("val/*_accident/other_vehicle/label/*/*_004.txt"))
     path.write_text(path.read_text().splitlines()[0])
-    dataset = DeepAccident("v1", own_release, verbose=False)
+    dataset, listed = DeepAccident("v1", own_release, verbose=False), tmp_path / "out/carla_infos_without_boxes.txt"
     form = ReleasedInfos(root_prefix="./DeepAccident", split="val", drop_empty=drop)
     with caplog.at_level(logging.WARNING):
         made = export_release(dataset, tmp_path / "out", form)
     boxless = [info["lidar_prefix"] for info in infos(made.folder) if not len(info["gt_boxes"])]
-    listed = tmp_path / "out/carla_infos_without_boxes.txt"
     if drop:
-        assert made.tally.left_out == {"infos without boxes": 1}
-        assert not boxless
-        assert not listed.exists()
+        assert (made.tally.left_out, boxless, listed.exists()) == ({"infos without boxes": 1}, [], False)
     else:
         assert listed.read_text().splitlines() == boxless == [f"type1_subtype2_accident_other_vehicle_{path.stem}"]
-        assert "1 infos have no boxes" in caplog.text
-        assert not made.tally.left_out
+        assert ("1 infos have no boxes" in caplog.text, made.tally.left_out) == (True, {})
 
 
 def test_the_command_of_mmdet3d_has_the_style(da: DeepAccident, tmp_path: Path) -> None:
@@ -177,8 +174,7 @@ def test_the_command_of_mmdet3d_has_the_style(da: DeepAccident, tmp_path: Path) 
     ],
 )
 def test_impossible_choices(choices: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ChoiceError, match=sentence):
-        ReleasedInfos(**choices)
+    assert_refused((lambda: ReleasedInfos(**choices), ChoiceError, sentence))
 
 
 @pytest.mark.parametrize(("opened", "prefix"), [("da", "data/DeepAccident_data/"), ("da_b", FOLDER)])
