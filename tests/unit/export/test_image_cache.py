@@ -75,14 +75,13 @@ def test_jpeg_images_are_nearly_the_uncached_ones(da: DeepAccident, cache: Image
     assert sizes[0] < sizes[1]
 
 
-def test_the_plan_is_what_is_written(da: DeepAccident, tmp_path: Path) -> None:
-    for codec, exact in (("raw", 0), ("jpeg", 0.5)):
-        form = CachedImages(images=IMAGES, where=ALL, codec=codec)  # type: ignore[arg-type]
-        done = export_release(da, tmp_path / codec, form, workers=1)
-        assert (done.tally.samples, done.tally.files) == (len(da.sample), len(da.scenario))
-        told = export_release(da, tmp_path / "none", form, dry_run=True).tally
-        assert told.bytes == pytest.approx(done.tally.bytes, rel=exact)
-        assert not done.tally.left_out
+@pytest.mark.parametrize(("codec", "exact"), [("raw", 0), ("jpeg", 0.5)])
+def test_the_plan_is_what_is_written(da: DeepAccident, tmp_path: Path, codec: Any, exact: float) -> None:
+    form = CachedImages(images=IMAGES, where=ALL, codec=codec)
+    done = export_release(da, tmp_path / "out", form, workers=1).tally
+    told = export_release(da, tmp_path / "none", form, dry_run=True).tally
+    assert (done.samples, done.files, done.left_out) == (len(da.sample), len(da.scenario), {})
+    assert told.bytes == pytest.approx(done.bytes, rel=exact)
 
 
 def test_what_a_partial_release_lacks_is_absent(da_partial: DeepAccident, tmp_path: Path) -> None:
@@ -135,15 +134,13 @@ def test_another_release_and_agents_without_images_are_refused(
 def test_what_is_no_complete_cache_is_refused(
     da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ConfigError, match=r"holds no cache of images \(.*\); make one with deepaccident cache"):
-        ImageCache(tmp_path)
-    form = CachedImages(images=IMAGES, where=ALL, agents=("infrastructure",))
-    with monkeypatch.context() as patch:
-        patch.setattr(CachedImages, "finish", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            export_release(da, tmp_path / "out", form, workers=1)
-    with pytest.raises(ConfigError, match="is not complete; run the deepaccident cache that makes it again"):
-        ImageCache(tmp_path / "out")
+    out, form = tmp_path / "out", CachedImages(images=IMAGES, where=ALL, agents=("infrastructure",))
+    monkeypatch.setattr(CachedImages, "finish", lambda *_: 1 / 0)
+    assert_refused(
+        (lambda: ImageCache(tmp_path), ConfigError, ("holds no cache of images", "make one with deepaccident cache")),
+        (lambda: export_release(da, out, form, workers=1), ZeroDivisionError, "division by zero"),
+        (lambda: ImageCache(out), ConfigError, ("is not complete", "run the deepaccident cache that makes it again")),
+    )
 
 
 @pytest.mark.parametrize(

@@ -135,15 +135,12 @@ def test_images_are_the_files_bytes(da: DeepAccident, scenario: str, file: McapF
 
 
 def test_calibrations_project_into_the_images(da: DeepAccident, scenario: str, file: McapFile) -> None:
-    image = file.only("/infrastructure/Camera_Back/image")[2]
-    message = file.only("/infrastructure/Camera_Back/calibration")[2]
+    image, message = (file.only(f"/infrastructure/Camera_Back/{kind}")[2] for kind in ("image", "calibration"))
     assert (message.width, message.height) == Image.open(BytesIO(image.data)).size
     assert message.frame_id == image.frame_id
-    _, _, intrinsic = da.get_sample_data(f"{sample(scenario, 'infrastructure', 3)}/Camera_Back")
-    record = da.get("sample_data", f"{sample(scenario, 'infrastructure', 3)}/Camera_Back")
-    assert intrinsic is not None
-    scale = message.width / record["width"]
-    expected = np.diag([scale, scale, 1.0]) @ intrinsic
+    camera = da.camera(sample(scenario, "infrastructure", 3), "Camera_Back")
+    scale = message.width / camera.width
+    expected = np.diag([scale, scale, 1.0]) @ camera.intrinsic
     np.testing.assert_allclose(np.reshape(message.K, (3, 3)), expected, atol=1e-9)
     np.testing.assert_allclose(np.reshape(message.P, (3, 4))[:, :3], expected, atol=1e-9)
     np.testing.assert_array_equal(np.reshape(message.R, (3, 3)), np.eye(3))
@@ -176,20 +173,17 @@ def test_clouds_have_all_points(da: DeepAccident, scenario: str, file: McapFile)
 def test_actors_are_the_union_of_all_annotations(da: DeepAccident, scenario: str, file: McapFile) -> None:
     for index, message in enumerate(file.only("/actors"), start=1):
         boxes = cooperative_boxes(da, sample(scenario, "ego_vehicle", index))
-        assert len(message.entities) == len(boxes) > 0
-        assert len({entity.id for entity in message.entities}) == len(boxes)
+        assert len(message.entities) == len({entity.id for entity in message.entities}) == len(boxes) > 0
         for row, entity in enumerate(message.entities):
             (cube,) = entity.cubes
-            pose = matrix_of(cube.pose.position, cube.pose.orientation)
-            assert entity.frame_id == "world"
+            pose, size = matrix_of(cube.pose.position, cube.pose.orientation), cube.size
             np.testing.assert_allclose(pose[:3, 3], boxes.center[row], atol=1e-9)
             np.testing.assert_allclose(np.arctan2(pose[1, 0], pose[0, 0]), boxes.yaw[row], atol=1e-6)
-            np.testing.assert_allclose([cube.size.x, cube.size.y, cube.size.z], boxes.size[row])
+            np.testing.assert_allclose([size.x, size.y, size.z], boxes.size[row])
             facts = {pair.key: pair.value for pair in entity.metadata}
-            assert facts["category"] == boxes.category_names[row]
-            assert facts["num_lidar_pts"] == str(boxes.num_lidar_pts[row])
-            if boxes.actor_id[row] != -1:
-                assert entity.id == facts["actor_id"] == str(boxes.actor_id[row])
+            told = (entity.frame_id, facts["category"], facts["num_lidar_pts"])
+            assert told == ("world", boxes.category_names[row], str(boxes.num_lidar_pts[row]))
+            assert boxes.actor_id[row] == -1 or entity.id == facts["actor_id"] == str(boxes.actor_id[row])
         assert [deletion.type for deletion in message.deletions] == [1]  # whoever has gone is not drawn any more
 
 
@@ -235,10 +229,10 @@ def test_annotations_are_each_agents_own(da: DeepAccident, scenario: str, file: 
         message = file.only(f"/{agent}/annotations")[3]
         assert len(message.entities) == len(boxes)
         for row, entity in enumerate(message.entities):
-            assert entity.frame_id == f"{agent}/{LIDAR}"
             facts = {pair.key: pair.value for pair in entity.metadata}
-            assert facts["label_id"] == str(boxes.actor_id[row])
-            assert facts["camera_visible"] == str(bool(boxes.camera_visible[row])).lower()
+            told = (entity.frame_id, facts["label_id"], facts["camera_visible"])
+            visible = str(bool(boxes.camera_visible[row])).lower()
+            assert told == (f"{agent}/{LIDAR}", str(boxes.actor_id[row]), visible)
             points = np.array([[point.x, point.y, point.z] for point in entity.lines[0].points])
             np.testing.assert_allclose(points[:24].mean(axis=0), boxes.center[row], atol=1e-9)
 

@@ -1,4 +1,4 @@
-"""OPV2V's folders, read back by a reader that knows OpenCOOD's conventions and not the devkit."""
+"""OPV2V's folders, read by a reader that knows OpenCOOD's conventions; CARLA's poses against its own formula."""
 
 import json
 from collections.abc import Callable
@@ -7,13 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from opencood_reader import agents_of, counts_of, facts_of, points_of, timestamps_of, world_from
 from refusals import assert_refused
+from strategies import matrices
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.export.bulk import Exported, export_release
-from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.export.opencood import OpenCood, carla_six
+from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
@@ -223,3 +228,39 @@ def test_without_labels_there_are_poses_and_clouds(own_release: Path, tmp_path: 
 )
 def test_impossible_choices(choices: dict[str, Any], sentence: str) -> None:
     assert_refused((lambda: OpenCood(**choices), ChoiceError, sentence))
+
+
+DEGREES = st.floats(-179.9, 179.9)
+
+
+def carla_matrix(x: float, y: float, z: float, roll: float, yaw: float, pitch: float) -> np.ndarray:
+    """What `carla.Transform.get_matrix` gives: metres and degrees, left-handed, as its `Transform` computes it."""
+    (cr, cy, cp), (sr, sy, sp) = np.cos(np.radians([roll, yaw, pitch])), np.sin(np.radians([roll, yaw, pitch]))
+    return np.array(
+        [
+            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr, x],
+            [cp * sy, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr, y],
+            [sp, -cp * sr, cp * cr, z],
+            [0, 0, 0, 1],
+        ]
+    )
+
+
+@given(roll=DEGREES, yaw=DEGREES, pitch=st.floats(-89, 89), place=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
+def test_a_carla_transform_there_and_back(roll: float, yaw: float, pitch: float, place: tuple[float, ...]) -> None:
+    six = carla_six(flip_pose(carla_matrix(*place, roll, yaw, pitch)))
+    assert_allclose(six, [*place, roll, yaw, pitch], rtol=0, atol=1e-9)
+
+
+@given(matrices())
+def test_a_pose_there_and_back(pose: np.ndarray) -> None:
+    """Also near pitches of 90°, where angles are not unique; arcsin is flat there, and keeps eight digits."""
+    assert_allclose(flip_pose(carla_matrix(*carla_six(pose))), pose, rtol=0, atol=1e-7)
+
+
+def test_directions_are_carlas() -> None:
+    """Ahead and to the left by 1 m, turned to the left and nose up: y, yaw and pitch of CARLA's sign."""
+    turned, raised = np.eye(4), np.eye(4)
+    turned[:3, 3], turned[:2, :2] = (1, 1, 0), [[0, -1], [1, 0]]
+    raised[:3, :3] = [[np.sqrt(0.5), 0, -np.sqrt(0.5)], [0, 1, 0], [np.sqrt(0.5), 0, np.sqrt(0.5)]]
+    assert_allclose(carla_six([turned, raised]), [[1, -1, 0, 0, -90, 0], [0, 0, 0, 0, 0, 45]], atol=1e-9)

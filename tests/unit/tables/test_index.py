@@ -188,11 +188,11 @@ def test_partial_releases_are_indexed_as_what_they_are(tmp_path: Path, missing: 
     if missing == "meta":
         assert (scenario["weather"], scenario["collision"], scenario["accident_type"]) == (None, None, None)
         own = release.get("annotation", f"{tiny.TOKEN}/ego_vehicle/001/0")
-        assert (own["instance_token"], own["time_to_impact"]) == (None, None)
-        assert own["next"] == f"{tiny.TOKEN}/ego_vehicle/002/0"
+        found = [own[name] for name in ("instance_token", "time_to_impact", "next")]
+        assert found == [None, None, f"{tiny.TOKEN}/ego_vehicle/002/0"]
     if missing == "infrastructure":
-        with pytest.raises(KeyError, match="the scenario's agents are ego_vehicle, ego_vehicle_behind"):
-            release.get_sample(scenario, "infrastructure", 1)
+        named = "the scenario's agents are ego_vehicle, ego_vehicle_behind"
+        assert_refused((lambda: release.get_sample(scenario, "infrastructure", 1), KeyError, named))
 
 
 def test_labels_without_calib_are_left_out_and_said_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -351,8 +351,9 @@ def test_scenarios_that_lack_the_same_are_told_in_one_line(root: Path, caplog: p
         meta.unlink()
     opened(root)
     (told,) = [record.getMessage() for record in caplog.records]
-    assert told.startswith(f"2 scenarios, such as {root / tiny.TYPE}/meta/")
-    assert told.endswith(": missing or not readable: weather and collision of this scenario are unknown")
+    assert re.match(
+        rf"2 scenarios, such as {root / tiny.TYPE}/meta/.*: missing .* weather and collision .* unknown$", told
+    )
 
 
 @pytest.mark.parametrize("frames", [3, 4, 6])
@@ -387,8 +388,7 @@ def index_in_the_cache(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("arguments", ["index", "index a b", "index a --clear --check"])
 def test_wrong_usage_is_status_2(arguments: str) -> None:
     result = CliRunner().invoke(deepaccident, arguments.split())
-    assert result.exit_code == 2
-    assert "Usage: " in result.output
+    assert (result.exit_code, "Usage: " in result.output) == (2, True)
 
 
 def test_clear_removes_every_index_and_says_what(root: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -409,9 +409,7 @@ def test_clear_removes_every_index_and_says_what(root: Path, cache: Path, monkey
         (own / name).touch()
     (found,) = cache.rglob("v1")
     assert run(root, "--clear").splitlines() == [f"removed {own}", f"removed {found}"]
-    assert contents(root) == release
-    assert not own.parent.exists()
-    assert not list(cache.rglob("v1"))
+    assert (contents(root), own.parent.exists(), list(cache.rglob("v1"))) == (release, False, [])
     assert run(root, "--clear") == f"{root}: no index to remove\n"
 
 
@@ -445,10 +443,10 @@ def test_clear_refuses_what_is_no_index(root: Path, tmp_path: Path, name: str) -
 
 
 def test_clear_leaves_another_manifest(root: Path, tmp_path: Path) -> None:
-    (tmp_path / "v1").mkdir()
-    (tmp_path / "v1" / MANIFEST_FILE).write_text("{}")
-    assert clear_index(root, index_dir=tmp_path) == []
-    assert (tmp_path / "v1" / MANIFEST_FILE).exists()
+    path = tmp_path / "v1" / MANIFEST_FILE
+    path.parent.mkdir()
+    path.write_text("{}")
+    assert (clear_index(root, index_dir=tmp_path), path.exists()) == ([], True)
 
 
 def test_clear_follows_no_symbolic_link(root: Path, tmp_path: Path) -> None:
@@ -466,8 +464,7 @@ def test_an_index_on_another_disk_is_cleared_there(root: Path, tmp_path: Path) -
     run(root)
     (root / INDEX).rename(tmp_path / "v1")
     (root / INDEX).symlink_to(tmp_path / "v1")
-    assert len(clear_index(root)) == 1
-    assert not list((tmp_path / "v1").iterdir())
+    assert (len(clear_index(root)), list((tmp_path / "v1").iterdir())) == (1, [])
 
 
 def test_a_newer_devkits_index_is_refused_and_kept_until_it_is_cleared(root: Path, tmp_path: Path) -> None:
