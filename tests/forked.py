@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.release import read_calib
 
 MEMORY = 1 << 30
-SECONDS = 10
+SECONDS = 60
 
 
 def main() -> None:

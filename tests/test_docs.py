@@ -46,7 +46,7 @@ WORDS_A_MINUTE = 200
 PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
 RUN_ELSEWHERE = {
     "docs/clusters.md": "tests/engines/test_page.py",
-    "docs/pictures.md": "tests/unit/export/test_mcap_choices.py",
+    "docs/pictures.md": "tests/unit/export/test_mcap.py",
     "docs/synth.md": "tests/unit/synth/test_synth_page.py",
     "docs/testing.md": "tests/unit/testing/test_page.py",
     "docs/training.md": "tests/torch_extra/test_batches.py",
@@ -75,7 +75,7 @@ NOT_RUN = {
     "predict constant_velocity hidden_release": "benchmarks/pages/baselines.py does that and the next one",
     "evaluate motion hidden_release": "likewise",
     "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
-    "results ": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
+    "results ": "tests/unit/export/nuscenes/test_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
     "explore ": "tests/browser/test_explore.py has it; it runs until Ctrl-C",
 }

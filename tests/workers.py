@@ -25,7 +25,7 @@ def interrupted(item: int) -> int:
 def told_and_asleep(path: str) -> None:
     if path:
         Path(path).write_text(str(os.getpid()))
-        time.sleep(60)
+        time.sleep(600)  # longer than anybody waits
 
 
 def told_or_broken(path: str) -> None:

@@ -207,7 +207,7 @@ def export_release(
     settings = {**form.settings(), "version": dataset.version}
     manifest = Manifest.of(root, form, settings)
     command = digest_of({"format": form.name, "settings": settings, "of": scenarios})
-    export, units = _Export(dataset, form, root, command), form.units(dataset, scenarios)
+    export, units = Export(dataset, form, root, command), form.units(dataset, scenarios)
     if dry_run:
         left = [] if manifest.release else [unit for unit in units if not export.is_written(unit)]
         tally = export.estimate(left, alone=len(left) == len(units))
@@ -240,7 +240,7 @@ class _Done:
 
 
 @dataclass(frozen=True, slots=True)
-class _Export:
+class Export:
     """An export of a format in a folder; cheap to pickle. The command is a digest of all that is asked for."""
 
     dataset: Dataset

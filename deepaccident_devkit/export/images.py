@@ -84,7 +84,7 @@ class ImageConfig:
         lens = dataset.camera(camera)
         if self.decode == "scaled" and self.resize is not None:
             image = dataset.load_image(camera, least=self.resize)
-            return _resized_part(image, self.resize, self.crop), self.intrinsic(lens, self.resize)
+            return resized_part(image, self.resize, self.crop), self.intrinsic(lens, self.resize)
         image = dataset.load_image(camera, size=self.resize)
         height, width = image.shape[:2]
         return self.cropped(image), self.intrinsic(lens, (height, width))
@@ -121,7 +121,7 @@ class ImageConfig:
         return result
 
 
-def _resized_part(image: ByteArray, size: tuple[int, int], crop: tuple[int, int, int, int] | None) -> ByteArray:
+def resized_part(image: ByteArray, size: tuple[int, int], crop: tuple[int, int, int, int] | None) -> ByteArray:
     """A part (top, left, height, width) of an image resized to `size` by OpenCV's area filter; None is all of it.
 
     Where the image shrinks, a pixel depends on the area that it covers alone, so little more than the part is made.

@@ -21,7 +21,7 @@ from deepaccident_devkit.tables.records import table_specs
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
 
-_ROWS: Final = 50_000
+ROWS: Final = 50_000
 """Rows of a group at most: what is in memory at once."""
 _ONCE: Final = ("sensor", "category")
 """Tables that are the same for all splits, and small."""
@@ -104,8 +104,8 @@ def _pieces(maker: RecordTables, table: str, rows: IntArray, split: str | None) 
     """The rows of a table, some at a time, with their split."""
     import pyarrow as pa
 
-    for start in range(0, len(rows), _ROWS):
-        piece = maker.table(table, rows[start : start + _ROWS])
+    for start in range(0, len(rows), ROWS):
+        piece = maker.table(table, rows[start : start + ROWS])
         if "split" not in piece.column_names:
             piece = piece.append_column("split", pa.array([split] * len(piece), type=pa.string()))
         yield piece

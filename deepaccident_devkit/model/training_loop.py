@@ -117,13 +117,13 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
             say=say or (lambda _text: None),
             bar=say is not None,
         )
-        model = _model(choice, config, weights, run.say)  # what is refused leaves no run behind
+        model = new_model(choice, config, weights, run.say)  # what is refused leaves no run behind
         if place.is_first:
             _claim(folder, run.notes)
         return run.trained(model.to(place.device))
 
 
-def _model(choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None, say: Say) -> V2XFormer:
+def new_model(choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None, say: Say) -> V2XFormer:
     """The model before the first step."""
     torch.manual_seed(config.seed)
     model = V2XFormer(choice.config)

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 _USUAL_WIDTH: Final = 64
 """Tasks at once of an executor that does not say it."""
 MPI: Final = "mpi"
-_SECONDS: Final = 10.0
+SECONDS: Final = 10.0
 """How long an empty file of a scheduler may still get its address."""
 _PACKAGE: Final = __name__.partition(".")[0]
 
@@ -149,7 +149,7 @@ def _address_in(file: Path) -> str:
 
     address = Annotated[str, msgspec.Meta(min_length=1, max_length=300)]
     record: Any = msgspec.defstruct("_Scheduler", [("address", address)])
-    end, content = time.monotonic() + _SECONDS, b""
+    end, content = time.monotonic() + SECONDS, b""
     while not content:
         with suppress(FileNotFoundError):
             content = read_bytes(file, "spec")

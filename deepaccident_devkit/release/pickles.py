@@ -22,7 +22,7 @@ _PROTOCOL: Final = 3
 _BEGIN: Final = pickle.PROTO + bytes([_PROTOCOL])
 _OLD_NAME: Final = b"cnumpy.core.multiarray\n"
 _NEW_NAME: Final = b"cnumpy._core.multiarray\n"
-_MOST_OPCODES: Final = 10_000
+MOST_OPCODES: Final = 10_000
 """A calib file has 263 to 543."""
 _DEEPEST: Final = 20
 """Containers within each other; a calib file has 1."""
@@ -58,10 +58,10 @@ def load_arrays(content: bytes) -> Any:
     pickle.UnpicklingError, and nothing of it has run.
     """
     try:
-        layout = next((each for each in _layouts if each.fits(content)), None)
+        layout = next((each for each in layouts if each.fits(content)), None)
         if layout is not None:
             return _Values(content).made(layout.value)
-        machine = Machine(content, _NAMES, _MOST_OPCODES)
+        machine = Machine(content, _NAMES, MOST_OPCODES)
         value = _Values(content).made(machine.value)
     except _FAULTS as error:
         said = shortened(fault_text(error), _LONGEST_SENTENCE)  # a pickle's own text may be no text for a screen
@@ -69,7 +69,7 @@ def load_arrays(content: bytes) -> Any:
     if machine.slices:
         starts, ends = [0, *(each.stop for each in machine.slices)], [*(each.start for each in machine.slices), None]
         parts = [(start, content[start:end]) for start, end in zip(starts, ends, strict=True)]
-        _layouts[:] = [_Layout(len(content), parts, machine.value), *_layouts[: _MOST_LAYOUTS - 1]]
+        layouts[:] = [_Layout(len(content), parts, machine.value), *layouts[: _MOST_LAYOUTS - 1]]
     return value
 
 
@@ -143,7 +143,7 @@ class _Layout(NamedTuple):
         return len(content) == self.size and all(content.startswith(part, start) for start, part in self.parts)
 
 
-_layouts: list[_Layout] = []
+layouts: list[_Layout] = []
 """The latest first."""
 
 

@@ -30,4 +30,4 @@ def cluster() -> Iterator[Cluster]:
         assert process.stdout is not None
         told = json.loads(process.stdout.readline())
         yield Cluster(told["address"], told["workers"])
-        process.communicate(timeout=60)
+        process.communicate(timeout=300)

@@ -1,5 +1,6 @@
 """Every bulk command on two dask workers, one of which is killed half-way; and clusters that cannot do the work."""
 
+import json
 import os
 import shutil
 import signal
@@ -107,7 +108,7 @@ def test_a_folder_that_workers_cannot_see(local: Local, scheduler: str, tmp_path
     worker = started_worker(scheduler, before=hidden)
     wait_for_worker(scheduler)
     line = [*words("opencood", {**local.places, "out": tmp_path}), "--scheduler", scheduler]
-    ended = subprocess.run(command(line), capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(command(line), capture_output=True, text=True, timeout=300, check=False)
     worker.kill()
     worker.wait()
     assert ended.returncode == 2
@@ -122,8 +123,7 @@ def started_scheduler(folder: Path) -> tuple[subprocess.Popen[str], str]:
     line = [sys.executable, "-c", f"{WITHOUT}; from distributed.cli.dask_scheduler import main; main()", *options]
     process = subprocess.Popen(line, stderr=subprocess.DEVNULL, text=True)  # it needs no devkit
     wait_for(lambda: file.exists() and '"address"' in file.read_text())
-    address = next(part for part in file.read_text().split('"') if part.startswith("tcp://"))
-    return process, address
+    return process, json.loads(file.read_text())["address"]
 
 
 def started_worker(address: str, setup: str = "", before: list[str] | None = None) -> subprocess.Popen[str]:

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import assert_refused
 from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
@@ -33,18 +34,15 @@ def moment(sample: str) -> list[str]:
 def test_each_ego_has_its_own_targets_and_its_partners(da: DeepAccident, moment: list[str], agents: str | None) -> None:
     config = V2XConfig(agents=agents, augmentation=RandomAugmentation(), **CONFIG)
     [item] = AllEgosDataset(da, moment, config)
-    assert item["egos"] == tuple(moment)
-    assert item["agents"][0] == AGENTS[-1]
+    assert (item["egos"], item["agents"][0]) == (tuple(moment), AGENTS[-1])
     for row, ego in enumerate(moment):
         alone = V2XDataset(da, [ego], config)[0]  # the first item in both: the same augmentation
-        for key, value in item["targets"][row].items():
-            assert torch.equal(value, alone[key])
-        assert {name for name, is_one in zip(item["agents"], item["partners"][row], strict=True) if is_one} == set(
-            alone["agents"]
-        )
+        targets = item["targets"][row]
+        assert_close(targets, {key: alone[key] for key in targets}, rtol=0, atol=0)
+        partners = {name for name, is_one in zip(item["agents"], item["partners"][row], strict=True) if is_one}
+        assert partners == set(alone["agents"])
         places = [item["agents"].index(name) for name in alone["agents"]]
-        for key in SENSORS:
-            assert torch.equal(item[key][places], alone[key])
+        assert_close([item[key][places] for key in SENSORS], [alone[key] for key in SENSORS], rtol=0, atol=0)
         ego_from_first = torch.linalg.inv(item["ego_from_agent"][places[0], -1].double())
         assert_close((ego_from_first @ item["ego_from_agent"][places].double()).float(), alone["ego_from_agent"])
 
@@ -56,9 +54,8 @@ def test_a_batch_lists_the_egos_of_all_moments(da: DeepAccident, moment: list[st
     assert batch["egos"] == [*later, *moment]
     names = [batch["agents"][b][a] for b, a in batch["ego_rows"].tolist()]
     assert names == [token.split("/")[-2] for token in batch["egos"]]
-    assert batch["partners"].shape == (8, 5)
-    assert batch["instance"].shape == (8, 5, 200, 200)
-    assert len(batch["boxes"]) == 8
+    shapes = (batch["partners"].shape, batch["instance"].shape, len(batch["boxes"]))
+    assert shapes == ((8, 5), (8, 5, 200, 200), 8)
     [by_default] = DataLoader(data, batch_size=2)
     assert by_default["egos"] == [*moment, *later]
 
@@ -78,12 +75,11 @@ def test_absent_agents_are_neither_egos_nor_partners(da_partial: DeepAccident, m
     assert whole["egos"] == tuple(there[:-1])
     first = AllEgosDataset(da_partial, there[::-1], config)[0]  # the one without its files is the first
     assert first["egos"] == tuple(there[-2::-1])
-    for key, value in first["targets"][0].items():
-        assert torch.equal(value, whole["targets"][-1][key])
+    assert_close(first["targets"][0], whole["targets"][-1], rtol=0, atol=0)
     with pytest.raises(MissingFileError, match="no agent has all its sensor files"):
         AllEgosDataset(da_partial, there[-1:], config)[0]
 
 
 def test_a_link_is_refused(da: DeepAccident, moment: list[str]) -> None:
-    with pytest.raises(ConfigError, match="each ego receives its own messages; use V2XDataset"):
-        AllEgosDataset(da, moment, V2XConfig(link=Link(latency=0.1)))
+    late = V2XConfig(link=Link(latency=0.1))
+    assert_refused((lambda: AllEgosDataset(da, moment, late), ConfigError, ("its own messages", "use V2XDataset")))

@@ -5,6 +5,7 @@ import pickle
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,39 +56,32 @@ def same(one: Any, other: Any) -> bool:
 
 def test_agents_side_by_side(da: DeepAccident, tokens: list[str]) -> None:
     one, two = (
-        V2XDataset(da, tokens[:1], V2XConfig(images=ImageConfig()))[0],
-        V2XDataset(da, tokens[1:2], V2XConfig(agents="all", images=ImageConfig()))[0],
+        V2XDataset(da, [token], V2XConfig(agents=agents, images=ImageConfig()))[0]
+        for token, agents in zip(tokens, ("single", "all"), strict=False)
     )
     batch = collate([one, two])
-    assert batch["token"] == tokens[:2]
-    assert batch["agents"] == [one["agents"], two["agents"]]
+    assert (batch["token"], batch["agents"]) == (tokens[:2], [one["agents"], two["agents"]])
     assert batch["agent_valid"].tolist() == [[[True]] + [[False]] * 4, [[True]] * 5]
-    assert batch["images"].shape == (2, 5, 1, 6, 3, 36, 64)
-    assert_array_equal(batch["images"][0, :1], one["images"])
-    assert not batch["images"][0, 1:].any()
+    assert (batch["images"].shape, batch["world_from_ego"].shape) == ((2, 5, 1, 6, 3, 36, 64), (2, 4, 4))
+    assert_array_equal(batch["images"][0], torch.cat([one["images"], torch.zeros_like(batch["images"][0, 1:])]))
     assert_array_equal(batch["intrinsics"][0, 1:], np.broadcast_to(np.eye(3), (4, 1, 6, 3, 3)))
     assert_array_equal(batch["ego_from_agent"][1], two["ego_from_agent"])
     assert [len(boxes) for boxes in batch["boxes"]] == [len(one["boxes"]), len(two["boxes"])]
     assert [len(agents) for agents in batch["points"]] == [1, 5]
-    assert batch["world_from_ego"].shape == (2, 4, 4)
     assert "record_len" not in batch
 
 
 def test_agents_one_after_another(da: DeepAccident, tokens: list[str]) -> None:
     items = [V2XDataset(da, [tokens[0]], V2XConfig(agents=agents))[0] for agents in ("+other", "single", "all")]
     batch = collate_fusion(items)
-    assert batch["record_len"].tolist() == [2, 1, 5]
-    assert batch["record_len"].dtype == torch.int64
-    assert batch["ego_from_agent"].shape == (8, 1, 4, 4)
-    assert len(batch["points"]) == 8
+    assert (batch["record_len"].tolist(), batch["record_len"].dtype) == ([2, 1, 5], torch.int64)
+    assert (batch["ego_from_agent"].shape, len(batch["points"])) == ((8, 1, 4, 4), 8)
     pairwise = batch["pairwise_t_matrix"]
-    assert pairwise.shape == (3, 5, 5, 4, 4)
     assert_array_equal(pairwise[1], np.broadcast_to(np.eye(4), (5, 5, 4, 4)))
     assert_array_equal(pairwise[0, 2:], np.broadcast_to(np.eye(4), (3, 5, 4, 4)))
-    for i, source in enumerate(items[2]["agents"]):
-        for j, target in enumerate(items[2]["agents"]):
-            frames = [da.get_sample(da.scenario[0], name, 4) for name in (target, source)]
-            assert_allclose(pairwise[2, i, j], da.transform(*frames).matrix, atol=1e-3)
+    frames = [da.get_sample(da.scenario[0], name, 4) for name in items[2]["agents"]]
+    expected = [[da.transform(target, source).matrix for target in frames] for source in frames]
+    assert_allclose(pairwise[2], expected, atol=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -158,8 +152,7 @@ def test_skipped_files_are_as_if_they_had_not_arrived(da: DeepAccident, da_parti
 
 @pytest.mark.parametrize("collated", [collate, collate_fusion])
 def test_items_that_make_no_batch(da: DeepAccident, tokens: list[str], collated: Callable[..., Any]) -> None:
-    with pytest.raises(ConfigError, match="batch: expected at least one item, found none"):
-        collated([])
+    assert_refused((lambda: collated([]), ConfigError, "batch: expected at least one item, found none"))
     plain, small, large, longer = (
         V2XDataset(da, tokens[:1], V2XConfig(points=False, boxes=None, **fields))[0]
         for fields in (
@@ -188,20 +181,15 @@ def test_opencoods_own_formula_gives_the_same_matrices(da: DeepAccident, sample:
     """Its t_list holds the poses to the ego's frame; pairwise[i, j] = inv(t_list[j]) · t_list[i]."""
     item = V2XDataset(da, [sample], V2XConfig(agents="all", augmentation=RandomAugmentation()))[0]
     t_list = item["ego_from_agent"][:, -1].double().numpy()
-    found = collate_fusion([item])["pairwise_t_matrix"][0]
-    for i in range(5):
-        for j in range(5):
-            assert_allclose(found[i, j], np.dot(np.linalg.inv(t_list[j]), t_list[i]), atol=1e-4)
+    expected = [[np.dot(np.linalg.inv(target), source) for target in t_list] for source in t_list]
+    assert_allclose(collate_fusion([item])["pairwise_t_matrix"][0], expected, atol=1e-4)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize("start", ["fork", "spawn"])
 def test_workers_give_what_one_process_gives(da: DeepAccident, tokens: list[str], start: str) -> None:
-    data = V2XDataset(da, tokens[:4], EVERYTHING)
-    arguments = {"batch_size": 2, "collate_fn": collate_fusion}
-    alone = list(DataLoader(data, **arguments))
-    shared = list(DataLoader(data, num_workers=2, multiprocessing_context=start, **arguments))
-    assert same(alone, shared)
+    load = partial(DataLoader, V2XDataset(da, tokens[:4], EVERYTHING), batch_size=2, collate_fn=collate_fusion)
+    assert same(list(load()), list(load(num_workers=2, multiprocessing_context=start)))
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -219,9 +207,8 @@ def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str]
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_errors_come_out_of_workers_as_they_are(da_b: DeepAccident) -> None:
-    data = V2XDataset(da_b, [da_b.sample[0]["token"]])
-    with pytest.raises(MissingFileError, match="no such file"):
-        next(iter(DataLoader(data, num_workers=1, collate_fn=collate)))
+    loader = DataLoader(V2XDataset(da_b, [da_b.sample[0]["token"]]), num_workers=1, collate_fn=collate)
+    assert_refused((lambda: next(iter(loader)), MissingFileError, "no such file"))
 
 
 def test_a_dataset_pickles_cheaply(da: DeepAccident) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from ranks import RANKS, counted, everything, run_ranks
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
@@ -18,16 +19,11 @@ from deepaccident_devkit.export.torch import RandomAugmentation, V2XConfig, V2XD
 Outcome = Callable[[str], list[Any]]
 
 
-def test_alone_one_process_merges_its_own() -> None:
+def test_alone_one_process_merges_its_own_and_only_evaluators() -> None:
     evaluator = MotionEvaluator()
     merged = merged_evaluator(evaluator)
-    assert merged is not evaluator
-    assert merged.settings == evaluator.settings
-
-
-def test_only_evaluators_are_merged() -> None:
-    with pytest.raises(EvaluationError, match=r"MotionEvaluator\(\), rank 0 has 0\.5"):
-        merged_evaluator(0.5)  # type: ignore[type-var]
+    assert (merged is evaluator, merged.settings) == (False, evaluator.settings)
+    assert_refused((lambda: merged_evaluator(0.5), EvaluationError, ("MotionEvaluator()", "rank 0 has 0.5")))
 
 
 @pytest.fixture(scope="module")

@@ -91,13 +91,14 @@ def test_workers_read_the_cache(da: DeepAccident, folder: Path, tokens: list[str
 def test_what_the_cache_cannot_serve_is_refused(
     da: DeepAccident, folder: Path, sample: str, changes: dict[str, Any], words: str
 ) -> None:
-    with pytest.raises(ConfigError, match=words):
-        V2XDataset(da, [sample], replace(CONFIG, **{"images_cache": folder, **changes}))
+    config = replace(CONFIG, **{"images": IMAGES, "images_cache": folder, **changes})
+    assert_refused((lambda: V2XDataset(da, [sample], config), ConfigError, words))
 
 
 def test_a_cache_without_images_is_refused() -> None:
-    with pytest.raises(ConfigError, match="images_cache: changes nothing without images"):
-        V2XConfig(images_cache="somewhere")
+    assert_refused(
+        (lambda: V2XConfig(images_cache="cache"), ConfigError, "images_cache: changes nothing without images")
+    )
 
 
 def test_samples_and_agents_that_are_not_in_it_are_refused(da: DeepAccident, sample: str, tmp_path: Path) -> None:

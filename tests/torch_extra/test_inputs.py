@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes
@@ -69,8 +70,9 @@ def test_tensors_on_the_processor_are_read(entry: Callable[[torch.Tensor], Any],
     ids=["grad", "device", "bfloat16", "complex"],
 )
 def test_others_are_refused_with_the_remedy(entry: Callable[[torch.Tensor], Any], tensor: torch.Tensor) -> None:
-    with pytest.raises(GeometryError, match=r"found Tensor \(.*\); pass a torch tensor as tensor\.detach\(\)\.cpu\(\)"):
-        entry(tensor)
+    assert_refused(
+        (lambda: entry(tensor), GeometryError, ("found Tensor (", "pass a torch tensor as tensor.detach().cpu()"))
+    )
 
 
 @pytest.mark.parametrize("entry", [heads, heads_in_order, labels_of_a_batch])
@@ -80,7 +82,6 @@ def test_numbers_beyond_float32_are_refused(entry: Callable[[torch.Tensor], Any]
 
 
 def test_the_remedy_is_one() -> None:
-    tensor = torch.rand(SHAPES["segmentation"]).bfloat16().requires_grad_()
-    taken = tensor.detach().cpu().float()
+    taken = torch.rand(SHAPES["segmentation"]).bfloat16().requires_grad_().detach().cpu().float()
     zeros = [torch.zeros(shape) for shape in SHAPES.values()][1:]
     assert_array_equal(MotionHeads.from_arrays(taken, *zeros).segmentation, taken.numpy())

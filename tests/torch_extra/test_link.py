@@ -1,9 +1,9 @@
 """Link effects: partners' data late, misplaced, lost; the truth untouched."""
 
 import numpy as np
-import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
@@ -93,13 +93,13 @@ def test_boxes_and_labels_stay_the_truth(da: DeepAccident, sample: str) -> None:
 
 
 def test_samples_before_the_first_data_are_refused_at_once(da: DeepAccident) -> None:
-    scenario, link = da.scenario[0]["token"], Link(latency=0.3)
+    scenario, late = da.scenario[0]["token"], {"link": Link(latency=0.3)}
     tokens = [f"{scenario}/ego_vehicle/{frame:03d}" for frame in range(1, 7)]
-    with pytest.raises(
-        ConfigError, match=rf"3 of the 6 samples are within the first 0\.3 s .*{scenario}.*leave them out"
-    ):
-        V2XDataset(da, tokens, V2XConfig(agents="+behind", link=link))
-    alone = V2XDataset(da, tokens, V2XConfig(link=link))
-    assert all(item["agent_valid"].all() for item in alone)
-    later = V2XDataset(da, tokens[3:], V2XConfig(agents="+behind", link=link, past=2, step=1))
+    behind, named = (
+        V2XConfig(agents="+behind", **late),
+        ("3 of the 6 samples", "first 0.3 s", scenario, "leave them out"),
+    )
+    assert_refused((lambda: V2XDataset(da, tokens, behind), ConfigError, named))
+    assert all(item["agent_valid"].all() for item in V2XDataset(da, tokens, V2XConfig(**late)))
+    later = V2XDataset(da, tokens[3:], V2XConfig(agents="+behind", **late, past=2, step=1))
     assert later[0]["agent_valid"].tolist() == [[True, True], [False, True]]

@@ -106,7 +106,7 @@ def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
 def _scheduled(room: Room) -> str:
     """Nobody listens at the healthy address, and it is right to say so."""
     try:
-        with patch.object(executors, "_SECONDS", 0.2), cluster_executor(scheduler_file=room.victim):
+        with patch.object(executors, "SECONDS", 0.2), cluster_executor(scheduler_file=room.victim):
             return "a scheduler"
     except WorkerError:
         same = room.victim.is_file() and room.victim.stat().st_size == room.healthy.stat().st_size

@@ -36,7 +36,7 @@ _SECRETS: Final = re.compile(r"\?\S*|(?<=://)[^/@\s]+@")
 _LARGEST_GAP: Final = 1 << 16
 _LARGEST_RANGE: Final = 64 << 20
 """Bytes between two members that are fetched with them, and that are fetched at once."""
-_MOST_OPEN: Final = 256
+MOST_OPEN: Final = 256
 """Archives that are open at once in a process; a system allows some 1,000 files."""
 Range = tuple[str, int, int]
 """An archive, and the first byte and the one after the last."""
@@ -91,7 +91,7 @@ class LocalSource(Source):
     def _open(self, archive: str) -> _Archive:
         with open_file(self._folder / archive) as file:
             opened = self._opened[archive] = _Archive(os.dup(file.fileno()))
-        if len(self._opened) > _MOST_OPEN:
+        if len(self._opened) > MOST_OPEN:
             self._opened.pop(next(iter(self._opened)), None)
         return opened
 

@@ -110,13 +110,13 @@ def killed_run(root: str, folder: str, step: int) -> None:
 def one_of_several(root: str, folder: Path) -> None:
     """A run of two steps on one of several processes; leaves its parameters, as it has them at the end."""
     made: list[torch.nn.Module] = []
-    model_of = training._model
+    model_of = training.new_model
 
     def watched(*arguments: Any) -> Any:
         made.append(model_of(*arguments))
         return made[-1]
 
-    with patch.object(training, "_model", watched):
+    with patch.object(training, "new_model", watched):
         trained(DeepAccident("v1", root, verbose=False), folder, replace(RUN, steps=2, validation=None))
     torch.save(dict(made[0].named_parameters()), folder / f"rank_{os.environ['RANK']}.pth")
 

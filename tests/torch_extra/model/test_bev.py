@@ -69,13 +69,11 @@ def test_what_does_not_fit_is_refused() -> None:
 
 @pytest.mark.parametrize(("encoder", "shape"), ENCODERS)
 def test_encoders_have_their_sizes_and_use_every_weight(encoder, shape) -> None:
-    features = torch.rand(2, 6, 16, 24)
-    result = encoder.train()(features)
+    encoder.train().zero_grad()
+    result = encoder(torch.rand(2, 6, 16, 24))
     assert tuple(result.shape) == (2, *shape)
-    encoder.zero_grad()
     result.square().sum().backward()
-    unused = [name for name, values in encoder.named_parameters() if values.grad is None or not values.grad.any()]
-    assert not unused
+    assert [name for name, each in encoder.named_parameters() if each.grad is None or not each.grad.any()] == []
 
 
 def test_the_small_encoder_takes_odd_sizes() -> None:
@@ -92,8 +90,7 @@ def test_the_small_encoder_takes_odd_sizes() -> None:
     ],
 )
 def test_impossible_sizes_are_refused(config, values, message) -> None:
-    with pytest.raises(ConfigError, match=message):
-        config(**values)
+    assert_refused((lambda: config(**values), ConfigError, message))
 
 
 def plane(grid: BevGrid) -> torch.Tensor:

@@ -175,7 +175,8 @@ def test_a_released_checkpoint_without_its_fusion_fits_another_fusion(tmp_path: 
 def test_official_swin_weights_go_into_the_image_encoder(tmp_path: Path) -> None:
     """Microsoft's names and order of tokens, under `model`."""
     config = replace(small(), encoder=SwinConfig(embed_dims=8, depths=(1, 1), num_heads=(1, 1), out_stages=(0, 1)))
-    model, path = V2XFormer(replace(config, lift=lift_of(config, 4, 512))), tmp_path / "swin.pth"
+    lift = replace(config.lift, stride=4, in_channels=512)
+    model, path = V2XFormer(replace(config, lift=lift)), tmp_path / "swin.pth"
     weight = torch.arange(16.0 * 32).view(16, 32)
     official = {
         "patch_embed.proj.weight": torch.full((8, 3, 4, 4), 2.0),
@@ -193,10 +194,6 @@ def test_official_swin_weights_go_into_the_image_encoder(tmp_path: Path) -> None
     assert (state["img_backbone.stages.0.blocks.0.ffn.layers.0.0.bias"] == 3).all()
     merged = state["img_backbone.stages.0.downsample.reduction.weight"]
     assert torch.equal(merged.view(16, 8, 4)[:, :, 1], weight.view(16, 4, 8)[:, 2])
-
-
-def lift_of(config: Any, stride: int, channels: int) -> Any:
-    return replace(config.lift, stride=stride, in_channels=channels)
 
 
 class Opens:
@@ -228,59 +225,62 @@ def assert_refused(path: Path, message: str) -> None:
     assert "; give " in str(error.value)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.999])
-@pytest.mark.parametrize("ours", [True, False])
-def test_truncated_files_are_refused(model: Model, tmp_path: Path, share: float, *, ours: bool) -> None:
-    path = tmp_path / "weights"
-    if ours:
-        write_weights(path, model(0).state_dict(), META)
-    else:
-        torch.save(model(0).state_dict(), path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(len(whole) * share)])
-    assert_refused(path, "is no ")
+def noted(text: str) -> Callable[[Path], None]:
+    """A file of ours with these notes."""
+    return lambda path: save_file({"img_neck.weight": torch.zeros(1)}, path, metadata={"deepaccident": text})
+
+
+def cut(write: Callable[[Path], object], share: float) -> Callable[[Path], None]:
+    """This share of a file."""
+
+    def make(path: Path) -> None:
+        write(path)
+        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+
+    return make
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("make", "message"),
     [
-        (b"lr: 0.002\nsteps: 1500\n", "is no file of weights"),
-        (b"PK\x03\x04 and no more", "is no plain checkpoint"),
-        (b"\x80\x02", "is no plain checkpoint"),
-        (b"\x80\x05", "is no file of weights"),
-        (b"\x08\0\0\0\0\0\0\0[1,2,3] ", "is no file of weights"),
-        (b'{"epoch": 20}', "is no file of weights"),
+        (lambda _: None, "weights cannot be read (No such file or directory)"),
+        *(
+            (lambda path, content=content: path.write_bytes(content), message)
+            for content, message in {
+                b"lr: 0.002\nsteps: 1500\n": "is no file of weights",
+                b"PK\x03\x04 and no more": "is no plain checkpoint",
+                b"\x80\x02": "is no plain checkpoint",
+                b"\x80\x05": "is no file of weights",
+                b"\x08\0\0\0\0\0\0\0[1,2,3] ": "is no file of weights",
+                b'{"epoch": 20}': "is no file of weights",
+            }.items()
+        ),
+        *(
+            (lambda path, content=content: torch.save(content, path), "holds no tensors by name")
+            for content in ([1, 2], {"state_dict": {"epoch": 3}}, {}, torch.zeros(3))
+        ),
+        *((noted(text), "is no file of weights") for text in ("{", "tiny", "[1]", '"tiny"', "3")),
+        *(
+            (cut(write, share), "is no ")
+            for share in (0.0, 0.001, 0.3, 0.999)
+            for write in (
+                lambda path: write_weights(path, V2XFormer(small()).state_dict(), META),
+                lambda path: torch.save(V2XFormer(small()).state_dict(), path),
+            )
+        ),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
+def test_what_is_no_file_of_weights_is_refused(tmp_path: Path, make: Callable[[Path], object], message: str) -> None:
+    """Absent, another file, nothing by name, notes that are no JSON object, cut off."""
     path = tmp_path / "weights.pth"
-    path.write_bytes(content)
+    make(path)
     assert_refused(path, message)
-
-
-@pytest.mark.parametrize("content", [[1, 2], {"state_dict": {"epoch": 3}}, {}, torch.zeros(3)])
-def test_files_without_named_tensors_are_refused(tmp_path: Path, content: Any) -> None:
-    path = tmp_path / "weights.pth"
-    torch.save(content, path)
-    assert_refused(path, "holds no tensors by name")
-
-
-@pytest.mark.parametrize("noted", ["{", "tiny", "[1]", '"tiny"', "3"])
-def test_notes_that_are_no_json_object_are_refused(tmp_path: Path, noted: str) -> None:
-    path = tmp_path / "weights.safetensors"
-    save_file({"img_neck.weight": torch.zeros(1)}, path, metadata={"deepaccident": noted})
-    assert_refused(path, "is no file of weights")
 
 
 @pytest.mark.parametrize("metadata", [None, {"format": "pt"}])
 def test_safetensors_of_others_have_no_notes(tmp_path: Path, metadata: dict[str, str] | None) -> None:
-    path = tmp_path / "weights.safetensors"
-    save_file({"img_neck.weight": torch.ones(1)}, path, metadata=metadata)
-    assert read_weights(path).meta == {}
-
-
-def test_absent_files_are_refused(tmp_path: Path) -> None:
-    assert_refused(tmp_path / "none.pth", "weights cannot be read (No such file or directory)")
+    save_file({"img_neck.weight": torch.ones(1)}, tmp_path / "weights.safetensors", metadata=metadata)
+    assert read_weights(tmp_path / "weights.safetensors").meta == {}
 
 
 def test_of_a_run_the_best_weights_are_read(model: Model, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import CliRunner, Result
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -21,12 +22,9 @@ def run(*words: object) -> Result:
     return CliRunner().invoke(deepaccident, [str(word) for word in words], catch_exceptions=False)
 
 
-def refusal(kind: type[DeepAccidentError], *words: object) -> str:
-    """The error of a command, one line."""
-    with pytest.raises(kind) as caught:
-        run(*words)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+def refused(kind: type[DeepAccidentError], named: tuple[str, ...], *words: object) -> None:
+    """The error of a command is one line, which names these."""
+    assert_refused((lambda: run(*words), kind, r"\A[^\n]*\Z"), (lambda: run(*words), kind, named))
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +60,7 @@ def test_one_set_of_weights_predicts_for_any_agents(
     assert result.exit_code == 0
     for task, name in {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}.items():
         found = read_results(out / name)
-        assert found.task == task
-        assert found.meta["agents"] == agents
+        assert (found.task, found.meta["agents"]) == (task, agents)
         assert found.meta["model"]["preset"] == "tiny"
         assert f"{task}: {len(found.tokens)} samples in {out / name}" in result.output
     assert read_results(out / "motion").form.grid.shape == (100, 100)
@@ -77,31 +74,24 @@ def test_one_set_of_weights_predicts_for_any_agents(
 
 def test_what_is_there_already_is_not_overwritten(trained: Path, release_root: Path, tmp_path: Path) -> None:
     (tmp_path / "accident.json").write_text("mine", encoding="utf-8")
-    said = refusal(
-        DeepAccidentError,
-        *("predict", trained, release_root, "--split", "train", "--scope", "all", "--out", tmp_path, "--device", "cpu"),
-    )
-    assert "accident.json: is there already" in said
-    assert (tmp_path / "accident.json").read_text(encoding="utf-8") == "mine"
-    assert not (tmp_path / "motion").exists()
+    words = ("predict", trained, release_root, "--split", "train", "--scope", "all", "--out", tmp_path)
+    refused(DeepAccidentError, ("accident.json: is there already",), *words, "--device", "cpu")
+    assert {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()} == {"accident.json": "mine"}
 
 
 def test_weights_of_another_model_say_which_keys_differ(trained: Path, release_root: Path, tmp_path: Path) -> None:
     words = ("train", release_root, "--fusion", "disconet", "--steps", 1, "--out", tmp_path / "run", *QUICK)
-    warm = run(*words, "--from", trained)
-    assert "as they were: v2x_fusion." in warm.output
+    assert "as they were: v2x_fusion." in run(*words, "--from", trained).output
     other = ("train", release_root, "--preset", "released", "--steps", 1, "--out", tmp_path / "big", *QUICK)
-    said = refusal(ConfigError, *other, "--from", trained)
-    assert "weights of the preset 'tiny' do not fit this model" in said
-    assert re.search(r"\d+ of the model are missing \(img_backbone\.", said)
+    named = ("weights of the preset 'tiny' do not fit this model", " of the model are missing (img_backbone.")
+    refused(ConfigError, named, *other, "--from", trained)
 
 
 def test_a_release_without_images(release_root_b: Path, trained: Path, tmp_path: Path) -> None:
-    for words in (("train", release_root_b, "--out", tmp_path / "run"), ("predict", trained, release_root_b)):
-        named = words if words[0] == "train" else (*words, "--out", tmp_path / "results", "--samples", "all")
-        said = refusal(NotAvailableError, *named, "--split", "train", "--device", "cpu")
-        assert "this release has no images" in said
-        assert "deepaccident synth OUT --sensors cameras" in said
+    named = ("this release has no images", "deepaccident synth OUT --sensors cameras")
+    train, predict = ("train", release_root_b), ("predict", trained, release_root_b, "--samples", "all")
+    for words in (train, predict):
+        refused(NotAvailableError, named, *words, "--out", tmp_path / "out", "--split", "train", "--device", "cpu")
 
 
 @pytest.mark.parametrize(
@@ -115,15 +105,15 @@ def test_a_release_without_images(release_root_b: Path, trained: Path, tmp_path:
     ],
 )
 def test_wrong_options_are_one_line(release_root: Path, tmp_path: Path, words: tuple[object, ...], said: str) -> None:
-    found = refusal(DeepAccidentError, "train", release_root, "--steps", 1, *QUICK, *words, "--out", tmp_path / "run")
-    assert said in found
+    given = ("train", release_root, "--steps", 1, *QUICK, *words, "--out", tmp_path / "run")
+    refused(DeepAccidentError, (said,), *given)
     assert not list(tmp_path.glob("run/*"))
 
 
 def test_weights_that_do_not_say_what_they_are_of(trained: Path, tmp_path: Path) -> None:
     torch.save(load_model(trained).state_dict(), tmp_path / "foreign.pth")
-    said = refusal(ConfigError, "predict", tmp_path / "foreign.pth", tmp_path, "--out", tmp_path / "results")
-    assert "does not say which model its weights are of" in said
+    words = ("predict", tmp_path / "foreign.pth", tmp_path, "--out", tmp_path / "results")
+    refused(ConfigError, ("does not say which model its weights are of",), *words)
 
 
 def test_the_pages_commands_exist() -> None:
@@ -139,5 +129,5 @@ def test_the_pages_commands_exist() -> None:
 def test_a_partial_release_trains_with_the_agents_that_are_there(da_partial: DeepAccident, tmp_path: Path) -> None:
     """It has no other_vehicle_behind, and the ego no front camera."""
     words = ("train", da_partial.dataroot, "--steps", 1, "--out", tmp_path / "run", *QUICK)
-    assert "other_vehicle_behind is not in this release" in refusal(NotAvailableError, *words)
+    refused(NotAvailableError, ("other_vehicle_behind is not in this release",), *words)
     assert run(*words, "--agents", "available").exit_code == 0

@@ -11,9 +11,10 @@ import shapely
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import assert_refused
 from torch import Tensor
 
-from deepaccident_devkit.errors import ConfigError, DeepAccidentError, GeometryError
+from deepaccident_devkit.errors import DeepAccidentError, GeometryError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.model.detection import (
     ONE_TASK,
@@ -103,11 +104,6 @@ def test_mixed_precision_gives_finite_single_precision_losses_and_boxes(config: 
     assert len(found.boxes) > 0
 
 
-def test_features_of_another_size_are_refused() -> None:
-    with pytest.raises(ConfigError, match="features: 24 × 32 cells after upsampling by 2, expected 12 × 16"):
-        CenterHead(JOINT)(torch.zeros(1, 4, 12, 16))
-
-
 @pytest.mark.parametrize("head", [SMALL, replace(SMALL, class_slots=ONE_TASK)], ids=["tasks", "one task"])
 @given(seed=SEEDS, count=st.integers(0, 30))
 @BUILT
@@ -165,8 +161,7 @@ def test_boxes_outside_or_of_no_category_are_left_out() -> None:
 def test_at_most_so_many_boxes_of_a_task() -> None:
     boxes, _ = random_boxes(5, 9)
     cars, *_ = detection_targets([boxes], [torch.zeros(9, dtype=torch.long)], SMALL, TargetConfig(max_boxes=4))
-    assert cars.mask.tolist() == [[True] * 4]
-    assert int((cars.heatmap == 1).sum()) == 4
+    assert (cars.mask.tolist(), int((cars.heatmap == 1).sum())) == ([[True] * 4], 4)
 
 
 def test_unknown_velocities_are_trained_to_zero_or_not_at_all() -> None:
@@ -267,19 +262,19 @@ def test_suppression_depends_neither_on_the_order_nor_on_the_axes(method: Any, s
     np.testing.assert_array_equal(suppress(mirrored, scores, slots, rules), kept)
 
 
-def test_scales_are_those_of_the_slots() -> None:
+@pytest.mark.parametrize(
+    ("scale", "kept"), [(NmsConfig().scale, [0, 1, 2, 3]), ((1.0, 3.0), [0, 1, 2]), ((3.0,), [0, 2])]
+)
+def test_scales_are_those_of_the_slots(scale: tuple[float, ...], kept: list[int]) -> None:
     boxes = as_boxes(np.array([[0.0, 0, 2, 2, 0], [1.5, 0, 2, 2, 0], [10.0, 0, 2, 2, 0], [11.5, 0, 2, 2, 0]]))
     scores, slots = np.array([0.4, 0.3, 0.2, 0.1]), np.array([0, 0, 1, 1])
-    assert suppress(boxes, scores, slots, NmsConfig()).tolist() == [0, 1, 2, 3]
-    assert suppress(boxes, scores, slots, NmsConfig(scale=(1.0, 3.0))).tolist() == [0, 1, 2]
-    assert suppress(boxes, scores, slots, NmsConfig(scale=(3.0,))).tolist() == [0, 2]
+    assert suppress(boxes, scores, slots, NmsConfig(scale=scale)).tolist() == kept
 
 
 def test_the_best_stay_if_there_are_too_many() -> None:
     boxes = as_boxes(np.column_stack([np.arange(9) * 10.0, *np.ones((4, 9))]))
     assert suppress(boxes, np.arange(9.0), np.zeros(9, dtype=int), NmsConfig(keep=3)).tolist() == [8, 7, 6]
-    none = suppress(boxes[:0], np.zeros(0), np.zeros(0, dtype=int), NmsConfig(scale=(1.0, 2.0)))
-    assert none.tolist() == []
+    assert suppress(boxes[:0], np.zeros(0), np.zeros(0, dtype=int), NmsConfig(scale=(1.0, 2.0))).tolist() == []
 
 
 def test_detected_boxes_stand_in_the_world() -> None:
@@ -288,15 +283,11 @@ def test_detected_boxes_stand_in_the_world() -> None:
     pose = SE3.from_yaw(math.pi / 2, (100.0, 200.0, 3.0))
     for given_pose in (pose, pose.matrix, torch.from_numpy(pose.matrix.copy())):
         world = detected_boxes(found, given_pose)
-        assert world.boxes.frame == "world"
-        np.testing.assert_allclose(world.boxes.center, [[98.0, 210.0, 4.0]], atol=1e-6)
-        np.testing.assert_allclose(world.boxes.size, [[4.0, 2.0, 1.5]], atol=1e-6)
-        np.testing.assert_allclose(world.boxes.yaw, [0.25 + math.pi / 2], atol=1e-6)
-        np.testing.assert_allclose(world.boxes.velocity, [[-1.0, 5.0, 0.0]], atol=1e-6)
-        assert world.boxes.category_names == ["cyclist"]
-        assert world.scores.tolist() == [0.5]
-    with pytest.raises(GeometryError, match=r"SE3\.matrix"):
-        detected_boxes(found, np.ones((4, 4)))
+        rows = np.column_stack([world.boxes.center, world.boxes.size, world.boxes.yaw, world.boxes.velocity])
+        expected = [[98.0, 210.0, 4.0, 4.0, 2.0, 1.5, 0.25 + math.pi / 2, -1.0, 5.0, 0.0]]
+        np.testing.assert_allclose(rows, expected, atol=1e-6)
+        assert (world.boxes.frame, world.boxes.category_names, world.scores.tolist()) == ("world", ["cyclist"], [0.5])
+    assert_refused((lambda: detected_boxes(found, np.ones((4, 4))), GeometryError, r"SE3\.matrix"))
 
 
 def test_a_sample_without_boxes_gives_none() -> None:
@@ -305,14 +296,8 @@ def test_a_sample_without_boxes_gives_none() -> None:
     assert [len(detected_boxes(each, SE3.identity())) for each in found] == [0, 0]
 
 
-def two_suppressions() -> object:
-    maps = CenterHead(SMALL)(features_of(SMALL))
-    return decode_detections(maps, SMALL, DecodingConfig(nms=(NmsConfig(), NmsConfig())))
-
-
-def three_scales() -> object:
-    maps = CenterHead(SMALL)(features_of(SMALL))
-    return decode_detections(maps, SMALL, DecodingConfig(nms=(NmsConfig(scale=(1.0, 1.0, 1.0)),)))
+def suppressed_by(*nms: NmsConfig) -> object:
+    return decode_detections(CenterHead(SMALL)(features_of(SMALL)), SMALL, DecodingConfig(nms=nms))
 
 
 @pytest.mark.parametrize(
@@ -335,10 +320,10 @@ def three_scales() -> object:
         (lambda: NmsConfig(threshold=-0.1), "threshold: expected a number from 0, found -0.1"),
         (lambda: NmsConfig(scale=(1.0, 0.0)), "scale: expected one number above 0, or one a slot"),
         (lambda: NmsConfig(keep=0), "keep: expected a number from 1, found 0"),
-        (two_suppressions, "nms: expected one NmsConfig, or 4, one a task; found 2"),
-        (three_scales, "nms: task 0 has 1 slots, found 3 scales"),
+        (lambda: suppressed_by(NmsConfig(), NmsConfig()), "nms: expected one NmsConfig, or 4, one a task; found 2"),
+        (lambda: suppressed_by(NmsConfig(scale=(1.0, 1.0, 1.0))), "nms: task 0 has 1 slots, found 3 scales"),
+        (lambda: CenterHead(JOINT)(torch.zeros(1, 4, 12, 16)), "24 × 32 cells after upsampling by 2, expected 12 × 16"),
     ],
 )
 def test_what_cannot_be_is_refused(make: Callable[[], object], sentence: str) -> None:
-    with pytest.raises(DeepAccidentError, match=sentence):
-        make()
+    assert_refused((make, DeepAccidentError, sentence))

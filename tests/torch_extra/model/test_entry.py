@@ -59,27 +59,22 @@ def test_a_left_handed_model_sees_all_in_the_mirror(batch: dict[str, Any]) -> No
 
 
 def test_a_right_handed_model_sees_the_batch_as_it_is(batch: dict[str, Any]) -> None:
-    inputs = model_inputs(batch)
-    assert torch.equal(inputs.images, batch["images"])
-    assert torch.equal(inputs.bev_transform, batch["augmentation"])
-    assert torch.equal(inputs.cameras.rotation, batch["ego_from_camera"][..., :3, :3])
-    assert torch.equal(inputs.cameras.translation, batch["ego_from_camera"][..., :3, 3])
-    assert torch.equal(inputs.cameras.intrinsics, batch["intrinsics"])
+    inputs, cameras = model_inputs(batch), batch["ego_from_camera"]
+    found = (inputs.images, inputs.bev_transform, inputs.cameras.rotation, inputs.cameras.translation)
+    expected = (batch["images"], batch["augmentation"], cameras[..., :3, :3], cameras[..., :3, 3])
+    assert_close([*found, inputs.cameras.intrinsics], [*expected, batch["intrinsics"]], rtol=0, atol=0)
     assert_close(inputs.ego_from_agent, batch["ego_from_agent"][:, :, -1])
-    assert inputs.ego_rows.tolist() == [[0, 0]]
-    assert inputs.partners.tolist() == [[True] * 5]
+    assert (inputs.ego_rows.tolist(), inputs.partners.tolist()) == ([[0, 0]], [[True] * 5])
     assert [name == "infrastructure" for name in batch["agents"][0]] == inputs.is_infrastructure[0].tolist()
 
 
 def test_boxes_are_mirrored_as_the_devkit_does() -> None:
     boxes = torch.randn(6, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert mirrored_boxes(boxes, "right") is boxes
-    left = mirrored_boxes(boxes, "left").numpy()
-    np.testing.assert_array_equal(left[:, :3], flip_points(boxes[:, :3]))
-    np.testing.assert_array_equal(left[:, 3:6], boxes[:, 3:6])
-    np.testing.assert_array_equal(left[:, 6], flip_yaw(boxes[:, 6]))
-    np.testing.assert_array_equal(left[:, 7:], flip_vectors2(boxes[:, 7:]))
-    assert torch.equal(mirrored_boxes(torch.as_tensor(left), "left"), boxes)
+    left = mirrored_boxes(boxes, "left")
+    columns = (flip_points(boxes[:, :3]), boxes[:, 3:6], flip_yaw(boxes[:, 6]), flip_vectors2(boxes[:, 7:]))
+    np.testing.assert_array_equal(left.numpy(), np.column_stack(columns))
+    assert torch.equal(mirrored_boxes(left, "left"), boxes)
 
 
 def test_egomotion_is_that_of_the_labels_without_the_augmentation(
@@ -128,8 +123,7 @@ def test_an_agent_whose_present_did_not_arrive_is_no_partner(batch: dict[str, An
     changed = batch | {"agent_valid": batch["agent_valid"].clone()}
     changed["agent_valid"][0, 3, -1] = False
     inputs = model_inputs(changed)
-    assert inputs.partners.tolist() == [[True, True, True, False, True]]
-    assert not inputs.frame_valid[0, 3].any()
+    assert (inputs.partners.tolist(), inputs.frame_valid[0, 3].any()) == ([[True, True, True, False, True]], False)
 
 
 def test_the_first_frames_of_a_recording_have_no_past(da: DeepAccident, moment: list[str], given: V2XConfig) -> None:

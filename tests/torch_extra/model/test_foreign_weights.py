@@ -77,11 +77,7 @@ def test_forms_in_use_load(tmp_path: Path, form: str, way: dict[str, Any]) -> No
     torch.save(content, path, **way)
     tensors = content.get("state_dict", content.get("model", content))
     wanted = {name: each for name, each in tensors.items() if isinstance(name, str) and isinstance(each, torch.Tensor)}
-    found = read_weights(path).tensors
-    assert found.keys() == wanted.keys()
-    for name, each in wanted.items():
-        assert (found[name].dtype, found[name].shape) == (each.dtype, each.shape)
-        assert torch.equal(found[name], each)
+    torch.testing.assert_close(dict(read_weights(path).tensors), wanted, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("old_form", [False, True])

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.fusion import (
@@ -124,10 +125,10 @@ def test_autocast_changes_digits_only(config: FusionConfig) -> None:
 def test_mean_and_maximum_are_over_those_that_are_seen() -> None:
     x, mask, infra, delay = batch()
     x[:, 1:] = x[:, 1:].abs() + 5
-    shown = [x[0, slot, :, 3, 4] for slot in range(4) if mask[0, slot, 3, 4]]
+    shown = torch.stack([x[0, slot, :, 3, 4] for slot in range(4) if mask[0, slot, 3, 4]])
     assert 1 < len(shown) < 4
-    torch.testing.assert_close(module(MEAN)(x, mask, infra, delay)[0, :, 3, 4], torch.stack(shown).mean(0))
-    torch.testing.assert_close(module(MAX)(x, mask, infra, delay)[0, :, 3, 4], torch.stack(shown).amax(0))
+    for config, expected in ((MEAN, shown.mean(0)), (MAX, shown.amax(0))):
+        torch.testing.assert_close(module(config)(x, mask, infra, delay)[0, :, 3, 4], expected)
 
 
 def test_released_fusion_fills_near_empty_and_masked_cells_and_keeps_channels_of_the_ego() -> None:
@@ -189,29 +190,21 @@ def test_cobevt_by_slots_depends_on_the_order_and_has_an_end_of_slots() -> None:
         model(*batch(agents=5))
 
 
-def test_cobevt_can_average_what_the_mask_hides() -> None:
-    x, mask, infra, delay = batch()
-    averaging = module(replace(COBEVT, masked_cells="averaged"))
-    fused = averaging(x, mask, infra, delay)
-    louder = torch.where(mask[:, :, None], x, 3 * x)
-    assert not torch.allclose(averaging(louder, mask, infra, delay), fused, atol=1e-4)
-
-
 def test_v2xvit_knows_kinds_and_delays() -> None:
     x, mask, infra, delay = batch()
     model = module(V2XVIT)
     fused = model(x, mask, infra, delay)
-    assert not torch.allclose(model(x, mask, ~infra, delay), fused, atol=1e-4)
-    assert not torch.allclose(model(x, mask, infra, 3 * delay), fused, atol=1e-4)
-    assert not torch.allclose(module(replace(V2XVIT, delay_rate=1))(x, mask, infra, delay), fused, atol=1e-4)
+    others = (model(x, mask, ~infra, delay), model(x, mask, infra, 3 * delay))
+    for other in (*others, module(replace(V2XVIT, delay_rate=1))(x, mask, infra, delay)):
+        assert not torch.allclose(other, fused, atol=1e-4)
 
 
-def test_v2xvit_s_windows_can_see_what_the_mask_hides() -> None:
+@pytest.mark.parametrize("config", [replace(V2XVIT, masked_cells="windowed"), replace(COBEVT, masked_cells="averaged")])
+def test_transformers_can_see_what_the_mask_hides(config: FusionConfig) -> None:
     x, mask, infra, delay = batch()
-    windowed = module(replace(V2XVIT, masked_cells="windowed"))
-    fused = windowed(x, mask, infra, delay)
     louder = torch.where(mask[:, :, None], x, 3 * x)
-    assert not torch.allclose(windowed(louder, mask, infra, delay), fused, atol=1e-4)
+    seen, as_it_is = (module(config)(each, mask, infra, delay) for each in (louder, x))
+    assert not torch.allclose(seen, as_it_is, atol=1e-4)
 
 
 @settings(max_examples=30)
@@ -227,24 +220,19 @@ def test_windows_are_joined_as_they_were_split(size: int, height: int, width: in
     assert int(known.sum()) == 2 * 3 * height * width
 
 
-def test_windows_hold_neighbours_or_cells_spread_over_the_map() -> None:
+@pytest.mark.parametrize(("strided", "held"), [(False, [2, 3, 8, 9]), (True, [1, 4, 13, 16])])
+def test_windows_hold_neighbours_or_cells_spread_over_the_map(strided: bool, held: list[int]) -> None:
     numbers = torch.arange(24).view(1, 1, 4, 6, 1)
-    assert Windows(size=2).split(numbers)[1, :, 0].tolist() == [2, 3, 8, 9]
-    assert Windows(size=2, strided=True).split(numbers)[1, :, 0].tolist() == [1, 4, 13, 16]
+    assert Windows(size=2, strided=strided).split(numbers)[1, :, 0].tolist() == held
 
 
 def test_wrong_configs_say_so() -> None:
-    with pytest.raises(ConfigError, match=r"expected numbers from 0 to 7, found \[31, 41"):
-        ReleasedFusionConfig(channels=C)
-    with pytest.raises(ConfigError, match="heads: 3 do not divide 8 channels"):
-        replace(COBEVT, heads=3)
-    with pytest.raises(ConfigError, match="window_heads: 3 do not divide 8 channels"):
-        replace(V2XVIT, window_heads=(2, 3))
-    with pytest.raises(ConfigError, match=r"one number for each of 2 windows, found \(2,\)"):
-        replace(V2XVIT, window_heads=(2,))
-    with pytest.raises(ConfigError, match="by: expected one of mean, max, found 'sum'"):
-        PoolFusionConfig(by="sum")
-    with pytest.raises(ConfigError, match="agents: expected at least 2, found 1"):
-        Agent3DConfig(channels=C, agents=1)
-    with pytest.raises(ConfigError, match="the config of a fusion module, found 'mean'"):
-        fusion("mean")
+    assert_refused(
+        (lambda: ReleasedFusionConfig(channels=C), ConfigError, r"expected numbers from 0 to 7, found \[31, 41"),
+        (lambda: replace(COBEVT, heads=3), ConfigError, "heads: 3 do not divide 8 channels"),
+        (lambda: replace(V2XVIT, window_heads=(2, 3)), ConfigError, "window_heads: 3 do not divide 8 channels"),
+        (lambda: replace(V2XVIT, window_heads=(2,)), ConfigError, r"one number for each of 2 windows, found \(2,\)"),
+        (lambda: PoolFusionConfig(by="sum"), ConfigError, "by: expected one of mean, max, found 'sum'"),
+        (lambda: Agent3DConfig(channels=C, agents=1), ConfigError, "agents: expected at least 2, found 1"),
+        (lambda: fusion("mean"), ConfigError, "the config of a fusion module, found 'mean'"),
+    )

@@ -106,14 +106,15 @@ def test_one_pixel_at_one_depth_lights_one_cell():
     torch.testing.assert_close(bev, expected)
 
 
-def test_rays_pass_through_the_centres_or_from_corner_to_corner():
-    centres, corners = LiftSplat(CONFIG).frustum, LiftSplat(replace(CONFIG, frustum="corners")).frustum
-    assert centres.shape == (8, 3, 5, 3)
-    assert centres[0, 0, :, 0].tolist() == [4, 12, 20, 28, 36]
-    assert centres[0, :, 0, 1].tolist() == [4, 12, 20]
-    assert centres[:, 1, 1, 2].tolist() == [2, 4, 6, 8, 10, 12, 14, 16]
-    assert corners[0, 0, :, 0].tolist() == [0, 9.75, 19.5, 29.25, 39]
-    assert corners[0, :, 0, 1].tolist() == [0, 11.5, 23]
+@pytest.mark.parametrize(
+    ("frustum", "columns", "rows"),
+    [("centres", [4, 12, 20, 28, 36], [4, 12, 20]), ("corners", [0, 9.75, 19.5, 29.25, 39], [0, 11.5, 23])],
+)
+def test_rays_pass_through_the_centres_or_from_corner_to_corner(frustum, columns, rows):
+    rays = LiftSplat(replace(CONFIG, frustum=frustum)).frustum
+    depths, down, along = torch.arange(2.0, 18, 2), torch.tensor(rows).float(), torch.tensor(columns).float()
+    expected = torch.stack(torch.meshgrid(depths, down, along, indexing="ij")[::-1], dim=-1)
+    torch.testing.assert_close(rays, expected, rtol=0, atol=0)
 
 
 def test_truncation_takes_points_from_a_step_below_the_range():
@@ -151,10 +152,11 @@ def test_a_wide_map_holds_all_that_the_pixels_have():
 def test_frames_and_samples_keep_apart_and_the_order_of_cameras_does_not_matter():
     lift, features, cameras = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5), rig()
     whole = lift(features, cameras)
-    names = ("rotation", "translation", "intrinsics")
-    part = CameraGeometry(**{name: getattr(cameras, name)[1:, :1] for name in names})
+    part, turned = (
+        CameraGeometry(**{name: of(getattr(cameras, name)) for name in ("rotation", "translation", "intrinsics")})
+        for of in (lambda each: each[1:, :1], lambda each: each.flip(2))
+    )
     torch.testing.assert_close(lift(features[1:, :1], part), whole[1:, :1])
-    turned = CameraGeometry(**{name: getattr(cameras, name).flip(2) for name in names})
     torch.testing.assert_close(lift(features.flip(2), turned), whole)
 
 
@@ -225,17 +227,12 @@ def test_a_mean_does_not_grow_with_the_number_of_points():
     ],
 )
 def test_a_wrong_configuration_is_named(change, message):
-    with pytest.raises(ConfigError, match=message):
-        replace(CONFIG, **change)
+    assert_refused((lambda: replace(CONFIG, **change), ConfigError, message))
 
 
 def test_features_of_another_shape_are_named():
-    lift = lift_of(CONFIG)
+    lift, good = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5)
     assert_refused(
-        (lambda: lift(noise(2, 2, 3, 5, 5, 3), rig()), GeometryError, r"features: expected \(…, 3, 5\)"),
-        (
-            lambda: lift(noise(2, 2, 3, 5, 3, 5), rig(shape=(2, 2, 2))),
-            GeometryError,
-            r"cameras: expected cells \(2, 2, 3, 8, 3, 5\)",
-        ),
+        (lambda: lift(noise(2, 2, 3, 5, 5, 3), rig()), GeometryError, ("features", "(…, 3, 5)")),
+        (lambda: lift(good, rig(shape=(2, 2, 2))), GeometryError, ("cameras", "cells (2, 2, 3, 8, 3, 5)")),
     )

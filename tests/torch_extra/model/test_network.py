@@ -161,17 +161,16 @@ def test_fusions_that_ask_know_kinds_and_delays(
     da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted
 ) -> None:
     """Of the right agents, in whichever order they stand."""
-    for name, differs in (("v2xvit", True), ("mean", False)):
-        config = of_fusion(name)
-        model, batch = seeded(config), collate([alone(da, moment[0], config, "all")])
-        inputs = model_inputs(batch)
-        late, parked = model_inputs(batch, delay=2), replace(inputs, is_infrastructure=torch.zeros(1, 5).bool())
+    batch = collate([alone(da, moment[0], of_fusion("v2xvit"), "all")])
+    inputs = model_inputs(batch)
+    late, parked = model_inputs(batch, delay=2), replace(inputs, is_infrastructure=torch.zeros(1, 5).bool())
+    for name, differs in (("mean", False), ("v2xvit", True)):
+        model = seeded(of_fusion(name))
         for changed in (late, parked):
             assert (apart(predicted(model, inputs), predicted(model, changed)) > 1e-3) == differs
-    config = of_fusion("v2xvit")
-    model, [item] = seeded(config), AllEgosDataset(da, moment, config.inputs("all"))
+    [item] = AllEgosDataset(da, moment, model.config.inputs("all"))
     together = predicted(model, model_inputs(collate_all_egos([item])))
-    own = predicted(model, model_inputs(collate([alone(da, moment[4], config, "all")])))
+    own = predicted(model, model_inputs(collate([alone(da, moment[4], model.config, "all")])))
     assert_same([each[4:] for each in together], own)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from refusals import assert_refused
 from torch_extra.model.small_model import small, small_released
 
 from deepaccident_devkit import DeepAccident
@@ -111,27 +112,21 @@ def test_the_seed_changes_the_draws_but_not_the_mean(
 def test_partners_and_the_link_matter(
     model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
 ) -> None:
-    single, late, lost = (
-        predict(model, da, tokens[:1], config)[0]
-        for config in (
-            PredictConfig(agents="single"),
-            PredictConfig(link=Link(latency=0.2)),
-            PredictConfig(link=Link(packet_loss=1.0)),
-        )
-    )
-    assert not same(single, found[0])
-    assert not same(late, found[0])
+    links = ({"agents": "single"}, {"link": Link(latency=0.2)}, {"link": Link(packet_loss=1.0)})
+    single, late, lost = (predict(model, da, tokens[:1], PredictConfig(**each))[0] for each in links)
+    assert (same(single, found[0]), same(late, found[0])) == (False, False)
     for a, b in zip(arrays(lost), arrays(single), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
 
 
-def test_the_model_is_left_in_its_mode(model: V2XFormer, da: DeepAccident, tokens: list[str]) -> None:
-    for mode in (True, False):
-        model.train(mode)
-        statistics = {name: each.clone() for name, each in model.named_buffers()}
-        predict(model, da, tokens[:1])
-        assert model.training == mode
-        assert all(torch.equal(each, statistics[name]) for name, each in model.named_buffers())
+@pytest.mark.parametrize("mode", [True, False])
+def test_the_model_is_left_in_its_mode(model: V2XFormer, da: DeepAccident, tokens: list[str], mode: bool) -> None:
+    model.train(mode)
+    statistics = {name: each.clone() for name, each in model.named_buffers()}
+    predict(model, da, tokens[:1])
+    assert model.training == mode
+    torch.testing.assert_close(dict(model.named_buffers()), statistics, rtol=0, atol=0)
+    model.eval()
 
 
 def test_a_release_without_images_is_refused(
@@ -139,9 +134,8 @@ def test_a_release_without_images_is_refused(
 ) -> None:
     """Such as one whose camera archives were not unpacked."""
     shutil.copytree(release_root, tmp_path / "blind", ignore=shutil.ignore_patterns(".deepaccident", "Camera_*"))
-    blind = DeepAccident("v1", tmp_path / "blind", verbose=False)
-    with pytest.raises(NotAvailableError, match=r"no images of .*; unpack its camera folders, .* --sensors cameras"):
-        predict(model, blind, moment[:1])
+    blind, named = DeepAccident("v1", tmp_path / "blind", verbose=False), ("no images", "unpack", "--sensors cameras")
+    assert_refused((lambda: predict(model, blind, moment[:1]), NotAvailableError, named))
     assert predict(model, blind, []) == []
 
 
@@ -166,9 +160,7 @@ def test_results_are_written_and_read(
     paths = predict_results(model, da, tokens, tmp_path / "results")
     for task, path in paths.items():
         results = read_results(path)
-        assert results.task == task
-        assert set(results.tokens) == set(tokens)
-        assert results.meta["agents"] == "all"
+        assert (results.task, set(results.tokens), results.meta["agents"]) == (task, set(tokens), "all")
     form: Any = {"grid": model.config.labels.grid, "step": 0.1, "labels": "clean", "store": "heads"}
     with ResultsWriter(tmp_path / "heads", "motion", **form) as writer:
         for each in found:
@@ -188,43 +180,35 @@ class TestPerfectMaps:
         self, perfect: V2XFormer, da: DeepAccident, moment: list[str], monkeypatch: pytest.MonkeyPatch, row: int
     ) -> None:
         config, token = perfect.config, moment[row]
-        head = config.detection
         item = V2XDataset(da, [token], V2XConfig(points=False))[0]
         inside = (item["boxes"][:, :2].abs() < 45).all(1)
-        boxes, categories = item["boxes"][inside], item["categories"][inside]
-        monkeypatch.setattr(type(perfect), "forward", told(perfect, detection=encoded(config, boxes, categories)))
-        [found] = predict(perfect, da, [token])
-        truth = da.boxes(token, "world", "released")[inside.numpy()]
-        assert len(truth) > 3
-        assert len(found.boxes) == len(truth), head
-        assert found.boxes.boxes.frame == "world"
-        apart = np.linalg.norm(found.boxes.boxes.center[:, None] - truth.center, axis=-1)
-        match = apart.argmin(1)
+        maps = encoded(config, item["boxes"][inside], item["categories"][inside])
+        monkeypatch.setattr(type(perfect), "forward", told(perfect, detection=maps))
+        [prediction] = predict(perfect, da, [token])
+        found, truth = prediction.boxes.boxes, da.boxes(token, "world", "released")[inside.numpy()]
+        assert (len(truth) > 3, found.frame) == (True, "world")
+        match = np.linalg.norm(found.center[:, None] - truth.center, axis=-1).argmin(1)
         assert sorted(match) == list(range(len(truth)))
-        np.testing.assert_allclose(found.boxes.boxes.center, truth.center[match], atol=2e-3)
-        np.testing.assert_allclose(found.boxes.boxes.size, truth.size[match], atol=2e-3)
-        turned = found.boxes.boxes.yaw - truth.yaw[match]
-        np.testing.assert_allclose(np.exp(1j * turned), 1, atol=2e-3)
-        velocity = np.nan_to_num(truth.velocity[match])
-        np.testing.assert_allclose(found.boxes.boxes.velocity[:, :2], velocity[:, :2], atol=2e-3)
-        np.testing.assert_array_equal(found.boxes.boxes.category, truth.category[match])
+        there = truth.select(match)
+        np.testing.assert_allclose(found.center, there.center, atol=2e-3)
+        np.testing.assert_allclose(found.size, there.size, atol=2e-3)
+        np.testing.assert_allclose(np.exp(1j * (found.yaw - there.yaw)), 1, atol=2e-3)
+        np.testing.assert_allclose(found.velocity[:, :2], np.nan_to_num(there.velocity)[:, :2], atol=2e-3)
+        np.testing.assert_array_equal(found.category, there.category)
 
     def test_motion_maps_score_as_their_labels(
         self, perfect: V2XFormer, da: DeepAccident, moment: list[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        config, token = perfect.config, moment[0]
-        label = motion_labels(da, token, config.labels).to_present("bilinear")
+        token, evaluator = moment[0], motion_evaluator(perfect)
+        label = motion_labels(da, token, perfect.config.labels).to_present("bilinear")
         heads = MotionHeads.from_labels(label)
-        fields = (heads.segmentation, heads.centerness, heads.offset, heads.flow)
+        fields = (heads.segmentation, heads.centerness.clip(1e-6, 1 - 1e-6), heads.offset, heads.flow)
         maps = [torch.as_tensor(np.array(each))[None, None].float() for each in fields]
-        maps[1] = maps[1].clamp(1e-6, 1 - 1e-6).logit()
+        maps[1] = maps[1].logit()
         monkeypatch.setattr(type(perfect), "forward", told(perfect, motion=MotionMaps(*maps)))
-        [found] = predict(perfect, da, [token])
-        evaluator = motion_evaluator(perfect)
-        evaluator.update(token, found.motion, label)
+        evaluator.update(token, predict(perfect, da, [token])[0].motion, label)
         scores = evaluator.compute().ranges["100x100"]
-        assert scores.iou == pytest.approx(100)
-        assert scores.pq > 90
+        assert (scores.iou, scores.pq > 90) == (pytest.approx(100), True)
 
 
 def encoded(config: ModelConfig, boxes: torch.Tensor, categories: torch.Tensor) -> list[TaskMaps]:
@@ -254,13 +238,10 @@ def told(model: V2XFormer, *, detection: Any = None, motion: Any = None) -> Call
 
 
 def test_centres_become_probabilities(model: V2XFormer) -> None:
-    shape = (2, 3, 1, 40, 40)
-    maps = MotionMaps(torch.zeros(2, 3, 2, 40, 40), torch.full(shape, 2.0), *[torch.zeros(2, 3, 2, 40, 40)] * 2)
-    output = motion_output(maps, model)
-    assert output.heads is not None
-    assert len(output.heads) == 2
+    zeros = [torch.zeros(2, 3, 2, 40, 40)] * 3
+    output = motion_output(MotionMaps(zeros[0], torch.full((2, 3, 1, 40, 40), 2.0), *zeros[1:]), model)
+    assert (output.grid, len(output.heads or ())) == (model.config.labels.grid, 2)
     np.testing.assert_allclose(output.heads[0].centerness, 1 / (1 + np.exp(-2.0)), rtol=1e-6)
-    assert output.grid == model.config.labels.grid
 
 
 def test_delays_reach_the_model(model: V2XFormer, da: DeepAccident, tokens: list[str], monkeypatch: Any) -> None:

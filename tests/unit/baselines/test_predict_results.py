@@ -60,22 +60,30 @@ def predicted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return done
 
 
-def stopped_at(token: str, error: BaseException) -> Callable[..., Any]:
-    """A `Baseline.predict` that fails at a sample."""
-    original = Baseline.predict
+def stopped_at(token: str, error: BaseException) -> pytest.MonkeyPatch:
+    """A patch with which `Baseline.predict` fails at a sample."""
+    original, patch = Baseline.predict, pytest.MonkeyPatch()
 
     def predict(self: Baseline, dataset: Any, task: ResultsTask, sample: str) -> Any:
         if sample == token:
             raise error
         return original(self, dataset, task, sample)
 
-    return predict
+    patch.setattr(Baseline, "predict", predict)
+    return patch
+
+
+def interrupted(call: Callable[[], object], token: str) -> None:
+    """A call that ends at a sample, as Ctrl-C ends it."""
+    patch = stopped_at(token, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        call()
+    patch.undo()
 
 
 def test_samples_are_taken_scenario_by_scenario(tokens: Sequence[str]) -> None:
     runs = samples_by_scenario(Path("out"), tokens)
-    assert [len(run) for run in runs.values()] == [4, 4, 4, 4]
-    assert [token for run in runs.values() for token in run] == tokens
+    assert (list(map(len, runs.values())), [token for run in runs.values() for token in run]) == ([4] * 4, tokens)
     assert samples_by_scenario(Path("out"), ["a/b/c/001", "a/d/c/001", "a/b/c/002"]) == {
         "a/b": ("a/b/c/001", "a/b/c/002"),
         "a/d": ("a/d/c/001",),
@@ -95,49 +103,35 @@ def test_several_calls_share_the_scenarios(
 
 
 def test_an_interrupted_call_loses_the_scenario_at_hand(
-    da_b: DeepAccident,
-    tokens: list[str],
-    wholes: Path,
-    tmp_path: Path,
-    predicted: list[str],
-    monkeypatch: pytest.MonkeyPatch,
+    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, predicted: list[str]
 ) -> None:
     call = partial(predict_results, da_b, "motion", tokens, tmp_path / "motion", NOISY, workers=1)
-    with monkeypatch.context() as patch:
-        patch.setattr(Baseline, "predict", stopped_at(tokens[6], KeyboardInterrupt()))
-        with pytest.raises(KeyboardInterrupt):
-            call()
-    assert predicted == tokens[:6]
-    assert not (tmp_path / "motion").exists()
+    interrupted(call, tokens[6])
+    assert (predicted, (tmp_path / "motion").exists()) == (tokens[:6], False)
     del predicted[:]
     call()
     assert (predicted, contents(tmp_path / "motion")) == (tokens[4:], contents(wholes / "motion"))
 
 
 def test_what_was_predicted_with_other_settings_or_samples_is_not_taken(
-    da_b: DeepAccident, tokens: list[str], tmp_path: Path, predicted: list[str], monkeypatch: pytest.MonkeyPatch
+    da_b: DeepAccident, tokens: list[str], tmp_path: Path, predicted: list[str]
 ) -> None:
     out = tmp_path / "accident.json"
     for samples, baseline in ((tokens[:-1], NOISY), (tokens, Baseline()), (tokens, NOISY)):
-        with monkeypatch.context() as patch:
-            patch.setattr(Baseline, "predict", stopped_at(samples[-1], KeyboardInterrupt()))
-            with pytest.raises(KeyboardInterrupt):
-                predict_results(da_b, "accident", samples, out, baseline, workers=1)
+        interrupted(partial(predict_results, da_b, "accident", samples, out, baseline, workers=1), samples[-1])
     del predicted[:]
     predict_results(da_b, "accident", tokens, out, NOISY, workers=1)
-    assert predicted == tokens[-4:]
-    assert [path.name for path in tmp_path.iterdir()] == ["accident.json"]
+    assert (predicted, [path.name for path in tmp_path.iterdir()]) == (tokens[-4:], ["accident.json"])
 
 
 def test_scenarios_that_fail_are_listed_and_the_others_done(
-    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "detection.json"
+    out, scenario = tmp_path / "detection.json", tokens[6].rsplit("/", 2)[0]
     call = partial(predict_results, da_b, "detection", tokens, out, NOISY, workers=1)
-    with monkeypatch.context() as patch:
-        patch.setattr(Baseline, "predict", stopped_at(tokens[6], ConfigError("no such day")))
-        scenario = tokens[6].rsplit("/", 2)[0]
-        assert_refused((call, SomeFailedError, rf"1 of 4 failed:\n  {scenario}: no such day\n"))
+    patch = stopped_at(tokens[6], ConfigError("no such day"))
+    assert_refused((call, SomeFailedError, rf"1 of 4 failed:\n  {scenario}: no such day\n"))
+    patch.undo()
     call()
     assert contents(out) == contents(wholes / "detection.json")
 
@@ -147,9 +141,9 @@ def test_an_agent_that_is_not_there_is_named_before_anything_is_written(
 ) -> None:
     for folder in own_release.glob("**/other_vehicle_behind"):
         shutil.rmtree(folder)
-    partial_release, out = DeepAccident("v1", own_release, verbose=False), tmp_path / "out" / "accident.json"
-    with pytest.raises(NotAvailableError, match="other_vehicle_behind is not in this release"):
-        predict_results(partial_release, "accident", tokens, out, Baseline(agents="all"))
+    out, every = tmp_path / "out" / "accident.json", Baseline(agents="all")
+    predict = partial(predict_results, DeepAccident("v1", own_release, verbose=False), "accident", tokens, out, every)
+    assert_refused((predict, NotAvailableError, "other_vehicle_behind is not in this release"))
     assert not out.parent.exists()
 
 
@@ -157,20 +151,17 @@ def test_an_agent_that_is_not_there_is_named_before_anything_is_written(
 def test_complete_results_stay_and_others_are_refused(
     da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, predicted: list[str], task: ResultsTask
 ) -> None:
-    out = wholes / NAMES[task]
+    out, broken = wholes / NAMES[task], tmp_path / NAMES[task]
     before = contents(out)
     assert is_predicted(da_b, task, tokens, out, NOISY)
     assert predict_results(da_b, task, tokens, out, NOISY) == out
-    others = ((tokens[1:], NOISY), (tokens[::-1], NOISY), (tokens, Baseline(agents="+behind")))
-    for (samples, baseline), told in zip(others, ("of other samples", "of other samples", "agents: "), strict=True):
-        called = partial(predict_results, da_b, task, samples, out, baseline)
-        assert_refused((called, ResultsError, (f"{out}: is there already ({told}", "choose another path")))
-    broken = tmp_path / NAMES[task]
     broken.mkdir()
     (broken / "results.json").write_bytes(b"{}")
-    assert_refused((lambda: predict_results(da_b, task, tokens, broken, NOISY), ResultsError, "is there already"))
-    assert not predicted
-    assert contents(out) == before
+    others = ((out, tokens[1:], NOISY), (out, tokens[::-1], NOISY), (out, tokens, Baseline(agents="+behind")))
+    for path, samples, baseline in (*others, (broken, tokens, NOISY)):
+        call = partial(predict_results, da_b, task, samples, path, baseline)
+        assert_refused((call, ResultsError, (f"{path}: is there already", "choose another path")))
+    assert (predicted, contents(out)) == ([], before)
 
 
 def test_results_say_of_what_they_are(da_b: DeepAccident, wholes: Path) -> None:
@@ -185,8 +176,8 @@ def test_results_say_of_what_they_are(da_b: DeepAccident, wholes: Path) -> None:
 def test_a_token_that_comes_twice_is_refused_at_once(
     da_b: DeepAccident, tokens: list[str], tmp_path: Path, predicted: list[str]
 ) -> None:
-    with pytest.raises(ResultsError, match=f"{tokens[3]}: comes twice; give each sample once"):
-        predict_results(da_b, "accident", [*tokens, tokens[3]], tmp_path / "out", workers=1)
+    twice = partial(predict_results, da_b, "accident", [*tokens, tokens[3]], tmp_path / "out", workers=1)
+    assert_refused((twice, ResultsError, (f"{tokens[3]}: comes twice", "give each sample once")))
     assert not predicted
 
 

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, SensorFileError
-from deepaccident_devkit.export.images import ImageConfig, _resized_part
+from deepaccident_devkit.export.images import ImageConfig, resized_part
 from deepaccident_devkit.release import read_image, write_image
 
 
@@ -44,8 +45,7 @@ def test_scaled_has_the_same_intrinsic_and_nearly_the_same_pixels(da: DeepAccide
 
 def test_scaled_without_a_size_is_full(da: DeepAccident, camera: str) -> None:
     np.testing.assert_array_equal(ImageConfig(decode="scaled").load(da, camera)[0], da.load_image(camera))
-    with pytest.raises(ConfigError, match="decode: expected one of full, scaled"):
-        ImageConfig(decode="half")  # type: ignore[arg-type]
+    assert_refused((lambda: ImageConfig(decode="half"), ConfigError, "decode: expected one of full, scaled"))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -67,8 +67,7 @@ def test_a_truncated_jpeg_is_no_half_grey_picture(tmp_path: Path, share: float) 
     path = tmp_path / "image.jpg"
     write_image(path, picture(64, 120))
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
-    with pytest.raises(SensorFileError, match=r"image\.jpg: not a readable image"):
-        read_image(path, least=(16, 16))
+    assert_refused((lambda: read_image(path, least=(16, 16)), SensorFileError, r"image\.jpg: not a readable image"))
 
 
 @given(st.data())
@@ -80,7 +79,7 @@ def test_a_part_is_cut_out_of_the_whole(data: st.DataObject) -> None:
     height, width = data.draw(st.integers(1, size[0] - top)), data.draw(st.integers(1, size[1] - left))
     image = picture(*old)
     whole = image if old == size else cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
-    part = _resized_part(image, size, (top, left, height, width))
+    part = resized_part(image, size, (top, left, height, width))
     difference = np.abs(part.astype(int) - whole[top : top + height, left : left + width])
     assert difference.shape == (height, width, 3)
     assert difference.max() <= 1  # the filter's weights are float32

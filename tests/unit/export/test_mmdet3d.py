@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.export import export
@@ -179,12 +180,13 @@ def test_without_labels_there_are_no_instances_and_without_a_split_another_file(
 
 
 def test_a_folder_without_that_nuscenes_export_is_refused(da: DeepAccident, tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="holds no complete nuscenes export"):
-        export_release(da, tmp_path / "new", Mmdet3d())
-    assert not (tmp_path / "new").exists()
-    export_release(da, tmp_path / "other", NuScenes(agents=("ego_vehicle",), sweeps=False))
-    with pytest.raises(ConfigError, match="holds an export to nuscenes with other settings"):
-        export_release(da, tmp_path / "other", Mmdet3d(agents=("ego_vehicle",)))
+    new, other, ego = tmp_path / "new", tmp_path / "other", ("ego_vehicle",)
+    export_release(da, other, NuScenes(agents=ego, sweeps=False))
+    assert_refused(
+        (lambda: export_release(da, new, Mmdet3d()), ExportError, "holds no complete nuscenes export"),
+        (lambda: export_release(da, other, Mmdet3d(agents=ego)), ConfigError, "export to nuscenes with other settings"),
+    )
+    assert not new.exists()
 
 
 def test_the_command_makes_the_nuscenes_export_too(da: DeepAccident, tmp_path: Path) -> None:
@@ -208,5 +210,4 @@ def test_the_command_makes_the_nuscenes_export_too(da: DeepAccident, tmp_path: P
 )
 def test_options_of_the_other_style_are_refused(tmp_path: Path, words: tuple[str, ...], sentence: str) -> None:
     run = CliRunner().invoke(export, ["mmdet3d", str(tmp_path), "--out", str(tmp_path / "out"), *words])
-    assert run.exit_code == 2
-    assert sentence in run.output
+    assert (run.exit_code, sentence in run.output) == (2, True)

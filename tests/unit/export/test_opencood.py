@@ -1,6 +1,5 @@
-"""OPV2V's folders, read back by a reader that knows OpenCOOD's conventions and not the devkit."""
+"""OPV2V's folders, read by a reader that knows OpenCOOD's conventions; CARLA's poses against its own formula."""
 
-import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -8,12 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from opencood_reader import agents_of, counts_of, facts_of, points_of, timestamps_of, world_from
+from refusals import assert_refused
+from strategies import matrices
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.export.bulk import Exported, export_release
-from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.export.opencood import OpenCood, carla_six
+from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
@@ -41,15 +46,15 @@ def expected_counts(da: DeepAccident, sample: str) -> dict[int, int]:
     return dict(zip(boxes.actor_id[kept].tolist(), boxes.num_lidar_pts[kept].tolist(), strict=True))
 
 
-def disagreement(da: DeepAccident, scenario: Path, change: Callable[[dict[str, Any]], None]) -> float:
+def disagreement(da: DeepAccident, scenario: Path, changed: Callable[[dict[str, Any]], dict[str, Any]]) -> float:
     """The share of boxes in which a reader finds another number of points than the labels say, after a change."""
     token, wrong, total = scenario.name.replace("__", "/", 1), 0, 0
     for place, agent in PLACES.items():
         for timestamp in timestamps_of(scenario, place):
-            facts = copy.deepcopy(dict(facts_of(scenario, place, timestamp)))
-            change(facts)
+            facts = dict(facts_of(scenario, place, timestamp))
+            vehicles = {actor: {**each, **changed(each)} for actor, each in facts["vehicles"].items()}
             expected = expected_counts(da, f"{token}/{agent}/{int(timestamp):03d}")
-            found = counts_of(facts, points_of(scenario, place, timestamp))
+            found = counts_of({**facts, "vehicles": vehicles}, points_of(scenario, place, timestamp))
             assert found.keys() == expected.keys()
             wrong += sum(abs(found[actor] - count) > 1 + 0.02 * count for actor, count in expected.items())
             total += len(expected)
@@ -57,29 +62,21 @@ def disagreement(da: DeepAccident, scenario: Path, change: Callable[[dict[str, A
     return wrong / total
 
 
-def flip_y(facts: dict[str, Any]) -> None:
-    for vehicle in facts["vehicles"].values():
-        vehicle["location"][1] *= -1
-        vehicle["angle"][1] *= -1
-
-
-def radians(facts: dict[str, Any]) -> None:
-    for vehicle in facts["vehicles"].values():
-        vehicle["angle"] = np.radians(vehicle["angle"]).tolist()
-
-
-def full_extents(facts: dict[str, Any]) -> None:
-    for vehicle in facts["vehicles"].values():
-        vehicle["extent"] = [2 * length for length in vehicle["extent"]]
-
-
 def test_boxes_hold_the_points_that_their_labels_count(da: DeepAccident, scenario: Path) -> None:
-    assert disagreement(da, scenario, lambda _: None) == 0
+    assert disagreement(da, scenario, lambda _: {}) == 0
 
 
-@pytest.mark.parametrize("planted", [flip_y, radians, full_extents])
-def test_the_reader_sees_a_wrong_convention(da: DeepAccident, scenario: Path, planted: Callable[..., None]) -> None:
-    assert disagreement(da, scenario, planted) > 0.2
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda vehicle: {name: vehicle[name] * np.array([1, -1, 1]) for name in ("location", "angle")},
+        lambda vehicle: {"angle": np.radians(vehicle["angle"])},
+        lambda vehicle: {"extent": 2 * np.array(vehicle["extent"])},
+    ],
+    ids=["flipped y", "radians", "full extents"],
+)
+def test_the_reader_sees_a_wrong_convention(da: DeepAccident, scenario: Path, changed: Callable[..., Any]) -> None:
+    assert disagreement(da, scenario, changed) > 0.2
 
 
 def test_agents_share_a_world(scenario: Path) -> None:
@@ -93,16 +90,14 @@ def test_agents_share_a_world(scenario: Path) -> None:
     assert max(np.ptp(found, axis=0).max() for found in shared) < 0.5
 
 
-def test_ego_is_the_first_folder_and_the_pole_the_last(scenario: Path) -> None:
-    assert agents_of(scenario) == ["1", "2", "3", "4", "-1"]
-
-
-def test_every_moment_has_all_files(scenario: Path) -> None:
+def test_every_moment_has_all_files_and_the_pole_is_the_last(scenario: Path) -> None:
+    assert agents_of(scenario) == list(PLACES)
+    stems = [f"{number:06d}" for number in range(1, 7)]
+    ends = (".yaml", ".json", ".pcd", *(f"_camera{number}.png" for number in range(6)))
     for place in PLACES:
-        names = {path.name for path in (scenario / place).iterdir()}
-        stems = [f"{number:06d}" for number in range(1, 7)]
-        cameras = [f"_camera{number}.png" for number in range(6)]
-        assert names == {f"{stem}{end}" for stem in stems for end in (".yaml", ".json", ".pcd", *cameras)}
+        assert {path.name for path in (scenario / place).iterdir()} == {
+            f"{stem}{end}" for stem in stems for end in ends
+        }
 
 
 def test_json_says_the_same_with_ids_as_words(scenario: Path) -> None:
@@ -136,32 +131,30 @@ def test_assignment_of_heal_names_every_folder(exported: Exported) -> None:
 
 def test_splits_have_their_folders(da: DeepAccident, exported: Exported) -> None:
     theirs = {"train": "train", "val": "validate", "test": "test"}
-    for record in da.scenario:
-        assert record["split"]
-        folder = exported.folder / theirs[record["split"]] / record["token"].replace("/", "__")
-        assert (folder / "data_protocol.yaml").is_file()
+    found = {
+        path.parent.relative_to(exported.folder).as_posix() for path in exported.folder.rglob("data_protocol.yaml")
+    }
+    assert found == {f"{theirs[each['split']]}/{each['token'].replace('/', '__')}" for each in da.scenario}
 
 
 def test_ego_can_be_another_vehicle_and_classes_more(da: DeepAccident, tmp_path: Path) -> None:
-    form = OpenCood(ego="other_vehicle", classes=("pedestrian", "car"), agents=("other_vehicle", "ego_vehicle"))
-    record = next(record for record in da.scenario if record["split"] == "train")
-    made = export_release(da, tmp_path / "out", OpenCood(**{**vars(form), "where": (f"token={record['token']}",)}))
-    (folder,) = made.folder.glob("train/*")
-    protocol = folder / "data_protocol.yaml"
+    token = next(record["token"] for record in da.scenario if record["split"] == "train")
+    agents, chosen = ("other_vehicle", "ego_vehicle"), (f"token={token}",)
+    form = OpenCood(ego="other_vehicle", classes=("pedestrian", "car"), agents=agents, where=chosen)
+    (folder,) = export_release(da, tmp_path / "out", form).folder.glob("train/*")
     assert agents_of(folder) == ["1", "2"]
-    assert "name: other_vehicle" in protocol.read_text().split("'2'")[0]
+    assert "name: other_vehicle" in (folder / "data_protocol.yaml").read_text().split("'2'")[0]
     actors = {actor for sample in (1, 2) for actor in facts_of(folder, str(sample), "000006")["vehicles"]}
-    walkers = da.boxes(f"{record['token']}/ego_vehicle/006")
+    walkers = da.boxes(f"{token}/ego_vehicle/006")
     seen = walkers.actor_id[(np.array(walkers.category_names) == "pedestrian") & (walkers.num_lidar_pts > 0)]
     assert set(seen.tolist()) - {UNTRACKED_ID} <= actors
 
 
 def test_a_partial_release_is_written_and_counted(da_partial: DeepAccident, tmp_path: Path) -> None:
-    made = export_release(da_partial, tmp_path / "out", OpenCood())
-    frames = 6 * len(da_partial.scenario)
-    assert made.tally.left_out["agents of scenarios that are not in this release"] == len(da_partial.scenario)
-    assert made.tally.left_out["images that are not in this release"] == frames
-    assert made.tally.left_out["point clouds that are not in this release"] == frames
+    left_out = export_release(da_partial, tmp_path / "out", OpenCood()).tally.left_out
+    assert left_out["agents of scenarios that are not in this release"] == len(da_partial.scenario)
+    for kind in ("images", "point clouds"):
+        assert left_out[f"{kind} that are not in this release"] == 6 * len(da_partial.scenario)
 
 
 @pytest.mark.parametrize(
@@ -234,5 +227,40 @@ def test_without_labels_there_are_poses_and_clouds(own_release: Path, tmp_path: 
     ],
 )
 def test_impossible_choices(choices: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ChoiceError, match=sentence):
-        OpenCood(**choices)
+    assert_refused((lambda: OpenCood(**choices), ChoiceError, sentence))
+
+
+DEGREES = st.floats(-179.9, 179.9)
+
+
+def carla_matrix(x: float, y: float, z: float, roll: float, yaw: float, pitch: float) -> np.ndarray:
+    """What `carla.Transform.get_matrix` gives: metres and degrees, left-handed, as its `Transform` computes it."""
+    (cr, cy, cp), (sr, sy, sp) = np.cos(np.radians([roll, yaw, pitch])), np.sin(np.radians([roll, yaw, pitch]))
+    return np.array(
+        [
+            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr, x],
+            [cp * sy, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr, y],
+            [sp, -cp * sr, cp * cr, z],
+            [0, 0, 0, 1],
+        ]
+    )
+
+
+@given(roll=DEGREES, yaw=DEGREES, pitch=st.floats(-89, 89), place=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
+def test_a_carla_transform_there_and_back(roll: float, yaw: float, pitch: float, place: tuple[float, ...]) -> None:
+    six = carla_six(flip_pose(carla_matrix(*place, roll, yaw, pitch)))
+    assert_allclose(six, [*place, roll, yaw, pitch], rtol=0, atol=1e-9)
+
+
+@given(matrices())
+def test_a_pose_there_and_back(pose: np.ndarray) -> None:
+    """Also near pitches of 90°, where angles are not unique; arcsin is flat there, and keeps eight digits."""
+    assert_allclose(flip_pose(carla_matrix(*carla_six(pose))), pose, rtol=0, atol=1e-7)
+
+
+def test_directions_are_carlas() -> None:
+    """Ahead and to the left by 1 m, turned to the left and nose up: y, yaw and pitch of CARLA's sign."""
+    turned, raised = np.eye(4), np.eye(4)
+    turned[:3, 3], turned[:2, :2] = (1, 1, 0), [[0, -1], [1, 0]]
+    raised[:3, :3] = [[np.sqrt(0.5), 0, -np.sqrt(0.5)], [0, 1, 0], [np.sqrt(0.5), 0, np.sqrt(0.5)]]
+    assert_allclose(carla_six([turned, raised]), [[1, -1, 0, 0, -90, 0], [0, 0, 0, 0, 0, 45]], atol=1e-9)

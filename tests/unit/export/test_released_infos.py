@@ -3,12 +3,14 @@
 import logging
 import pickle
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.export import export
@@ -81,12 +83,12 @@ def test_every_agents_keyframes_are_there_in_order(da: DeepAccident, exported: E
     assert exported.tally.samples == 2 * len(AGENTS) * len(da.scenario)
 
 
-def test_mini_splits_have_files_of_their_own(da: DeepAccident, exported: Exported) -> None:
-    for split in ("train_mini", "val_mini"):
-        content = pickle.loads((exported.folder / f"carla_infos_{split}.pkl").read_bytes())
-        assert content["metadata"] == {"version": "v1.0-mini"}
-        expected = {token.split("/")[0] for token in da.split_scenarios(split)}
-        assert {info["scenario_type"] for info in content["infos"]} == expected
+@pytest.mark.parametrize("split", ["train_mini", "val_mini"])
+def test_mini_splits_have_files_of_their_own(da: DeepAccident, exported: Exported, split: str) -> None:
+    content = pickle.loads((exported.folder / f"carla_infos_{split}.pkl").read_bytes())
+    assert content["metadata"] == {"version": "v1.0-mini"}
+    expected = {token.split("/")[0] for token in da.split_scenarios(split)}
+    assert {info["scenario_type"] for info in content["infos"]} == expected
 
 
 def test_velocities_are_the_labels_own_but_for_a_sign(da: DeepAccident, exported: Exported) -> None:
@@ -144,27 +146,22 @@ def test_infos_without_boxes(
 ) -> None:
     path = next(own_release.glob("val/*_accident/other_vehicle/label/*/*_004.txt"))
     path.write_text(path.read_text().splitlines()[0])
-    dataset = DeepAccident("v1", own_release, verbose=False)
+    dataset, listed = DeepAccident("v1", own_release, verbose=False), tmp_path / "out/carla_infos_without_boxes.txt"
     form = ReleasedInfos(root_prefix="./DeepAccident", split="val", drop_empty=drop)
     with caplog.at_level(logging.WARNING):
         made = export_release(dataset, tmp_path / "out", form)
     boxless = [info["lidar_prefix"] for info in infos(made.folder) if not len(info["gt_boxes"])]
-    listed = tmp_path / "out/carla_infos_without_boxes.txt"
     if drop:
-        assert made.tally.left_out == {"infos without boxes": 1}
-        assert not boxless
-        assert not listed.exists()
+        assert (made.tally.left_out, boxless, listed.exists()) == ({"infos without boxes": 1}, [], False)
     else:
         assert listed.read_text().splitlines() == boxless == [f"type1_subtype2_accident_other_vehicle_{path.stem}"]
-        assert "1 infos have no boxes" in caplog.text
-        assert not made.tally.left_out
+        assert ("1 infos have no boxes" in caplog.text, made.tally.left_out) == (True, {})
 
 
 def test_the_command_of_mmdet3d_has_the_style(da: DeepAccident, tmp_path: Path) -> None:
     words = ("--out", str(tmp_path / "out"), "--split", "val", "--style", "released", "--root-prefix", "./a/b")
     run = CliRunner().invoke(export, ["mmdet3d", str(da.dataroot), *words, "--workers", "1"])
-    assert run.exit_code == 0, run.output
-    assert "20 samples: a few files to write" in run.output
+    assert (run.exit_code, "20 samples: a few files to write" in run.output) == (0, True)
     assert infos(tmp_path / "out")[0]["lidar_path"].startswith("./a/b/type1_")
     assert not (tmp_path / "out" / "v1.0-deepaccident").exists()
 
@@ -177,16 +174,16 @@ def test_the_command_of_mmdet3d_has_the_style(da: DeepAccident, tmp_path: Path) 
     ],
 )
 def test_impossible_choices(choices: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ChoiceError, match=sentence):
-        ReleasedInfos(**choices)
+    assert_refused((lambda: ReleasedInfos(**choices), ChoiceError, sentence))
 
 
-@pytest.mark.parametrize(("opened", "prefix"), [("da", "data/DeepAccident_data/"), ("da_b", FOLDER)])
+@pytest.mark.parametrize(
+    ("opened", "prefix", "fitting"), [("da", "data/DeepAccident_data/", FOLDER), ("da_b", FOLDER, "./DeepAccident")]
+)
 def test_a_prefix_of_other_length_is_refused(
-    request: pytest.FixtureRequest, tmp_path: Path, opened: str, prefix: str
+    request: pytest.FixtureRequest, tmp_path: Path, opened: str, prefix: str, fitting: str
 ) -> None:
-    dataset = request.getfixturevalue(opened)
-    fitting = FOLDER if opened == "da" else "./DeepAccident"
-    with pytest.raises(ChoiceError, match=f"three parts before the scenario type.*give {fitting}, or another"):
-        export_release(dataset, tmp_path / "out", ReleasedInfos(root_prefix=prefix))
-    assert not (tmp_path / "out").exists()
+    out, form = tmp_path / "out", ReleasedInfos(root_prefix=prefix)
+    export = partial(export_release, request.getfixturevalue(opened), out, form)
+    assert_refused((export, ChoiceError, ("three parts before the scenario type", f"give {fitting}, or another")))
+    assert not out.exists()

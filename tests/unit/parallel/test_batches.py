@@ -67,8 +67,8 @@ def test_what_is_under_way_is_bounded() -> None:
     first_last = Delayed()
     first_last.finish_one = lambda: None  # type: ignore[method-assign] - the first is never done, nor another
     results = run_unordered(workers.following, range(300), executor=first_last)
-    thread = threading.Thread(target=lambda: next(results), daemon=True)
-    thread.start()
+    threading.Thread(target=lambda: next(results), daemon=True).start()
+    wait_for(lambda: first_last.given >= 4 * 2)
     time.sleep(0.05)
     assert first_last.given == 4 * 2
 

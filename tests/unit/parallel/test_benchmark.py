@@ -27,11 +27,9 @@ def test_every_engine_is_measured(benchmark: ModuleType, monkeypatch: pytest.Mon
     assert found["engine_here_samples_per_s_1_worker"] > 0
     for kind in filter(benchmark.installed, ("own", "dask", "mpi")):
         name = f"engine_{kind}"
-        assert found[f"{name}_samples_per_s_2_workers"] > 0
-        assert found[f"{name}_batch_ms_2_workers"] > 0
-        assert found[f"{name}_efficiency_2_workers"] > 0
+        positive = ("samples_per_s_2_workers", "batch_ms_2_workers", "efficiency_2_workers", "serial_share")
+        assert min(found[f"{name}_{figure}"] for figure in positive) > 0
         assert 0 <= found[f"{name}_caller_mb"] < 100
-        assert found[f"{name}_serial_share"] > 0
         minutes = [found[f"{name}_whole_release_by_amdahl_{cores}"] for cores in benchmark.CORES]
         times = [found[f"{name}_speed_up_by_amdahl_{cores}"] for cores in benchmark.CORES]
         assert minutes[0] * times[0] == pytest.approx(minutes[1] * times[1])

@@ -3,10 +3,12 @@
 import gc
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from refusals import assert_refused
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError, WorkerError
@@ -54,7 +56,7 @@ def test_a_wrong_scheduler_file(tmp_path: Path, content: str | None, monkeypatch
     import distributed  # noqa: F401 - as above
     from dask import config
 
-    monkeypatch.setattr("deepaccident_devkit.parallel.executors._SECONDS", 0.2)
+    monkeypatch.setattr("deepaccident_devkit.parallel.executors.SECONDS", 0.2)
     path = tmp_path / "scheduler.json"
     if content is not None:
         path.write_text(content)
@@ -98,9 +100,10 @@ def test_errors_of_the_work_are_not_those_of_workers(error: Exception) -> None:
 
 
 def test_the_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    refused = CliRunner().invoke(deepaccident, ["index", "release", "--scheduler", "tcp://x", "--workers", "2"])
+    words = ["index", "release", "--scheduler"]
+    refused = CliRunner().invoke(deepaccident, [*words, "tcp://x", "--workers", "2"])
     assert (refused.exit_code, "--workers changes nothing with a scheduler" in refused.output) == (2, True)
-    monkeypatch.setattr("deepaccident_devkit.parallel.executors._SECONDS", 0.2)
-    path = tmp_path / "absent.json"
-    with pytest.raises(WorkerError, match=f"^{path}: no dask scheduler answers"):
-        CliRunner().invoke(deepaccident, ["index", "release", "--scheduler", str(path)], catch_exceptions=False)
+    monkeypatch.setattr("deepaccident_devkit.parallel.executors.SECONDS", 0.2)
+    absent = [*words, str(tmp_path / "absent.json")]
+    invoke = partial(CliRunner().invoke, deepaccident, absent, catch_exceptions=False)
+    assert_refused((invoke, WorkerError, f"^{absent[-1]}: no dask scheduler answers"))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from processes import wait_for
 from refusals import assert_refused
 from stored import ITEMS, Work, made, process, store_in
 
@@ -20,7 +21,7 @@ WHOLE = b"\n".join(f"{name} {name} settings".encode() for name in ITEMS)
 
 def ended(running: "subprocess.Popen[str]") -> tuple[bool, str]:
     """Whether a process did all, and what it said."""
-    _, errors = running.communicate(timeout=60)
+    _, errors = running.communicate(timeout=300)
     return running.returncode == 0, errors
 
 
@@ -31,12 +32,10 @@ def marks(folder: Path) -> list[str]:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_several_processes_share_a_folder(tmp_path: Path, workers: int) -> None:
-    running = [process(tmp_path, workers) for _ in range(3)]
-    for each in running:
+    for each in [process(tmp_path, workers) for _ in range(3)]:
         good, errors = ended(each)
         assert good, errors
-    assert (tmp_path / "out").read_bytes() == WHOLE
-    assert not store_in(tmp_path).folder.exists()
+    assert ((tmp_path / "out").read_bytes(), store_in(tmp_path).folder.exists()) == (WHOLE, False)
     if len(list((tmp_path / "wholes").iterdir())) == 1:  # else one began when all was done
         assert marks(tmp_path) == [name.replace("/", ".") for name in ITEMS]
 
@@ -118,18 +117,14 @@ def test_removing_leaves_what_is_not_ours(tmp_path: Path) -> None:
 
 
 def test_who_waits_says_so_and_sees_that_all_is_done(tmp_path: Path) -> None:
-    store = store_in(tmp_path)
-    with store.shared() as turn:
+    with store_in(tmp_path).shared() as turn:
         running = process(tmp_path)
-        while len(list((tmp_path / "marks").glob("*"))) < len(ITEMS):
-            time.sleep(0.02)
+        wait_for(lambda: len(list((tmp_path / "marks").glob("*"))) == len(ITEMS), seconds=300)
         time.sleep(0.3)
-        assert running.poll() is None
-        assert not (tmp_path / "out").exists()
+        assert (running.poll(), (tmp_path / "out").exists()) == (None, False)
         turn.end()
         good, errors = ended(running)
-    assert good
-    assert "another process doubles there; waiting for it" in errors
+    assert (good, "another process doubles there; waiting for it" in errors) == (True, True)
 
 
 def test_begin_is_called_if_nobody_else_takes_part(tmp_path: Path) -> None:

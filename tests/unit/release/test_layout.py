@@ -29,28 +29,21 @@ def found(root: Path, version: str = "v1") -> list[tuple[str, str]]:
     return [(each.folder, each.token) for each in find_release(root, version).scenarios]
 
 
-def test_layout_a_in_the_order_of_tokens(root: Path) -> None:
-    scenario(root, NORMAL)
-    scenario(root, ACCIDENT, OTHER)
-    scenario(root, ACCIDENT)
+@pytest.mark.parametrize(
+    ("layout", "scenarios"),
+    [
+        ("A", [("", ACCIDENT, NAME), ("", ACCIDENT, OTHER), ("", NORMAL, NAME)]),
+        ("B", [("train", ACCIDENT, NAME), ("val", ACCIDENT, NAME), ("test", NORMAL, NAME)]),
+        ("A+B", [("val", ACCIDENT, NAME), ("", ACCIDENT, OTHER)]),
+    ],
+)
+def test_layouts_in_the_order_of_tokens(root: Path, layout: str, scenarios: list[tuple[str, str, str]]) -> None:
+    """A scenario may stand in two splits."""
+    for folder, kind, name in reversed(scenarios):
+        scenario(root / folder, kind, name)
     release = find_release(root)
-    assert (release.layout, release.version, release.root) == ("A", "v1", root)
-    assert found(root) == [("", f"{ACCIDENT}/{NAME}"), ("", f"{ACCIDENT}/{OTHER}"), ("", f"{NORMAL}/{NAME}")]
-
-
-def test_layout_b_and_a_scenario_that_stands_in_two_splits(root: Path) -> None:
-    scenario(root / "val")
-    scenario(root / "train")
-    scenario(root / "test", NORMAL)
-    assert find_release(root).layout == "B"
-    assert found(root) == [("train", f"{ACCIDENT}/{NAME}"), ("val", f"{ACCIDENT}/{NAME}"), ("test", f"{NORMAL}/{NAME}")]
-
-
-def test_both_layouts_at_once(root: Path) -> None:
-    scenario(root, name=OTHER)
-    scenario(root / "val")
-    assert find_release(root).layout == "A+B"
-    assert found(root) == [("val", f"{ACCIDENT}/{NAME}"), ("", f"{ACCIDENT}/{OTHER}")]
+    assert (release.layout, release.version, release.root) == (layout, "v1", root)
+    assert found(root) == [(folder, f"{kind}/{name}") for folder, kind, name in scenarios]
 
 
 def test_mini_is_apart_unless_it_is_all_there_is(root: Path) -> None:
@@ -58,8 +51,7 @@ def test_mini_is_apart_unless_it_is_all_there_is(root: Path) -> None:
     mini = [("DeepAccident_mini", f"{ACCIDENT}/{NAME}")]
     assert found(root) == found(root, "v1-mini") == mini
     scenario(root / "train", name=OTHER)
-    assert found(root) == [("train", f"{ACCIDENT}/{OTHER}")]
-    assert found(root, "v1-mini") == mini
+    assert (found(root), found(root, "v1-mini")) == ([("train", f"{ACCIDENT}/{OTHER}")], mini)
 
 
 def test_the_mini_folder_given_as_dataroot(root: Path) -> None:
@@ -68,42 +60,27 @@ def test_the_mini_folder_given_as_dataroot(root: Path) -> None:
         assert found(root / "DeepAccident_mini", version) == [("", f"{ACCIDENT}/{NAME}")]
 
 
-def test_a_release_without_mini(root: Path) -> None:
-    scenario(root)
-    with pytest.raises(VersionError, match=rf"^{root}: holds no mini release .*open it with version='v1'$"):
-        find_release(root, "v1-mini")
-
-
-def test_an_unknown_version(root: Path) -> None:
-    scenario(root)
-    with pytest.raises(VersionError, match=r"unknown version 'v2'; known are v1, v1-mini"):
-        find_release(root, "v2")
-
-
 @pytest.mark.parametrize("version", ["v1", "v1-mini"])
 def test_no_release_there(root: Path, version: str) -> None:
-    file = root / "file.txt"
+    file, gone = root / "file.txt", root / "gone"
     file.write_text("")
     assert_refused(
-        (
-            lambda: find_release(root / "gone", version),
-            DatarootError,
-            rf"^{root / 'gone'}: does not exist; give the folder",
-        ),
-        (lambda: find_release(file, version), DatarootError, rf"^{file}: is a file; give the folder"),
-        (
-            lambda: find_release(root, version),
-            DatarootError,
-            rf"^{root}: no scenario found; expected .*deepaccident synth OUT",
-        ),
+        (lambda: find_release(gone, version), DatarootError, (f"{gone}: does not exist", "give the folder")),
+        (lambda: find_release(file, version), DatarootError, (f"{file}: is a file", "give the folder")),
+        (lambda: find_release(root, version), DatarootError, (f"{root}: no scenario found", "deepaccident synth OUT")),
     )
     # the shell of one: sensors and labels, but no calib; files where folders are expected
     (root / ACCIDENT / "ego_vehicle" / "label" / NAME).mkdir(parents=True)
-    (root / ACCIDENT / "other_vehicle").write_text("")
-    (root / NORMAL).write_text("")
-    (root / "train").write_text("")
-    with pytest.raises(DatarootError if version == "v1" else VersionError, match=f"^{root}: "):
-        find_release(root, version)
+    for name in (f"{ACCIDENT}/other_vehicle", NORMAL, "train"):
+        (root / name).write_text("")
+    assert_refused(
+        (lambda: find_release(root, version), DatarootError if version == "v1" else VersionError, f"^{root}: ")
+    )
+    scenario(root)
+    assert_refused(
+        (lambda: find_release(root, "v2"), VersionError, "unknown version 'v2'; known are v1, v1-mini"),
+        (lambda: find_release(root, "v1-mini"), VersionError, (f"{root}: holds no mini release", "version='v1'")),
+    )
 
 
 def test_agents_are_those_with_a_calib_folder_in_the_usual_order(root: Path) -> None:
@@ -114,10 +91,8 @@ def test_agents_are_those_with_a_calib_folder_in_the_usual_order(root: Path) -> 
 
 def test_what_else_lies_about_is_ignored(root: Path) -> None:
     scenario(root)
-    scenario(root, "type1_subtype1_accident_old")
-    scenario(root, "my_notes")
-    scenario(root / "trainval")
-    scenario(root / ".deepaccident")
+    for kind in ("type1_subtype1_accident_old", "my_notes", f"trainval/{ACCIDENT}", f".deepaccident/{ACCIDENT}"):
+        scenario(root, kind)
     (root / ACCIDENT / "ego_vehicle" / "calib" / ".cache").mkdir()
     (root / ACCIDENT / "ego_vehicle" / "calib" / "readme.txt").write_text("")
     assert found(root) == [("", f"{ACCIDENT}/{NAME}")]
@@ -131,13 +106,21 @@ def test_paths_of_a_scenarios_files(root: Path, folder: str) -> None:
     each = find_release(root).scenarios[0]
     base = root / folder / ACCIDENT
     assert (each.token, each.scenario_type, each.name) == (f"{ACCIDENT}/{NAME}", ACCIDENT, NAME)
-    assert each.meta_path == base / "meta" / f"{NAME}.txt"
-    assert each.label_path("ego_vehicle", 7) == base / "ego_vehicle" / "label" / NAME / f"{NAME}_007.txt"
-    assert each.calib_path("infrastructure", 100) == base / "infrastructure" / "calib" / NAME / f"{NAME}_100.pkl"
-    image = base / "ego_vehicle" / "Camera_Front" / NAME / f"{NAME}_001.jpg"
-    assert each.channel_path("ego_vehicle", "Camera_Front", 1) == image
-    assert each.channel_path("ego_vehicle", "lidar01", 1).name == f"{NAME}_001.npz"
-    assert each.channel_path("ego_vehicle", "BEV_instance_camera", 1).name == f"{NAME}_001.npz"
+    assert [
+        each.meta_path,
+        each.label_path("ego_vehicle", 7),
+        each.calib_path("infrastructure", 100),
+        each.channel_path("ego_vehicle", "Camera_Front", 1),
+        each.channel_path("ego_vehicle", "lidar01", 1),
+        each.channel_path("ego_vehicle", "BEV_instance_camera", 1),
+    ] == [
+        base / "meta" / f"{NAME}.txt",
+        base / "ego_vehicle" / "label" / NAME / f"{NAME}_007.txt",
+        base / "infrastructure" / "calib" / NAME / f"{NAME}_100.pkl",
+        base / "ego_vehicle" / "Camera_Front" / NAME / f"{NAME}_001.jpg",
+        base / "ego_vehicle" / "lidar01" / NAME / f"{NAME}_001.npz",
+        base / "ego_vehicle" / "BEV_instance_camera" / NAME / f"{NAME}_001.npz",
+    ]
 
 
 def test_split_files_in_the_root_win_over_those_in_their_folder(root: Path) -> None:
@@ -184,20 +167,17 @@ def test_a_frame_number_that_leads_to_no_path_is_odd(root: Path) -> None:
         (folder / name).write_text("")
     frames, odd = frame_numbers(folder, "pkl")
     assert all(each.calib_path("ego_vehicle", frame).exists() for frame in frames)
-    assert frames == [7, 1000]
-    assert odd == sorted([f"{NAME}_0007.pkl", f"{NAME}_٠٠٩.pkl"])
+    assert (frames, odd) == ([7, 1000], sorted([f"{NAME}_0007.pkl", f"{NAME}_٠٠٩.pkl"]))
 
 
 def test_frame_sizes_are_those_of_files_with_a_number(tmp_path: Path) -> None:
     folder = tmp_path / NAME
     folder.mkdir()
-    for frame in (10, 2):
-        (folder / f"{NAME}_{frame:03d}.txt").write_text("x" * frame)
-    for name in (f"{NAME}_003.pkl", "notes.txt", f"{NAME}_000.txt"):
-        (folder / name).write_text("x")
+    for name, size in {"_010.txt": 10, "_002.txt": 2, "_003.pkl": 1, "_000.txt": 1, ".notes.txt": 1}.items():
+        (folder / f"{NAME}{name}").write_text("x" * size)
     (folder / f"{NAME}_004.txt").symlink_to("nowhere")
     assert list(frame_sizes(folder, "txt").items()) == [(2, 2), (10, 10)]
-    assert frame_sizes(tmp_path / "gone", "txt") == frame_sizes(folder / "notes.txt", "txt") == {}
+    assert frame_sizes(tmp_path / "gone", "txt") == frame_sizes(folder / f"{NAME}_002.txt", "txt") == {}
 
 
 def test_links_that_lead_to_themselves_or_back_hold_nothing(root: Path) -> None:

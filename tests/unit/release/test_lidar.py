@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError, SensorFileError
 from deepaccident_devkit.release import read_lidar, write_lidar
@@ -20,13 +21,9 @@ def path(tmp_path: Path) -> Path:
 def test_any_float_type_becomes_right_handed_double(path: Path, dtype: str, key: str) -> None:
     np.savez(path, **{key: RAW.astype(dtype)})
     cloud = read_lidar(path)
-    assert cloud.frame == "lidar"
-    assert cloud.xyz.dtype == np.float64
-    assert_array_equal(cloud.xyz, [[10, -2.5, -1.5], [-3, 4, 0.5]])
-    assert_array_equal(cloud.intensity, [0.25, 1])
-    raw = read_lidar(path, raw=True)
-    assert_array_equal(raw, RAW)
-    assert raw.dtype == np.dtype(dtype)
+    assert (cloud.frame, cloud.xyz.dtype) == ("lidar", np.float64)
+    assert_array_equal(cloud.points, [[10, -2.5, -1.5, 0.25], [-3, 4, 0.5, 1]])
+    assert_array_equal(read_lidar(path, raw=True), RAW.astype(dtype), strict=True)
 
 
 def test_no_points_are_a_cloud(path: Path) -> None:
@@ -49,8 +46,7 @@ def test_no_points_are_a_cloud(path: Path) -> None:
 def test_other_arrays_are_refused(path: Path, data: np.ndarray, found: str, raw: bool) -> None:
     np.savez(path, data=data)
     message = rf"^{path}: expected points \(N, 4\) of floats, found {found}; restore the file from its archive$"
-    with pytest.raises(SensorFileError, match=message):
-        read_lidar(path, raw=raw)
+    assert_refused((lambda: read_lidar(path, raw=raw), SensorFileError, message))
 
 
 def test_writing_restores_carlas_signs_in_single_precision_as_float64(path: Path) -> None:
@@ -61,6 +57,5 @@ def test_writing_restores_carlas_signs_in_single_precision_as_float64(path: Path
 
 @pytest.mark.parametrize(("xyz", "intensity"), [([[1, 2]], [1]), ([[1, 2, 3]], [1, 2]), ([[1, 2, 3]], 1)])
 def test_writing_other_shapes_is_refused_and_leaves_nothing(path: Path, xyz: list, intensity: list) -> None:
-    with pytest.raises(GeometryError, match=r"(xyz|intensity): expected shape"):
-        write_lidar(path, xyz, intensity)
+    assert_refused((lambda: write_lidar(path, xyz, intensity), GeometryError, r"(xyz|intensity): expected shape"))
     assert list(path.parent.iterdir()) == []

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -103,22 +104,16 @@ def test_tolerated_forms(write, text: str) -> None:
 )
 def test_a_missing_or_empty_line_is_none(write, line: int, field: str) -> None:
     lines = ACCIDENT.splitlines()
-    without = read_meta(write("\n".join(lines[:line] + lines[line + 1 :])))
-    assert getattr(without, field) is None
-    others = {name for name in Meta.__slots__ if name != field}
-    assert all(getattr(without, name) == getattr(ACCIDENT_META, name) for name in others)
+    assert read_meta(write("\n".join(lines[:line] + lines[line + 1 :]))) == replace(ACCIDENT_META, **{field: None})
     if line > 2:
         lines[line] = lines[line].split(":")[0] + ":"
         assert getattr(read_meta(write("\n".join(lines))), field) is None
 
 
-def test_colliding_agents_may_be_missing_or_third_road_users(write) -> None:
-    without = read_meta(write(ACCIDENT.replace(" colliding agents: ego_behind other_behind\n", "")))
-    assert without.collision is not None
-    assert without.collision.agents is None
-    third = read_meta(write(ACCIDENT.replace("ego_behind other_behind", "ego none")))
-    assert third.collision is not None
-    assert third.collision.agents == ("ego_vehicle", None)
+@pytest.mark.parametrize(("named", "agents"), [("", None), (" colliding agents: ego none\n", ("ego_vehicle", None))])
+def test_colliding_agents_may_be_missing_or_third_road_users(write, named: str, agents: tuple | None) -> None:
+    read = read_meta(write(ACCIDENT.replace(" colliding agents: ego_behind other_behind\n", named)))
+    assert read.collision == replace(ACCIDENT_META.collision, agents=agents)
 
 
 @pytest.mark.parametrize(
@@ -162,8 +157,7 @@ def test_a_pair_with_an_untracked_id_is_no_collision(write) -> None:
 )
 def test_faults_name_file_line_and_remedy(write, text: str, message: str) -> None:
     path = write(text)
-    with pytest.raises(MetaError, match=f"^{path}{message}.*{REMEDY}$"):
-        read_meta(path)
+    assert_refused((lambda: read_meta(path), MetaError, f"^{path}{message}.*{REMEDY}$"))
 
 
 def test_binary_garbage_and_a_missing_file(write, tmp_path: Path) -> None:
@@ -185,16 +179,14 @@ def test_written_text_is_as_the_release_has_it(tmp_path: Path) -> None:
 def test_a_normal_scenario_names_those_who_were_to_collide(write, tmp_path: Path, names: str) -> None:
     text = f"{NO_COLLISION}\n colliding agents: {names}"
     meta = read_meta(write(text))
-    first, second = names.split()
-    assert meta.collision is None
-    assert meta.planned_agents == (META_AGENTS[first], META_AGENTS[second])
+    assert (meta.collision, meta.planned_agents) == (None, tuple(META_AGENTS[name] for name in names.split()))
     write_meta(tmp_path / "meta.txt", meta)
     assert (tmp_path / "meta.txt").read_text() == text
 
 
-def test_nobody_is_planned_where_meta_names_nobody_or_a_collision(write) -> None:
-    assert read_meta(write(f"{NO_COLLISION}\n colliding agents: none none")).planned_agents is None
-    assert read_meta(write(ACCIDENT)).planned_agents is None
+@pytest.mark.parametrize("text", [f"{NO_COLLISION}\n colliding agents: none none", ACCIDENT])
+def test_nobody_is_planned_where_meta_names_nobody_or_a_collision(write, text: str) -> None:
+    assert read_meta(write(text)).planned_agents is None
 
 
 @given(st.data())

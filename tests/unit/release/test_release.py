@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import release
 from deepaccident_devkit.errors import MissingFileError, ReleaseError
@@ -21,13 +22,13 @@ def test_every_reader_is_known() -> None:
 
 @pytest.mark.parametrize("read", SINGLE.values(), ids=SINGLE)
 def test_a_missing_file_is_ours_and_pythons_own_error(tmp_path: Path, read: Callable) -> None:
-    with pytest.raises(MissingFileError, match=f"^{tmp_path / 'gone'}: no such file") as caught:
-        read(tmp_path / "gone")
-    assert isinstance(caught.value, FileNotFoundError)
+    gone = tmp_path / "gone"
+    assert_refused(
+        *((lambda: read(gone), kind, f"^{gone}: no such file") for kind in (MissingFileError, FileNotFoundError))
+    )
 
 
 @pytest.mark.parametrize("read", SINGLE.values(), ids=SINGLE)
 def test_a_folder_in_the_files_place_is_our_error(tmp_path: Path, read: Callable) -> None:
     """As any file that is there and cannot be read."""
-    with pytest.raises(ReleaseError, match=f"^{tmp_path}"):
-        read(tmp_path)
+    assert_refused((lambda: read(tmp_path), ReleaseError, f"^{tmp_path}"))

@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import MissingFileError, SplitFileError
 from deepaccident_devkit.release import read_split_file, write_split_file
@@ -31,14 +32,11 @@ def test_tokens_in_the_files_order_each_once(path: Path, text: str) -> None:
     assert read_split_file(path) == [f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"]
 
 
-def test_raw_keeps_repeated_lines(path: Path) -> None:
-    path.write_text(f"{TYPE} {NAME}\n\n{TYPE} {NAME}\n")
-    assert read_split_file(path, raw=True) == [f"{TYPE}/{NAME}"] * 2
-
-
-def test_an_empty_file_names_no_scenario(path: Path) -> None:
-    path.write_text("\n \n")
-    assert read_split_file(path) == read_split_file(path, raw=True) == []
+@pytest.mark.parametrize("count", [0, 2])
+def test_raw_keeps_repeated_lines_and_an_empty_file_names_no_scenario(path: Path, count: int) -> None:
+    path.write_text(f"{TYPE} {NAME}\n\n" * count + "\n \n")
+    assert read_split_file(path, raw=True) == [f"{TYPE}/{NAME}"] * count
+    assert read_split_file(path) == [f"{TYPE}/{NAME}"] * min(count, 1)
 
 
 @pytest.mark.parametrize("line", [NAME, f"{TYPE} {NAME} 3"])
@@ -46,34 +44,37 @@ def test_an_empty_file_names_no_scenario(path: Path) -> None:
 def test_a_malformed_line_is_named_by_its_number_in_the_file(path: Path, line: str, raw: bool) -> None:
     path.write_text(f"{TYPE} {NAME}\n\n{line}\n")
     message = rf"^{path}:3: expected '<scenario_type> <scenario>', found '{line}'; mend or remove the line$"
-    with pytest.raises(SplitFileError, match=message):
-        read_split_file(path, raw=raw)
+    assert_refused((lambda: read_split_file(path, raw=raw), SplitFileError, message))
 
 
 def test_binary_garbage_and_a_missing_file(path: Path) -> None:
-    with pytest.raises(MissingFileError, match=r"train\.txt: no such file"):
-        read_split_file(path)
-    path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(SplitFileError, match=r"train\.txt: not a text file .*; restore it from the release"):
-        read_split_file(path)
+    binary = path.with_name("binary.txt")
+    binary.write_bytes(b"\xff\xfe\x00\x80")
+    assert_refused(
+        (lambda: read_split_file(path), MissingFileError, r"train\.txt: no such file"),
+        (
+            lambda: read_split_file(binary),
+            SplitFileError,
+            ("binary.txt: not a text file", "restore it from the release"),
+        ),
+    )
 
 
-def test_written_text(path: Path) -> None:
-    write_split_file(path, [f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"])
-    assert path.read_text() == f"{TYPE} {NAME}\n{TWIN} {NAME}\n"
-    write_split_file(path, [])
-    assert path.read_bytes() == b""
+@pytest.mark.parametrize(
+    ("tokens", "text"), [([f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"], f"{TYPE} {NAME}\n{TWIN} {NAME}\n"), ([], "")]
+)
+def test_written_text(path: Path, tokens: list[str], text: str) -> None:
+    write_split_file(path, tokens)
+    assert path.read_text() == text
 
 
-def test_unique_names_both_lines(path: Path) -> None:
+@pytest.mark.parametrize("raw", [False, True])
+def test_unique_names_both_lines(path: Path, raw: bool) -> None:
     path.write_text(f"{TYPE} {NAME}\n\n{TWIN} {NAME}\n{TYPE}  {NAME}\n")
-    for raw in (False, True):
-        with pytest.raises(
-            SplitFileError, match=rf"train\.txt:4: '{TYPE} {NAME}' stands in line 1 already; remove one"
-        ):
-            read_split_file(path, raw=raw, unique=True)
+    named = ("train.txt:4: ", f"'{TYPE} {NAME}' stands in line 1 already", "remove one")
+    assert_refused((lambda: read_split_file(path, raw=raw, unique=True), SplitFileError, named))
     path.write_text(f"{TYPE} {NAME}\n{TWIN} {NAME}\n")
-    assert read_split_file(path, unique=True) == [f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"]
+    assert read_split_file(path, raw=raw, unique=True) == [f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"]
 
 
 def test_a_message_quotes_little(path: Path) -> None:

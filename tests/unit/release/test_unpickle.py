@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hypothesis_numpy
+from refusals import assert_refused
 from strategies import mutations
 
 from deepaccident_devkit.errors import CalibError
@@ -247,8 +248,7 @@ HOSTILE = {
 def test_hostile_opcodes(tmp_path: Path, raw_calib: Calibs, name: str) -> None:
     flag, path = tmp_path / "flag", tmp_path / "calib.pkl"
     path.write_bytes(HOSTILE[name].replace(b"FLAG", bytes(flag)))
-    with pytest.raises(CalibError, match=rf"(?s)^{path}: .*; restore the file from its archive$"):
-        read_calib(path)
+    assert_refused((lambda: read_calib(path), CalibError, rf"(?s)^{path}: .*; restore the file from its archive$"))
     assert not flag.exists()
     # nothing of it stays behind in the stand-ins
     assert_read_back(path, pickle.dumps(raw_calib, 2), raw_calib)
@@ -270,11 +270,10 @@ def test_hostile_opcodes_within_a_good_file(tmp_path: Path, raw_calib: Calibs, o
 
 def test_a_registered_extension_is_not_a_way_in(tmp_path: Path) -> None:
     path = tmp_path / "calib.pkl"
+    path.write_bytes(b"\x80\x02\x82\xf0(Vtouch " + bytes(tmp_path / "flag") + b"\ntR.")
     copyreg.add_extension("posix", "system", 240)
     try:
-        path.write_bytes(b"\x80\x02\x82\xf0(Vtouch " + bytes(tmp_path / "flag") + b"\ntR.")
-        with pytest.raises(CalibError, match="at byte 2: the opcode EXT1 is not allowed"):
-            read_calib(path)
+        assert_refused((lambda: read_calib(path), CalibError, "at byte 2: the opcode EXT1 is not allowed"))
     finally:
         copyreg.remove_extension("posix", "system", 240)
     assert not (tmp_path / "flag").exists()
@@ -305,8 +304,7 @@ def test_arrays_of_other_than_numbers_are_refused(
 ) -> None:
     path = tmp_path / "calib.pkl"
     path.write_bytes(pickle.dumps({**raw_calib, "ego_to_world": array}, protocol))
-    with pytest.raises(CalibError, match=rf"^{path}: .*restore"):
-        read_calib(path)
+    assert_refused((lambda: read_calib(path), CalibError, rf"^{path}: .*restore"))
 
 
 def int4(number: int) -> bytes:
@@ -402,7 +400,7 @@ BOMBS = {
 
 @pytest.fixture(scope="module")
 def bomb_outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
-    """What became of the processes that read them: each has 1 GiB and 10 s."""
+    """What became of the processes that read them: each has 1 GiB and a minute."""
     pytest.importorskip("resource")
     folder = tmp_path_factory.mktemp("bombs")
     paths = [folder / f"{number}.pkl" for number in range(len(BOMBS))]
@@ -416,7 +414,7 @@ def bomb_outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs_are_named_in_little_memory(bomb_outcomes: dict[str, dict], name: str) -> None:
     outcome = bomb_outcomes[name]
-    assert outcome["status"] == 0, "the process has crashed, or was killed after 10 s"
+    assert outcome["status"] == 0, "the process has crashed, or was killed after a minute"
     assert BOMBS[name][1] in outcome["message"]
     assert len(outcome["message"]) < 600
     assert outcome["message"].isprintable()
@@ -455,13 +453,12 @@ def test_damage_raises_our_error_or_nothing(
 
 
 @pytest.mark.usefixtures("_little_memory")
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(pieces=st.lists(st.sampled_from(PIECES), max_size=25))
 def test_random_programs_raise_our_error(tmp_path_factory: pytest.TempPathFactory, pieces: list[bytes]) -> None:
     path = tmp_path_factory.getbasetemp() / "program.pkl"
     path.write_bytes(b"".join(pieces) + b".")
-    with pytest.raises(CalibError, match=r"program\.pkl: "):
-        read_calib(path)
+    assert_refused((lambda: read_calib(path), CalibError, r"program\.pkl: "))
 
 
 @settings(max_examples=60)
@@ -494,9 +491,9 @@ def test_all_arrays_are_read_back(arrays: Calibs, protocol: int, *, fortran: boo
 def test_the_opcodes_of_one_layout_are_read_once(
     raw_calib: Calibs, monkeypatch: pytest.MonkeyPatch, protocol: int
 ) -> None:
-    monkeypatch.setattr(pickles, "_layouts", [])
+    monkeypatch.setattr(pickles, "layouts", [])
     load_arrays(pickle.dumps(raw_calib, protocol))
-    monkeypatch.setattr(pickles, "_MOST_OPCODES", 0)  # whatever is read again is now refused
+    monkeypatch.setattr(pickles, "MOST_OPCODES", 0)  # whatever is read again is now refused
     changed = {key: array[::-1] * np.pi for key, array in raw_calib.items()}
     if protocol >= 3:  # before, bytes are text, which may have another length
         read = load_arrays(pickle.dumps(changed, protocol))
@@ -506,10 +503,10 @@ def test_the_opcodes_of_one_layout_are_read_once(
 
 
 def test_only_some_layouts_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pickles, "_layouts", [])
+    monkeypatch.setattr(pickles, "layouts", [])
     for number in range(100):
         load_arrays(pickle.dumps({f"key {number}": np.zeros(8)}, 4))
-    assert len(pickles._layouts) == 16
+    assert len(pickles.layouts) == 16
 
 
 def outcome_of(content: bytes) -> Calibs | str:
@@ -525,16 +522,16 @@ def test_changed_bytes_are_refused_or_read_as_python_reads_them(
 ) -> None:
     content = pickle.dumps({key: raw_calib[key] for key in ("ego_to_world", "intrinsic_Camera_Back")}, protocol)
     load_arrays(content)
-    remembered = list(pickles._layouts)
+    remembered = list(pickles.layouts)
     rng = np.random.default_rng(protocol)
     values = 0
-    for _ in range(400):
+    for _ in range(200):
         changed = bytearray(content)
         for at in rng.integers(len(content), size=rng.integers(1, 3)):
             changed[at] = rng.integers(256)
-        monkeypatch.setattr(pickles, "_layouts", [])
+        monkeypatch.setattr(pickles, "layouts", [])
         fresh = outcome_of(bytes(changed))
-        monkeypatch.setattr(pickles, "_layouts", list(remembered))
+        monkeypatch.setattr(pickles, "layouts", list(remembered))
         known = outcome_of(bytes(changed))
         if isinstance(fresh, str):
             assert known == fresh
@@ -548,4 +545,4 @@ def test_changed_bytes_are_refused_or_read_as_python_reads_them(
             for key, array in plain.items():
                 np.testing.assert_array_equal(fresh[key], array)
                 np.testing.assert_array_equal(known[key], array)
-    assert values > 20
+    assert values > 10

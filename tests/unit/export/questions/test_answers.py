@@ -138,8 +138,7 @@ def test_the_results_file(asked: Asked, tmp_path: Path) -> None:
     assert all(read.prediction(token) == [] for token in ends)
     for sample, each in asked.truth.items():
         assert len(read.prediction(sample)) == (True in each["accident"] and each["when"] != 1.0)
-    with pytest.raises(ResultsError, match=f"^{out}: "):
-        results_of_answers(tmp_path / "answers", truth, out)
+    assert_refused((lambda: results_of_answers(tmp_path / "answers", truth, out), ResultsError, f"^{out}: "))
 
 
 GOOD: dict[str, Any] = {"accident": [False, 0.7, False], "who": None, "where": [0, 1]}
@@ -185,37 +184,35 @@ def test_malformed_answers(asked: Asked, tmp_path: Path, change: Any, sentence: 
 
 
 @pytest.mark.parametrize("name", ["id", "accident", "who", "where"])
-def test_an_answer_that_lacks_something(asked: Asked, tmp_path: Path, name: str) -> None:
-    line = {"id": next(iter(asked.truth.values()))["id"], **GOOD}
-    del line[name]
-    path = written(tmp_path / "answers.jsonl", [line])
-    with pytest.raises(ResultsError, match=f"^{path}:1: object missing required field `{name}`; mend that line"):
-        read_answers(path, asked.done.folder / "truth.jsonl")
-
-
-def test_two_answers_to_a_question(asked: Asked, tmp_path: Path) -> None:
-    line = {"id": next(iter(asked.truth.values()))["id"], **GOOD}
-    path = written(tmp_path / "answers.jsonl", [line, line])
-    with pytest.raises(ResultsError, match=f"^{path}:2: id: {line['id']} is answered in line 1 already; leave one"):
-        read_answers(path, asked.done.folder / "truth.jsonl")
+def test_an_answer_that_lacks_something_or_comes_twice(asked: Asked, tmp_path: Path, name: str) -> None:
+    whole = {"id": next(iter(asked.truth.values()))["id"], **GOOD}
+    lacking = {key: each for key, each in whole.items() if key != name}
+    path, truth = written(tmp_path / "a.jsonl", [whole, lacking]), asked.done.folder / "truth.jsonl"
+    twice = written(tmp_path / "b.jsonl", [whole, whole])
+    assert_refused(
+        (
+            lambda: read_answers(path, truth),
+            ResultsError,
+            (f"{path}:2: ", f"required field `{name}`", "mend that line"),
+        ),
+        (lambda: read_answers(twice, truth), ResultsError, (f"{twice}:2: id: {whole['id']}", "line 1", "leave one")),
+    )
 
 
 def test_files_that_are_something_else(asked: Asked, tmp_path: Path) -> None:
     path, truth = written(tmp_path / "answers.jsonl", perfect(asked)), asked.done.folder / "truth.jsonl"
+    empty = written(tmp_path / "empty", [])
     assert_refused(
         (
             lambda: read_answers(path, path),
             ResultsError,
-            rf"^{path}:1: .*; this is no line of a truth file; give truth\.jsonl of the export",
+            (f"{path}:1: ", "no line of a truth file", "give truth.jsonl"),
         ),
         (lambda: read_answers(tmp_path / "none", truth), ResultsError, f"^{tmp_path}/none: cannot be read"),
+        (lambda: read_answers(path, empty), ResultsError, f"^{empty}: holds no question"),
+        (lambda: read_answers(path, truth, threshold=1.5), ConfigError, ("threshold", "from 0 to 1", "1.5")),
     )
-    empty = written(tmp_path / "empty", [])
-    with pytest.raises(ResultsError, match=f"^{empty}: holds no question"):
-        read_answers(path, empty)
     assert read_answers(empty, truth).alarms == 0
-    with pytest.raises(ConfigError, match=r"^threshold: expected a number from 0 to 1, found 1\.5"):
-        read_answers(path, truth, threshold=1.5)
 
 
 @pytest.mark.parametrize(
@@ -245,9 +242,9 @@ def test_a_truth_file_that_was_changed(asked: Asked, tmp_path: Path, name: str, 
 def test_the_command(asked: Asked, tmp_path: Path) -> None:
     answers, out = written(tmp_path / "answers.jsonl", perfect(asked)[1:]), tmp_path / "accident.json"
     words = [str(answers), "--truth", str(asked.done.folder / "truth.jsonl"), "--out", str(out), "--method", "mine"]
-    result = CliRunner().invoke(deepaccident, ["results", *words], catch_exceptions=False)
-    assert result.exit_code == 0
-    alarms = sum(len(read_results(out).prediction(token)) for token in read_results(out).tokens)
-    assert f"{out}: {alarms} alarms in {len(asked.truth) - 1} answers\n" in result.stdout
-    assert "without an answer: 1 questions, which raise no alarm" in result.stdout
-    assert read_results(out).meta["method"] == "mine"
+    said = CliRunner().invoke(deepaccident, ["results", *words], catch_exceptions=False).stdout
+    found = read_results(out)
+    alarms = sum(len(found.prediction(token)) for token in found.tokens)
+    assert f"{out}: {alarms} alarms in {len(asked.truth) - 1} answers\n" in said
+    assert "without an answer: 1 questions, which raise no alarm" in said
+    assert found.meta["method"] == "mine"

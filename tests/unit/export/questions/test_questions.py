@@ -13,13 +13,18 @@ import jsonschema
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from hypothesis import given
+from hypothesis import strategies as st
 from question_files import Asked, accident_of, ask, read_back
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.frames import keyframes
 from deepaccident_devkit.export.questions import Questions, WindowRules
+from deepaccident_devkit.export.questions.observed import digest
 from deepaccident_devkit.export.questions.questions import seconds_ahead
 from deepaccident_devkit.release import read_meta
 from deepaccident_devkit.release.meta import write_meta
@@ -52,8 +57,7 @@ def test_every_window_of_every_ego_is_asked_about(da_motion: DeepAccident, asked
         for ego in FORM.agents
         for present in (15, 20, 25, 30)
     }
-    assert set(asked.lines) == wanted
-    assert asked.done.tally.samples == len(wanted)
+    assert (set(asked.lines), asked.done.tally.samples) == (wanted, len(wanted))
     assert not asked.done.tally.left_out
 
 
@@ -65,15 +69,13 @@ def test_the_actors_of_each_moment_are_those_that_the_set_sees(da_motion: DeepAc
         assert truth["observers"]["ego"] == ego
         members = {da_motion.agent.get(f"{scenario}/{agent}")["actor_id"] for agent in SET}
         for frame, time in zip(frames_of(sample, question), question["moments"], strict=True):
-            shown = {
-                truth["actors"][actor["name"]]: actor["seen_by"][actor["time"].index(time)]
-                for actor in question["actors"]
-                if time in actor["time"]
-            }
-            for agent in SET:
+            for name, agent in truth["observers"].items():
+                by_it = {
+                    truth["actors"][actor["name"]]
+                    for actor in question["actors"]
+                    if time in actor["time"] and name in actor["seen_by"][actor["time"].index(time)]
+                }
                 tokens = visible_instances(da_motion, f"{scenario}/{agent}/{frame:03d}", agents=[agent])
-                name = next(name for name, each in truth["observers"].items() if each == agent)
-                by_it = {actor for actor, names in shown.items() if name in names}
                 assert by_it == {int(token.rsplit("/", 1)[1]) for token in tokens} - members
 
 
@@ -94,8 +96,8 @@ def test_places_headings_speeds_and_sizes_are_those_of_the_labels(da_motion: Dee
                 turn = actor["heading"][number] - boxes.yaw[row]
                 assert np.arctan2(np.sin(turn), np.cos(turn)) == pytest.approx(0, abs=0.002)
                 assert actor["speed"][number] == pytest.approx(np.linalg.norm(boxes.velocity[row]), abs=0.006)
-                assert actor["class"] == boxes.category_names[row]
-                assert actor["size"] == pytest.approx(boxes.size[row].tolist(), abs=0.006)
+                size = pytest.approx(boxes.size[row].tolist(), abs=0.006)
+                assert (actor["class"], actor["size"]) == (boxes.category_names[row], size)
 
 
 def test_observers_know_themselves(da_motion: DeepAccident, asked: Asked) -> None:
@@ -284,19 +286,18 @@ def test_what_cannot_be_asked_is_counted(
     assert len(others) == 1
 
 
-def test_a_release_of_short_recordings(da_b: DeepAccident, tmp_path: Path) -> None:
-    form = Questions(window=WindowRules(observe=0, stride=0.5))
-    with pytest.raises(
-        NotAvailableError, match=r"^no recording is long enough for a window of 0 s: the longest has 0\.4"
-    ):
-        ask(da_b, tmp_path, form)
-
-
-def test_a_release_in_which_nothing_can_be_asked(da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_a_release_in_which_nothing_can_be_asked(da_motion: DeepAccident, da_b: DeepAccident, tmp_path: Path) -> None:
     root = tmp_path / "release"
     shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "meta"))
-    with pytest.raises(NotAvailableError, match=r"^no question can be asked: scenarios lack labels"):
-        ask(DeepAccident(dataroot=root, verbose=False, workers=1), tmp_path, FORM)
+    without_meta, short = DeepAccident(dataroot=root, verbose=False, workers=1), WindowRules(observe=0, stride=0.5)
+    assert_refused(
+        (
+            lambda: ask(without_meta, tmp_path, FORM),
+            NotAvailableError,
+            "^no question can be asked: scenarios lack labels",
+        ),
+        (lambda: ask(da_b, tmp_path, Questions(window=short)), NotAvailableError, ("no recording is long", "has 0.4")),
+    )
 
 
 @pytest.mark.parametrize(
@@ -312,8 +313,7 @@ def test_a_release_in_which_nothing_can_be_asked(da_motion: DeepAccident, tmp_pa
     ],
 )
 def test_impossible_settings(options: dict[str, Any], error: type[Exception], sentence: str) -> None:
-    with pytest.raises(error, match=f"^{sentence}"):
-        Questions(**options)
+    assert_refused((lambda: Questions(**options), error, f"^{sentence}"))
 
 
 def test_the_command(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
@@ -341,3 +341,57 @@ def _settings(folder: Path) -> dict[str, Any]:
     told = json.loads((folder / "questions.manifest.json").read_text())["settings"]
     del told["version"]
     return {**told, "window": WindowRules(**told["window"])}
+
+
+@pytest.mark.parametrize(
+    ("rules", "last", "presents"),
+    [
+        (WindowRules(observe=2.0), 57, [27, 37, 47]),
+        (WindowRules(observe=2.0, stride=0.5), 40, [25, 30, 35]),
+        (WindowRules(observe=2.0, stride=0.5), 41, [21, 26, 31, 36]),
+        (WindowRules(observe=5.0), 51, []),
+    ],
+)
+def test_presents_are_counted_back_from_the_last_frame_which_is_none(
+    rules: WindowRules, last: int, presents: list[int]
+) -> None:
+    assert [each.present for each in rules.windows(last)] == presents
+
+
+def test_the_moments_of_a_window() -> None:
+    (window,) = WindowRules(observe=1.5).windows(26)
+    assert (window.frames, window.times) == ((1, 6, 11, 16), [-1.5, -1.0, -0.5, 0.0])
+    assert WindowRules(observe=0).windows(11)[0].frames == (1,)
+
+
+@given(st.integers(0, 130), st.integers(0, 12), st.integers(1, 6))
+def test_windows_lie_in_the_recording_before_its_end(last: int, observe: int, stride: int) -> None:
+    windows = WindowRules(observe=observe, stride=stride / 2).windows(last)
+    for window in windows:
+        assert window.frames[0] >= 1
+        assert window.present < last
+        assert window.present in keyframes(last)  # where evaluations have their samples
+        assert len(window.frames) == observe * 2 + 1
+        assert set(map(int.__sub__, window.frames[1:], window.frames)) <= {5}
+    assert len({window.present for window in windows}) == len(windows)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"observe": 0.3}, "observe: expected seconds from 0 in steps of 0.5, found 0.3"),
+        ({"observe": -1}, "observe: expected seconds from 0"),
+        ({"observe": float("nan")}, "observe: expected"),
+        ({"stride": 0}, "stride: expected seconds from 0.5 in steps of 0.5, found 0"),
+        ({"stride": 0.7}, "stride: expected seconds from 0.5"),
+        ({"ahead": 0}, "ahead: expected a whole number from 1, found 0"),
+    ],
+)
+def test_impossible_rules(options: dict[str, float], sentence: str) -> None:
+    assert_refused((lambda: WindowRules(**options), ConfigError, f"^{sentence}"))  # type: ignore[arg-type]
+
+
+def test_a_digest_depends_on_the_seed_and_on_each_word() -> None:
+    found = [digest("0", "a", "bc"), digest("1", "a", "bc"), digest("0", "ab", "c"), digest("0", "a", "bd")]
+    assert (len(set(found)), digest("0", "a", "bc")) == (4, found[0])
+    assert all(len(each) == 16 and set(each) <= set("0123456789abcdef") for each in found)

@@ -34,8 +34,7 @@ def test_every_file_is_found_and_no_other(tmp_path: Path, files: dict[tuple[str,
     write_members(tmp_path / "list.arrow", listings, {"0.zip": (3, "x")})
     members = Members(tmp_path / "list.arrow")
     assert {path: members.find(path) for path in expected} == expected
-    assert len(members) == len(files)
-    assert members.states == {"0.zip": (3, "x")}
+    assert (len(members), members.states) == (len(files), {"0.zip": (3, "x")})
     for folder, name in files:
         assert members.find(f"{folder}/{name}x") in (None, expected.get(f"{folder}/{name}x"))
         assert members.has_folder(folder)

@@ -92,11 +92,9 @@ def test_fields_mean_what_they_mean_in_nuscenes(da_motion: DeepAccident, tmp_pat
     found = results_from_nuscenes(da_motion, file)
     assert list(found.boxes) == [other, sample]
     boxes, scores = found.boxes[other].boxes, found.boxes[other].scores
-    assert boxes.frame == "world"
-    assert boxes.category_names == [*OURS.values(), "van", "cyclist"]
+    assert (boxes.frame, boxes.category_names) == ("world", [*OURS.values(), "van", "cyclist"])
     assert scores.tolist() == [number / 16 for number in range(7)]
-    assert boxes.center[0].tolist() == [105.0, -33.0, 1.0]
-    assert boxes.size[0].tolist() == [4.5, 2.0, 1.5]
+    assert (boxes.center[0].tolist(), boxes.size[0].tolist()) == ([105.0, -33.0, 1.0], [4.5, 2.0, 1.5])
     assert boxes.yaw[0] == pytest.approx(2 * np.arctan2(0.8, 0.6))
     assert boxes.velocity[0].tolist() == [3.0, -4.0, 0.0]
     assert np.isnan(boxes.velocity[1]).any()

@@ -45,20 +45,17 @@ def test_the_scenario_is_what_its_name_and_meta_say(hand_made: DeepAccident) -> 
 
 def test_left_handed_values_are_turned_once(hand_made: DeepAccident) -> None:
     pose = hand_made.get("ego_pose", FRAME_2)
-    assert pose["translation"] == [5.0, -2.0, 0.5]
     np.testing.assert_allclose(pose["rotation"], [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)], atol=1e-12)
-    assert hand_made.get("sample", FRAME_2)["velocity"] == [0.0, -10.0]
-    own = hand_made.get("annotation", f"{FRAME_2}/0")
+    own, pedestrian = (hand_made.get("annotation", f"{FRAME_2}/{row}") for row in (0, 2))
+    assert (pose["translation"], hand_made.get("sample", FRAME_2)["velocity"]) == ([5.0, -2.0, 0.5], [0.0, -10.0])
     assert (own["velocity_label"], own["actor_id"]) == ([0.0, -10.0], -100)
-    pedestrian = hand_made.get("annotation", f"{FRAME_2}/2")
     assert (pedestrian["translation"], pedestrian["yaw"]) == ([30.0, 1.5, -0.9], -2.19)
 
 
 def test_world_boxes_are_where_the_car_is_for_every_agent(hand_made: DeepAccident) -> None:
     for sample in hand_made.samples_of(f"{tiny.TOKEN}/003"):
         van = next(box for box in hand_made.get_boxes(sample) if box.actor_id == 1300)
-        np.testing.assert_allclose(van.center, [20.6, -3.0, 1.3], atol=1e-9)
-        assert van.yaw == pytest.approx(0.0, abs=1e-9)
+        np.testing.assert_allclose([*van.center, van.yaw], [20.6, -3.0, 1.3, 0.0], atol=1e-9)
         assert van.token == f"{sample['token']}/{0 if sample['agent'] == 'infrastructure' else 1}"
         assert van.instance_token == f"{tiny.TOKEN}/actor/1300"
 
@@ -99,30 +96,28 @@ def test_untracked_boxes_have_no_instance_and_no_chain(hand_made: DeepAccident) 
     assert found == [[0.0, 0.0, 0.0], None, None, None]
 
 
-def test_the_labels_own_velocity_can_be_asked_for(hand_made: DeepAccident) -> None:
+@pytest.mark.parametrize(("frame", "row", "velocity"), [("lidar", 1, [0.0, 2.0, 0.0]), ("world", 0, [0, -10, 0])])
+def test_the_labels_own_velocity_can_be_asked_for(
+    hand_made: DeepAccident, frame: str, row: int, velocity: list[float]
+) -> None:
     """(vx, −vy) of the label as if in the LiDAR frame; the agent's own row is in world already."""
-    boxes = hand_made.boxes(FRAME_2, "lidar", velocity="label")
-    np.testing.assert_allclose(boxes.velocity[1], [0.0, 2.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(hand_made.boxes(FRAME_2, "world", velocity="label").velocity[0], [0, -10, 0], atol=1e-9)
+    found = hand_made.boxes(FRAME_2, frame, velocity="label").velocity[row]
+    np.testing.assert_allclose(found, velocity, atol=1e-9)
 
 
 def test_the_colliding_pair_and_the_countdown_are_on_the_annotations(hand_made: DeepAccident) -> None:
-    colliders = {record["token"] for record in hand_made.annotation if record["is_collider"]}
-    rows = {
+    assert {record["token"] for record in hand_made.annotation if record["is_collider"]} == {
         f"{tiny.TOKEN}/{agent}/{frame:03d}/0" for agent in ("ego_vehicle", "other_vehicle") for frame in range(1, 5)
     }
-    assert colliders == rows
     for table, token in (("annotation", f"{FRAME_2}/1"), ("sample", FRAME_2), ("frame", f"{tiny.TOKEN}/002")):
         assert hand_made.get(table, token)["time_to_impact"] == 0.2
 
 
 def test_tracks_take_the_view_from_outside(hand_made: DeepAccident) -> None:
-    van = hand_made.get("track", f"{tiny.TOKEN}/002/actor/1300")
-    assert van["agents"] == list(tiny.AGENTS)
+    van, ego = (hand_made.get("track", f"{tiny.TOKEN}/002/actor/{actor}") for actor in (1300, 1223))
+    assert (van["agents"], ego["agents"], ego["is_collider"]) == (list(tiny.AGENTS), ["ego_vehicle"], True)
     np.testing.assert_allclose(van["translation"], [20.4, -3.0, 1.3], atol=1e-9)
     np.testing.assert_allclose(van["velocity"], [2.0, 0.0, 0.0], atol=1e-9)
-    ego = hand_made.get("track", f"{tiny.TOKEN}/002/actor/1223")
-    assert (ego["agents"], ego["is_collider"]) == (["ego_vehicle"], True)
 
 
 def test_a_track_prefers_another_agents_row_to_the_actors_own(tmp_path: Path) -> None:
@@ -183,23 +178,23 @@ def test_sensor_data_comes_with_boxes_in_the_sensors_frame(hand_made: DeepAccide
 def test_transform_between_agents_and_times(hand_made: DeepAccident) -> None:
     behind, later = f"{tiny.TOKEN}/ego_vehicle_behind/001", f"{tiny.TOKEN}/ego_vehicle/004"
     moved = hand_made.transform(behind, later, "ego", "ego")
-    np.testing.assert_allclose(moved.translation, [15.0, -4.0, 0.0], atol=1e-9)
-    assert moved.yaw == pytest.approx(-np.pi / 2)
-    round_trip = moved @ hand_made.transform(later, behind)
-    np.testing.assert_allclose(round_trip.matrix, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose([*moved.translation, moved.yaw], [15.0, -4.0, 0.0, -np.pi / 2], atol=1e-9)
+    np.testing.assert_allclose((moved @ hand_made.transform(later, behind)).matrix, np.eye(4), atol=1e-9)
 
 
-def test_visibility(hand_made: DeepAccident) -> None:
+@pytest.mark.parametrize(("visible", "actors"), [("released", [1300]), ("camera", [1300, -1])])
+def test_visibility(hand_made: DeepAccident, visible: str, actors: list[int]) -> None:
     """The van has 12 points and a camera for all; the pedestrian is untracked, the agent itself never counts."""
-    assert [box.actor_id for box in hand_made.get_boxes(FRAME_2, visible="released")] == [1300]
-    assert [box.actor_id for box in hand_made.get_boxes(FRAME_2, visible="camera")] == [1300, -1]
+    assert [box.actor_id for box in hand_made.get_boxes(FRAME_2, visible=visible)] == actors
 
 
 def test_twelve_tables_and_agents_sizes(hand_made: DeepAccident) -> None:
-    agent = hand_made.get("agent", f"{tiny.TOKEN}/ego_vehicle_behind")
-    assert (agent["actor_id"], agent["category"], agent["size"]) == (1236, "car", [4.5, 1.9, 1.5])
-    pole = hand_made.get("agent", f"{tiny.TOKEN}/infrastructure")
-    assert (pole["actor_id"], pole["category"], pole["size"], pole["is_infrastructure"]) == (None, None, None, True)
+    agents = (hand_made.get("agent", f"{tiny.TOKEN}/{name}") for name in ("ego_vehicle_behind", "infrastructure"))
+    fields = ("actor_id", "category", "size", "is_infrastructure")
+    assert [[agent[field] for field in fields] for agent in agents] == [
+        [1236, "car", [4.5, 1.9, 1.5], False],
+        [None, None, None, True],
+    ]
     assert len(hand_made.table_names) == 12
 
 

@@ -13,7 +13,7 @@ import deepaccident_devkit.export
 from deepaccident_devkit.export.bulk import Format
 from deepaccident_devkit.synth import SynthConfig
 
-TOP = Path(__file__).parents[4]
+TOP = Path(__file__).parents[3]
 
 
 @pytest.fixture

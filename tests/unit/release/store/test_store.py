@@ -1,10 +1,13 @@
 """The same release in a folder, in zips and at URLs: every byte, every number and every verb."""
 
+import os
 import pickle
 import shutil
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -44,9 +47,12 @@ def test_every_sensor_file_has_the_same_bytes(opened: dict[str, DeepAccident], k
     for token in tokens:
         assert other.local_path(token).read_bytes() == folder.get_sample_data_path(token).read_bytes()
     sample = folder.sample[3]["token"]
-    assert np.array_equal(other.load_image(sample, "Camera_Back"), folder.load_image(sample, "Camera_Back"))
-    assert np.array_equal(other.load_point_cloud(sample).xyz, folder.load_point_cloud(sample).xyz)
-    assert np.array_equal(other.load_bev(sample).instance, folder.load_bev(sample).instance)
+    for read in (
+        lambda da: da.load_image(sample, "Camera_Back"),
+        lambda da: da.load_point_cloud(sample).xyz,
+        lambda da: da.load_bev(sample).instance,
+    ):
+        assert np.array_equal(read(other), read(folder))
 
 
 @pytest.mark.slow
@@ -59,15 +65,13 @@ def test_a_release_in_a_store_is_valid_and_whole(
     found, plain = (validate_release(each, deep=True, workers=1, scenarios=[one]) for each in (root, places["folder"]))
     assert [finding.code for finding in found.findings] == [finding.code for finding in plain.findings]
     counts, of_folder = (release_completeness(each, workers=1) for each in (root, places["folder"]))
-    assert counts.total == of_folder.total
-    assert counts.splits == of_folder.splits
+    assert (counts.total, counts.splits) == (of_folder.total, of_folder.splits)
 
 
 @pytest.mark.parametrize("kind", STORES)
 def test_the_truth_has_the_same_hashes(opened: dict[str, DeepAccident], kind: str) -> None:
     tokens = [record["token"] for record in opened["folder"].scenario[:2]]
-    of_folder, of_store = (scenario_hashes(opened[each], tokens, workers=1) for each in ("folder", kind))
-    assert of_folder == of_store
+    assert scenario_hashes(opened[kind], tokens, workers=1) == scenario_hashes(opened["folder"], tokens, workers=1)
 
 
 @pytest.mark.parametrize("kind", STORES)
@@ -90,8 +94,7 @@ def test_local_path_of_a_folder_is_the_file_itself(da_partial: DeepAccident, da:
         for channel in CHANNELS
         if not da_partial.get_sample_data_path(f"{record['token']}/{channel}").exists()
     )
-    with pytest.raises(MissingFileError, match="no such file"):
-        da_partial.local_path(absent)
+    assert_refused((lambda: da_partial.local_path(absent), MissingFileError, "no such file"))
 
 
 def test_a_file_that_no_archive_holds_is_missing(release_root: Path, tmp_path: Path) -> None:
@@ -122,23 +125,17 @@ def test_workers_read_what_was_pickled(opened: dict[str, DeepAccident], kind: st
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", LOCAL_STORES)
-def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "verb", ["index", "info", "validate --files", "validate", "export opencood --out {tmp_path}/opencood"]
+)
+def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path, verb: str) -> None:
     """Every verb opens a dataroot in one of three ways: by the facade, by files alone, by the index."""
-    for number, verb in enumerate(
-        (
-            ["index", "--workers", "1"],
-            ["info"],
-            ["validate", "--files", "--workers", "1"],
-            ["validate", "--workers", "1"],
-            ["export", "opencood", "--out", str(tmp_path / "opencood"), "--workers", "1"],
-        )
-    ):
-        at = 2 if verb[0] == "export" else 1
-        command = [*verb[:at], places[kind], *verb[at:]]
-        if verb[0] != "validate":
-            command += ["--index-dir", str(tmp_path / "index")]
-        result = CliRunner().invoke(deepaccident, command)
-        assert result.exit_code == 0, (number, result.output)
+    words = verb.format(tmp_path=tmp_path).split()
+    words.insert(1 + (verb[:6] == "export"), places[kind])
+    words += [] if verb == "info" else ["--workers", "1"]
+    words += [] if verb.startswith("validate") else ["--index-dir", str(tmp_path / "index")]
+    result = CliRunner().invoke(deepaccident, words)
+    assert result.exit_code == 0, result.output
 
 
 @pytest.mark.slow
@@ -162,12 +159,11 @@ def test_an_unpacked_release_counts_and_not_the_archives_beside_it(own_release: 
 
 def test_a_new_archive_is_noticed(release_root: Path, tmp_path: Path) -> None:
     agents = [path.name for path in (release_root / "type1_subtype1_accident").iterdir() if path.name != "meta"]
-    folder = tmp_path / "zips"
-    packed(release_root, folder / "one.zip", chosen=lambda path: agents[0] in path.parts or "meta" in path.parts)
-    before = len(DeepAccident(dataroot=folder, workers=1, verbose=False).sample)
-    packed(release_root, folder / "two.zip", chosen=lambda path: agents[1] in path.parts)
-    after = DeepAccident(dataroot=folder, workers=1, verbose=False)
-    assert len(after.sample) > before
+    folder, counts = tmp_path / "zips", []
+    for agent in agents[:2]:
+        packed(release_root, folder / f"{agent}.zip", chosen=lambda path, agent=agent: agent in path.parts)
+        counts.append(len(DeepAccident(dataroot=folder, workers=1, verbose=False).sample))
+    assert counts[0] < counts[1]
     assert len(list((folder / ".deepaccident").glob("files-*"))) == 1
 
 
@@ -187,13 +183,14 @@ def test_where_nothing_can_be_written_lists_are_kept_in_the_cache(
 
 
 def test_as_many_archives_are_open_as_the_system_allows(
-    opened: dict[str, DeepAccident], places: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    places: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deepaccident_devkit.release.store.sources._MOST_OPEN", 2)
-    source = LocalSource(Path(places["zips"]))
-    for path in [*sorted(Path(places["zips"]).rglob("*.zip"))] * 2:
-        assert source.read(path.relative_to(places["zips"]).as_posix(), 0, 4) == b"PK\x03\x04"
-        assert len(source._opened) <= 2
+    monkeypatch.setattr("deepaccident_devkit.release.store.sources.MOST_OPEN", 2)
+    folder = shutil.copytree(places["zips"], tmp_path / "zips")
+    source, names = LocalSource(folder), sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.zip"))
+    for name in names * 2:
+        assert source.read(name, 0, 4) == b"PK\x03\x04"
+        assert sum(folder in file.resolve().parents for file in Path("/proc/self/fd").iterdir()) <= 2
 
 
 def test_a_copy_that_another_process_removes_is_read_from_the_url(
@@ -208,14 +205,11 @@ def test_a_copy_that_another_process_removes_is_read_from_the_url(
 def test_a_url_that_fails_amid_indexing_is_told(
     places: dict[str, str], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def gone(*_: object) -> None:
-        raise RefusedFileError(5, "cannot be read (the line is dead)")
-
+    gone = Mock(side_effect=RefusedFileError(5, "cannot be read (the line is dead)"))
     monkeypatch.setattr(UrlSource, "read_all", gone)
-    with pytest.raises(
-        SomeFailedError, match=r"memory://.*: cannot be read \(the line is dead\); check the connection"
-    ):
-        DeepAccident(dataroot=places[kind], index_dir=tmp_path, workers=1, verbose=False)
+    opening = partial(DeepAccident, dataroot=places[kind], index_dir=tmp_path, workers=1, verbose=False)
+    named = ("memory://", ": cannot be read (the line is dead)", "check the connection")
+    assert_refused((opening, SomeFailedError, named))
 
 
 def test_clear_removes_the_lists_too(release_root: Path, tmp_path: Path) -> None:
@@ -225,3 +219,25 @@ def test_clear_removes_the_lists_too(release_root: Path, tmp_path: Path) -> None
     open_dataroot(archive, workers=1)
     assert clear_index(archive) == []
     assert [each for each in (tmp_path / ".deepaccident").rglob("*") if each.is_file()] == []
+
+
+def test_the_least_used_copies_go_first(tmp_path: Path) -> None:
+    cache = FileCache(tmp_path, 1000)
+    paths = [cache.path_of(f"file {number}", "a.jpg") for number in range(12)]
+    for number, path in enumerate(paths[:9]):
+        cache.put(path, bytes(100))
+        os.utime(path, ns=(number, number))
+    assert cache.found(paths[0], 100)
+    for path in paths[9:]:
+        cache.put(path, bytes(100))
+    there = [path.exists() for path in paths]
+    assert sum(path.stat().st_size for path in tmp_path.rglob("*.jpg")) <= 1000
+    assert (there[0], there[-2:], there[1:4] != [True] * 3) == (True, [True, True], True)
+
+
+def test_a_file_larger_than_the_cache_is_kept_alone(tmp_path: Path) -> None:
+    cache = FileCache(tmp_path, 100)
+    small, large = cache.path_of("small", "a"), cache.path_of("large", "a")
+    cache.put(small, bytes(50))
+    cache.put(large, bytes(500))
+    assert (large.exists(), small.exists()) == (True, False)

@@ -25,6 +25,12 @@ FORM = Questions(observers="+behind", window=WindowRules(observe=1.0, stride=0.5
 Edit = Callable[[ScenarioEditor], None]
 
 
+@pytest.fixture(scope="module")
+def before(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Asked:
+    """The questions of the release as it is."""
+    return ask(da_motion, tmp_path_factory.mktemp("before"), FORM)
+
+
 def edited(dataset: DeepAccident, root: Path, edit: Edit) -> DeepAccident:
     """A copy of a release whose accident was edited."""
     shutil.copytree(dataset.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident"))
@@ -38,7 +44,7 @@ def without_collision(editor: ScenarioEditor) -> None:
     write_meta(path, replace(read_meta(path), collision=None, planned_agents=None))
 
 
-def test_what_comes_after_the_present_changes_nothing(da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_what_comes_after_the_present_changes_nothing(da_motion: DeepAccident, before: Asked, tmp_path: Path) -> None:
     scenario, present = accident_of(da_motion), 20
 
     def shift(row: list[str]) -> None:
@@ -52,10 +58,7 @@ def test_what_comes_after_the_present_changes_nothing(da_motion: DeepAccident, t
             editor.edit_calib(agent, range(present + 1, editor.frames[-1] + 1), "ego_to_world", _moved)
         without_collision(editor)
 
-    before, after = (
-        ask(da_motion, tmp_path, FORM),
-        ask(edited(da_motion, tmp_path / "other future", edit), tmp_path, FORM),
-    )
+    after = ask(edited(da_motion, tmp_path / "other future", edit), tmp_path, FORM)
     earlier = [sample for sample in before.lines if sample.startswith(scenario) and int(sample[-3:]) <= present]
     later = [sample for sample in before.lines if sample.startswith(scenario) and int(sample[-3:]) > present]
     assert len(earlier) == len(later) == 2
@@ -101,9 +104,8 @@ def unseen_actor(dataset: DeepAccident, asked: Asked) -> int:
 
 @pytest.mark.parametrize("change", ["gone", "moved"])
 def test_an_actor_that_nobody_of_the_set_sees_changes_nothing(
-    da_motion: DeepAccident, tmp_path: Path, change: str
+    da_motion: DeepAccident, before: Asked, tmp_path: Path, change: str
 ) -> None:
-    before = ask(da_motion, tmp_path, FORM)
     actor = unseen_actor(da_motion, before)
 
     def edit(editor: ScenarioEditor) -> None:
@@ -116,8 +118,7 @@ def test_an_actor_that_nobody_of_the_set_sees_changes_nothing(
                 kept = [rows[0], *(row for row in rows[1:] if int(row[FIELD["id"]]) != actor)]
                 editor.write_rows(agent, frame, kept)
 
-    after = ask(edited(da_motion, tmp_path / change, edit), tmp_path, FORM)
-    assert after.lines == before.lines
+    assert ask(edited(da_motion, tmp_path / change, edit), tmp_path, FORM).lines == before.lines
 
 
 def _pushed(row: list[str]) -> None:
@@ -125,8 +126,7 @@ def _pushed(row: list[str]) -> None:
     row[FIELD["y"]] = str(float(row[FIELD["y"]]) * 1.1)
 
 
-def test_an_actor_that_is_seen_changes_something(da_motion: DeepAccident, tmp_path: Path) -> None:
-    before = ask(da_motion, tmp_path, FORM)
+def test_an_actor_that_is_seen_changes_something(da_motion: DeepAccident, before: Asked, tmp_path: Path) -> None:
     sample = next(sample for sample in before.truth if sample.startswith(accident_of(da_motion)))
     actor = before.truth[sample]["actors"]["a1"]
 
@@ -137,7 +137,9 @@ def test_an_actor_that_is_seen_changes_something(da_motion: DeepAccident, tmp_pa
     assert ask(edited(da_motion, tmp_path / "seen", edit), tmp_path, FORM).lines[sample] != before.lines[sample]
 
 
-def test_an_accident_and_its_twin_differ_by_what_was_seen_alone(da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_an_accident_and_its_twin_differ_by_what_was_seen_alone(
+    da_motion: DeepAccident, before: Asked, tmp_path: Path
+) -> None:
     """With the same labels the only difference is the id, by which the lines are ordered."""
     root, token = tmp_path / "twin", accident_of(da_motion)
     accident, name = token.split("/")
@@ -145,16 +147,13 @@ def test_an_accident_and_its_twin_differ_by_what_was_seen_alone(da_motion: DeepA
     (root / accident).rename(root / accident.replace("accident", "normal"))
     path = root / accident.replace("accident", "normal") / "meta" / f"{name}.txt"
     write_meta(path, replace(read_meta(path), collision=None))
-    with_accident, without = (
-        ask(da_motion, tmp_path, FORM),
-        ask(DeepAccident(dataroot=root, verbose=False, workers=1), tmp_path, FORM),
-    )
-    samples = [sample for sample in with_accident.lines if sample.startswith(token)]
+    without = ask(DeepAccident(dataroot=root, verbose=False, workers=1), tmp_path, FORM)
+    samples = [sample for sample in before.lines if sample.startswith(token)]
     assert len(samples) == len(without.lines) == 4
     for sample in samples:
         twin = sample.replace("accident", "normal")
-        assert with_accident.truth[sample]["accident"] != without.truth[twin]["accident"]
-        one, other = with_accident.question(sample), without.question(twin)
+        assert before.truth[sample]["accident"] != without.truth[twin]["accident"]
+        one, other = before.question(sample), without.question(twin)
         assert one.pop("id") != other.pop("id")
         assert json.dumps(one) == json.dumps(other)
 
@@ -177,16 +176,11 @@ def test_no_word_of_the_release_or_of_the_ending_is_in_a_question(
     assert keys == {"id", "seconds", "moments", "conditions", "observers", "actors"}
 
 
-def test_ids_and_order_are_drawn_by_the_seed(da_motion: DeepAccident, tmp_path: Path) -> None:
-    one, again, other = (
-        ask(da_motion, tmp_path, FORM),
-        ask(da_motion, tmp_path, FORM),
-        ask(da_motion, tmp_path, replace(FORM, seed="a secret")),
-    )
-    assert list(one.lines.items()) == list(again.lines.items())
-    assert not {each["id"] for each in one.truth.values()} & {each["id"] for each in other.truth.values()}
-    assert list(one.lines) != list(other.lines)
-    assert list(one.lines) != sorted(one.lines)
+def test_ids_and_order_are_drawn_by_the_seed(da_motion: DeepAccident, before: Asked, tmp_path: Path) -> None:
+    again, other = (ask(da_motion, tmp_path, form) for form in (FORM, replace(FORM, seed="a secret")))
+    assert list(before.lines.items()) == list(again.lines.items())
+    assert not {each["id"] for each in before.truth.values()} & {each["id"] for each in other.truth.values()}
+    assert list(before.lines) not in (list(other.lines), sorted(before.lines))
 
 
 @pytest.mark.parametrize("way", ["hard", "copy"])

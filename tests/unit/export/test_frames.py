@@ -1,0 +1,18 @@
+"""The moments that formats annotate."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepaccident_devkit.export.frames import KEY_STEP, keyframe_after, keyframes
+
+
+@given(last=st.integers(1, 400), number=st.integers(1, 400))
+def test_keyframes_lead_to_the_last_frame(last: int, number: int) -> None:
+    keys = keyframes(last)
+    assert keys[-1] == last
+    assert 1 <= keys[0] <= KEY_STEP
+    assert set(np.diff(keys)) <= {KEY_STEP}
+    if number <= last:
+        after = keyframe_after(number, last)
+        assert after == min(key for key in keys if key >= number)

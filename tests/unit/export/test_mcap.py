@@ -1,0 +1,517 @@
+"""Files of MCAP, read back by the format's own library: what is in them, what goes in, and what errors say."""
+
+import logging
+import re
+import shutil
+import sys
+from datetime import datetime, timezone
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from mcap_reading import McapFile, cloud_of, matrix_of, read_mcap, xyz_of
+from PIL import Image
+from refusals import assert_refused
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.cli.export import export
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    MissingExtraError,
+    NotAvailableError,
+    SensorFileError,
+    TokenError,
+)
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
+from deepaccident_devkit.export.mcap import EPOCH, McapConfig, export_mcap
+from deepaccident_devkit.motion import MotionHeads, motion_labels
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR
+from deepaccident_devkit.v2x import cooperative_boxes, visible_instances
+
+FRAMES = 6
+RED = tuple(bytes.fromhex(COLLIDER_COLOR[1:]))
+
+
+@pytest.fixture(scope="module")
+def scenario(da: DeepAccident) -> str:
+    return next(record["token"] for record in da.scenario if record["collision"] is not None)
+
+
+@pytest.fixture(scope="module")
+def path(da: DeepAccident, scenario: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    wanted = tmp_path_factory.mktemp("mcap") / "new folder" / "accident.mcap"
+    made = export_mcap(da, scenario, wanted, motion_labels="deepaccident")
+    assert made == wanted
+    return made
+
+
+@pytest.fixture(scope="module")
+def file(path: Path) -> McapFile:
+    return read_mcap(path)
+
+
+def sample(scenario: str, agent: str, index: int) -> str:
+    return f"{scenario}/{agent}/{index:03d}"
+
+
+def test_every_topic_has_a_message_a_frame_and_the_schema_of_its_kind(file: McapFile) -> None:
+    cloud, update = "PointCloud", "SceneUpdate"
+    of_agent = {"pose": "PoseInFrame", f"{LIDAR}/points": cloud, "annotations": update, "annotations/points": cloud}
+    of_agent |= {"motion_labels/points": cloud, **{f"{camera}/image": "CompressedImage" for camera in CAMERAS}}
+    of_agent |= {f"{camera}/calibration": "CameraCalibration" for camera in CAMERAS}
+    expected = {"/log": "Log", "/tf": "FrameTransforms", "/actors": update, "/actors/points": cloud}
+    expected |= {f"/{agent}/{name}": kind for agent in AGENTS for name, kind in of_agent.items()}
+    wanted = {topic: f"foxglove.{name}" for topic, name in expected.items()}
+    assert file.schemas == {**wanted, "/time_to_impact": "google.protobuf.DoubleValue"}
+    assert {len(messages) for topic, messages in file.messages.items() if topic != "/log"} == {FRAMES}
+
+
+def test_the_file_is_compressed_and_indexed_for_seeking(file: McapFile) -> None:
+    summary = file.summary
+    assert summary.statistics.message_count == len(file.log_times) == sum(map(len, file.messages.values()))
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+    assert all(chunk.message_index_length > 0 for chunk in summary.chunk_indexes)
+    assert [index.name for index in summary.metadata_indexes] == ["deepaccident_devkit"]
+
+
+def test_there_is_one_timeline_of_ten_frames_a_second(file: McapFile) -> None:
+    assert file.log_times == sorted(file.log_times)
+    frames = [EPOCH * 10**9 + number * 10**8 for number in range(FRAMES)]
+    for topic, messages in file.messages.items():
+        records = [record for record, _ in messages]
+        assert {record.publish_time - record.log_time for record in records} == {0}
+        if topic != "/log":
+            assert [record.log_time for record in records] == frames
+            assert [record.sequence for record in records] == list(range(FRAMES))
+    stamps = [image.timestamp.ToNanoseconds() for image in file.only("/ego_vehicle/Camera_Front/image")]
+    assert stamps == frames
+    assert datetime.fromtimestamp(EPOCH, tz=timezone.utc) == datetime(2024, 1, 1, tzinfo=timezone.utc)
+
+
+def test_transforms_are_those_of_the_dataset(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    for index, message in enumerate(file.only("/tf"), start=1):
+        parent_from = {
+            each.child_frame_id: (each.parent_frame_id, matrix_of(each.translation, each.rotation))
+            for each in message.transforms
+        }
+        assert len(parent_from) == len(AGENTS) * (1 + len(CAMERAS) + 1)
+        for agent in AGENTS:
+            parent, world_from_ego = parent_from[agent]
+            assert parent == "world"
+            expected = da.world_from(sample(scenario, agent, index), "ego").matrix
+            np.testing.assert_allclose(world_from_ego, expected, atol=1e-5)
+            for channel in (*CAMERAS, LIDAR):
+                parent, ego_from_sensor = parent_from[f"{agent}/{channel}"]
+                assert parent == agent
+                expected = da.world_from(sample(scenario, agent, index), channel).matrix
+                np.testing.assert_allclose(world_from_ego @ ego_from_sensor, expected, atol=1e-4)
+
+
+def test_poses_are_those_of_the_agents(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    for agent in AGENTS:
+        for index, message in enumerate(file.only(f"/{agent}/pose"), start=1):
+            assert message.frame_id == "world"
+            pose = matrix_of(message.pose.position, message.pose.orientation)
+            expected = da.world_from(sample(scenario, agent, index), "ego").matrix
+            np.testing.assert_allclose(pose, expected, atol=1e-5)
+
+
+def test_images_are_the_files_bytes(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    for agent in AGENTS:
+        for camera in CAMERAS:
+            for index, image in enumerate(file.only(f"/{agent}/{camera}/image"), start=1):
+                stored = da.get_sample_data_path(f"{sample(scenario, agent, index)}/{camera}")
+                assert image.data == stored.read_bytes()
+                assert (image.format, image.frame_id) == ("jpeg", f"{agent}/{camera}")
+
+
+def test_calibrations_project_into_the_images(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    image, message = (file.only(f"/infrastructure/Camera_Back/{kind}")[2] for kind in ("image", "calibration"))
+    assert (message.width, message.height) == Image.open(BytesIO(image.data)).size
+    assert message.frame_id == image.frame_id
+    camera = da.camera(sample(scenario, "infrastructure", 3), "Camera_Back")
+    scale = message.width / camera.width
+    expected = np.diag([scale, scale, 1.0]) @ camera.intrinsic
+    np.testing.assert_allclose(np.reshape(message.K, (3, 3)), expected, atol=1e-9)
+    np.testing.assert_allclose(np.reshape(message.P, (3, 4))[:, :3], expected, atol=1e-9)
+    np.testing.assert_array_equal(np.reshape(message.R, (3, 3)), np.eye(3))
+
+
+def test_an_image_that_was_stored_smaller_has_a_calibration_of_its_size(
+    da: DeepAccident, scenario: str, file: McapFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = tmp_path / "small.jpg"
+    Image.new("RGB", (32, 18)).save(small)
+    monkeypatch.setattr(type(da), "sensor_path", lambda *_: small)
+    made = read_mcap(
+        export_mcap(da, scenario, tmp_path / "a.mcap", agents=["ego_vehicle"], channels=["Camera_Front"], frames=[1])
+    )
+    half, whole = (each.only("/ego_vehicle/Camera_Front/calibration")[0] for each in (made, file))
+    assert (half.width, half.height, whole.width, whole.height) == (32, 18, 64, 36)
+    np.testing.assert_allclose(np.array(half.K)[:6], np.array(whole.K)[:6] / 2)
+
+
+def test_clouds_have_all_points(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    for agent in AGENTS:
+        for index, message in enumerate(file.only(f"/{agent}/{LIDAR}/points"), start=1):
+            stored, cloud = da.load_point_cloud(sample(scenario, agent, index), "lidar"), cloud_of(message)
+            assert message.frame_id == f"{agent}/{LIDAR}"
+            assert len(cloud) == len(stored) > 0
+            np.testing.assert_allclose(xyz_of(cloud), stored.xyz, atol=1e-4)
+            np.testing.assert_array_equal(cloud["intensity"], stored.intensity)
+
+
+def test_actors_are_the_union_of_all_annotations(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    for index, message in enumerate(file.only("/actors"), start=1):
+        boxes = cooperative_boxes(da, sample(scenario, "ego_vehicle", index))
+        assert len(message.entities) == len({entity.id for entity in message.entities}) == len(boxes) > 0
+        for row, entity in enumerate(message.entities):
+            (cube,) = entity.cubes
+            pose, size = matrix_of(cube.pose.position, cube.pose.orientation), cube.size
+            np.testing.assert_allclose(pose[:3, 3], boxes.center[row], atol=1e-9)
+            np.testing.assert_allclose(np.arctan2(pose[1, 0], pose[0, 0]), boxes.yaw[row], atol=1e-6)
+            np.testing.assert_allclose([size.x, size.y, size.z], boxes.size[row])
+            facts = {pair.key: pair.value for pair in entity.metadata}
+            told = (entity.frame_id, facts["category"], facts["num_lidar_pts"])
+            assert told == ("world", boxes.category_names[row], str(boxes.num_lidar_pts[row]))
+            assert boxes.actor_id[row] == -1 or entity.id == facts["actor_id"] == str(boxes.actor_id[row])
+        assert [deletion.type for deletion in message.deletions] == [1]  # whoever has gone is not drawn any more
+
+
+def test_actors_say_who_sees_them(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    seen_by = {agent: set() for agent in AGENTS}
+    for entity in file.only("/actors")[1].entities:
+        facts = {pair.key: pair.value for pair in entity.metadata}
+        for agent in filter(None, facts["seen_by"].split(", ")):
+            seen_by[agent].add(int(entity.id))
+    for agent in AGENTS:
+        tokens = visible_instances(da, sample(scenario, agent, 2), agents=[agent])
+        assert seen_by[agent] == {int(token.rsplit("/", 1)[1]) for token in tokens}
+    assert any(seen_by.values())
+
+
+def test_the_colliding_pair_is_red_and_other_recorders_have_their_hues(
+    da: DeepAccident, scenario: str, file: McapFile
+) -> None:
+    pair = da.get("scenario", scenario)["collision"]["ids"]
+    agents = {each["actor_id"]: each["name"] for each in da.agent if each["scenario_token"] == scenario}
+    colors, words = {}, {}
+    for entity in file.only("/actors")[-1].entities:
+        color = entity.cubes[0].color
+        colors[entity.id] = "#" + bytes(round(255 * each) for each in (color.r, color.g, color.b)).hex()
+        words[entity.id] = entity.texts[0].text
+    assert [name for name, color in colors.items() if color == COLLIDER_COLOR] == sorted(map(str, pair), key=int)
+    behind = {str(actor): AGENT_COLORS[agents[actor]] for actor in agents.keys() - {None, *pair}}
+    assert {name: color for name, color in colors.items() if color in AGENT_COLORS.values()} == behind
+    assert len(behind) == 2
+    assert all("collides" in words[str(actor)] for actor in pair)
+    cloud = cloud_of(file.only("/actors/points")[-1])
+    red = (cloud["red"] == RED[0]) & (cloud["green"] == RED[1]) & (cloud["blue"] == RED[2]) & (cloud["alpha"] == 255)
+    boxes = cooperative_boxes(da, sample(scenario, "ego_vehicle", FRAMES))
+    two = boxes.select(np.isin(boxes.actor_id, pair))
+    corners = two.corners().reshape(-1, 3)
+    nearest = np.linalg.norm(xyz_of(cloud[red])[None] - corners[:, None], axis=-1).min(axis=1)
+    assert (nearest < 1e-3).all()  # lines end at the corners
+
+
+def test_annotations_are_each_agents_own(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    for agent in AGENTS:
+        boxes = da.boxes(sample(scenario, agent, 4), "lidar")
+        message = file.only(f"/{agent}/annotations")[3]
+        assert len(message.entities) == len(boxes)
+        for row, entity in enumerate(message.entities):
+            facts = {pair.key: pair.value for pair in entity.metadata}
+            told = (entity.frame_id, facts["label_id"], facts["camera_visible"])
+            visible = str(bool(boxes.camera_visible[row])).lower()
+            assert told == (f"{agent}/{LIDAR}", str(boxes.actor_id[row]), visible)
+            points = np.array([[point.x, point.y, point.z] for point in entity.lines[0].points])
+            np.testing.assert_allclose(points[:24].mean(axis=0), boxes.center[row], atol=1e-9)
+
+
+def test_trails_lead_through_the_actors_centres(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    actor = da.get("scenario", scenario)["collision"]["ids"][0]
+    centers = da.trajectory(f"{scenario}/actor/{actor}").center
+    entity = next(entity for entity in file.only("/actors")[2].entities if entity.id == str(actor))
+    _, trail, path = entity.lines
+    assert (len(trail.points), len(path.points)) == (3, FRAMES - 2)
+    places = [[point.x, point.y, point.z] for point in (*trail.points, *path.points[1:])]
+    np.testing.assert_allclose(places, centers, atol=1e-9)
+
+
+def test_motion_labels_are_points_on_their_cells(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    labels = motion_labels(da, sample(scenario, "ego_vehicle", 1), "deepaccident").to_present()
+    message = file.only("/ego_vehicle/motion_labels/points")[0]
+    cloud, grid = cloud_of(message), labels.config.grid
+    assert message.frame_id == "ego_vehicle"
+    index, inside = grid.index_of(xyz_of(cloud))
+    assert inside.all()
+    drawn = np.zeros_like(labels.instance)
+    drawn[cloud["frame"], index[:, 0], index[:, 1]] = cloud["instance"]
+    expected = np.where(labels.label_valid[:, None, None], labels.instance, 0)
+    np.testing.assert_array_equal(drawn, expected)
+    assert (expected[0] > 0).any()
+    assert len(cloud) == np.count_nonzero(expected)
+
+
+def test_the_countdown_ends_at_the_impact(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    assert [message.value for message in file.only("/time_to_impact")] == pytest.approx([0.5, 0.4, 0.3, 0.2, 0.1, 0.0])
+    facts, first, *_, last = [message.message for message in file.only("/log")]
+    assert (facts.startswith(f"{scenario}: town "), first) == (True, "0.5 s to the impact")
+    one, other = da.get("scenario", scenario)["collision"]["ids"]
+    assert re.fullmatch(rf"impact: .*\b({one}\b.*\b{other}|{other}\b.*\b{one})\b.*", last)
+
+
+def test_the_metadata_tell_where_the_file_is_from(scenario: str, file: McapFile) -> None:
+    told = file.metadata["deepaccident_devkit"]
+    assert (told["devkit_version"], told["scenario"], told["release_version"]) == (__version__, scenario, "v1")
+    assert len(bytes.fromhex(told["fingerprint"])) == 16
+
+
+def test_the_same_choices_give_the_same_bytes(da: DeepAccident, scenario: str, path: Path, tmp_path: Path) -> None:
+    again = export_mcap(da, da.get("scenario", scenario), tmp_path / "again.mcap", motion_labels="deepaccident")
+    assert again.read_bytes() == path.read_bytes()
+
+
+DOCS = Path(__file__).parents[3] / "docs"
+
+
+def exported(da: DeepAccident, scenario: str, folder: Path, **choices: Any) -> Any:
+    """A small file: one agent, one frame, no sensors unless asked for."""
+    small = {"agents": ["ego_vehicle"], "channels": [], "frames": [2], **choices}
+    return read_mcap(export_mcap(da, scenario, folder / "small.mcap", **small))
+
+
+def test_agents_channels_and_frames_can_be_chosen(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    chosen = {"agents": "+infrastructure", "channels": [LIDAR, "Camera_Back"], "frames": range(2, 6, 2)}
+    file = exported(da, scenario, tmp_path, **chosen)
+    images = {topic for topic in file.messages if topic.endswith("/image")}
+    clouds = {topic for topic in file.messages if topic.endswith(f"{LIDAR}/points")}
+    assert images == {"/ego_vehicle/Camera_Back/image", "/infrastructure/Camera_Back/image"}
+    assert clouds == {f"/ego_vehicle/{LIDAR}/points", f"/infrastructure/{LIDAR}/points"}
+    steps = [record.log_time for record, _ in file.messages["/tf"]]
+    assert np.diff(steps).tolist() == [2 * 10**8]
+    assert len({transform.child_frame_id for transform in file.only("/tf")[0].transforms}) == 2 * 8
+
+
+def test_actors_are_those_that_the_chosen_agents_annotated(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    (message,) = exported(da, scenario, tmp_path, agents=["infrastructure"]).only("/actors")
+    assert len(message.entities) == len(da.boxes(f"{scenario}/infrastructure/002"))
+
+
+@pytest.mark.slow
+def test_scenarios_without_labels_have_poses_and_no_boxes(own_release: Path, tmp_path: Path) -> None:
+    for folder in list(own_release.glob("*/*/*/label")):
+        shutil.rmtree(folder)
+    unlabelled = DeepAccident("v1", own_release, verbose=False)
+    token = unlabelled.scenario[0]["token"]
+    file = exported(unlabelled, token, tmp_path, motion_labels="deepaccident", frames=[1, 2])
+    assert len(file.only("/tf")) == 2
+    assert [len(message.entities) for message in file.only("/actors")] == [0, 0]
+    assert [len(message.data) for message in file.only("/actors/points")] == [0, 0]
+    assert not [topic for topic in file.messages if "annotations" in topic or "motion" in topic]
+
+
+def test_a_normal_scenario_has_no_countdown(da: DeepAccident, tmp_path: Path) -> None:
+    token = next(record["token"] for record in da.scenario if record["collision"] is None)
+    file = exported(da, token, tmp_path)
+    assert "/time_to_impact" not in file.messages
+    (facts,) = (message.message for message in file.only("/log"))
+    assert facts.startswith(f"{token}: ")
+    assert facts.endswith("no collision is known")
+
+
+def test_the_code_on_the_page_runs(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (DOCS / "pictures.md").read_text(encoding="utf-8")
+    code = "\n".join(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE))
+    assert "deepaccident_demo/release" in code
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code.replace("deepaccident_demo/release", str(da.dataroot)), "pictures.md", "exec"), {})  # noqa: S102
+    assert len(read_mcap(tmp_path / "accident.mcap").only("/actors")) == 6
+
+
+def test_the_page_lists_every_topic(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    page = (DOCS / "pictures.md").read_text(encoding="utf-8")
+    file = exported(da, scenario, tmp_path, channels=None, motion_labels="deepaccident")
+    for topic in file.messages:
+        general = re.sub("Camera_[A-Za-z]+", "<camera>", topic.replace("ego_vehicle", "<agent>"))
+        assert f"| `{general}` |" in page
+
+
+def test_every_nth_point(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    file = exported(da, scenario, tmp_path, channels=[LIDAR], points=7)
+    (message,) = file.only(f"/ego_vehicle/{LIDAR}/points")
+    stored = da.load_point_cloud(f"{scenario}/ego_vehicle/002", "lidar").xyz
+    np.testing.assert_allclose(xyz_of(cloud_of(message)), stored[::7], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("choices", "sentence"),
+    [
+        ({"agent": "ego_vehicle"}, "export_mcap has no 'agent'; there are agents, "),
+        ({"channels": "lidar01"}, "channels: expected names of channels, found 'lidar01'"),
+        ({"channels": ["BEV_instance_camera"]}, "channels: expected one of Camera_Front, .*found 'BEV_instance_"),
+        ({"frames": 3}, r"frames: expected frame numbers from 1, such as range\(1, 11\), found 3"),
+        ({"frames": [1.5]}, "frames: expected whole numbers from 1, found 1.5"),
+        ({"frames": []}, "frames: expected at least one frame number"),
+        ({"frames": [6, 7]}, "frames: expected numbers from 1 to 6, found 7"),
+        ({"frames": [0]}, "frames: expected numbers from 1 to 6, found 0"),
+        ({"points": 0}, "points: expected a number from 1, for every n-th point, found 0"),
+        ({"points": "some"}, "points: expected n for every n-th point, found 'some'"),
+        ({"agents": ["ego"]}, "agent: expected one of ego_vehicle, .*found 'ego'"),
+        ({"motion_labels": "mine"}, "expected one of .*found 'mine'"),
+    ],
+)
+def test_choices_that_cannot_be_are_refused(
+    da: DeepAccident, scenario: str, tmp_path: Path, choices: dict[str, Any], sentence: str
+) -> None:
+    assert_refused((lambda: export_mcap(da, scenario, tmp_path / "a.mcap", **choices), ChoiceError, sentence))
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_files_are_left_out_and_told(
+    da_b: DeepAccident, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    token = da_b.scenario[0]["token"]
+    with caplog.at_level(logging.WARNING):
+        file = read_mcap(export_mcap(da_b, token, tmp_path / "a.mcap", channels=["Camera_Front", LIDAR], frames=[1, 2]))
+    assert not [topic for topic in file.messages if "Camera" in topic or LIDAR in topic]
+    assert len(file.only("/actors")) == 2
+    (record,) = caplog.records
+    assert "10 of 10 of Camera_Front, 10 of 10 of lidar01" in record.getMessage()
+
+
+def test_a_damaged_image_or_a_folder_in_its_place_is_an_error_and_the_old_file_stays(
+    da: DeepAccident, scenario: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged, old = tmp_path / "damaged.jpg", tmp_path / "a.mcap"
+    damaged.write_bytes(b"\xff\xd8no picture")
+    old.write_bytes(b"before")
+    for path, said in ((damaged, "damaged.jpg: not a readable image"), (tmp_path, "not a regular file (a folder)")):
+        monkeypatch.setattr(type(da), "sensor_path", lambda *_, path=path: path)
+        export = partial(export_mcap, da, scenario, old, channels=["Camera_Front"])
+        assert_refused((export, SensorFileError, (said, "restore the file")))
+    assert old.read_bytes() == b"before"
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.mcap", "damaged.jpg"]
+
+
+def test_a_predicted_motion_is_drawn_on_its_cells(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    sample = f"{scenario}/ego_vehicle/002"
+    labels = motion_labels(da, sample).to_present()
+    instances = MotionOutput(grid=labels.config.grid, instances=labels.instance[None])
+    heads = MotionOutput(grid=labels.config.grid, heads=(MotionHeads.from_labels(labels),))
+    drawn = []
+    for prediction in (instances, heads):
+        (message,) = exported(da, scenario, tmp_path, prediction={sample: prediction}).only(
+            "/ego_vehicle/prediction/motion/points"
+        )
+        assert message.frame_id == "ego_vehicle"
+        drawn.append(cloud_of(message))
+    for cloud in drawn:
+        index, _ = labels.config.grid.index_of(xyz_of(cloud[cloud["frame"] == 0]))
+        present = np.zeros(labels.instance[0].shape, dtype=bool)
+        present[tuple(index.T)] = True
+        np.testing.assert_array_equal(present, labels.instance[0] > 0)
+
+
+def test_predicted_accidents_stand_where_they_are_foreseen(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    foreseen = Accident(positions=np.array([[10.0, 2.0], [13.0, -1.0]]), time=1.5, score=0.75, ids=(3, 9))
+    with ResultsWriter(tmp_path / "results.json", "accident") as writer:
+        writer.add(f"{scenario}/ego_vehicle/002", [foreseen])
+    file = exported(da, scenario, tmp_path, prediction=read_results(tmp_path / "results.json"), frames=[1, 2])
+    ((record, message),) = file.messages["/ego_vehicle/prediction/accidents"]
+    (entity,) = message.entities
+    assert (record.log_time, entity.frame_id) == (file.messages["/tf"][1][0].log_time, "ego_vehicle")
+    places = [[sphere.pose.position.x, sphere.pose.position.y] for sphere in entity.spheres]
+    np.testing.assert_allclose(places, foreseen.positions)
+    assert entity.texts[0].text == "accident in 1.5 s (score 0.75)"
+    assert ("actor_ids", "3, 9") in [(pair.key, pair.value) for pair in entity.metadata]
+
+
+def test_detected_boxes_are_drawn_in_their_own_frame(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    boxes = DetectedBoxes.from_arrays([[5, 1, 0]], [[4, 2, 1.5]], [0.5], [0.9], category=["van"], frame="lidar")
+    file = exported(da, scenario, tmp_path, prediction={f"{scenario}/ego_vehicle/002": boxes})
+    ((entity,),) = (message.entities for message in file.only("/ego_vehicle/prediction/boxes"))
+    assert entity.frame_id == f"ego_vehicle/{LIDAR}"
+    assert (entity.cubes[0].pose.position.x, entity.cubes[0].size.y) == (5, 2)
+    cloud = xyz_of(cloud_of(file.only("/ego_vehicle/prediction/boxes/points")[0]))
+    nearest = np.linalg.norm(cloud[None] - boxes.boxes.corners()[0][:, None], axis=-1).min(axis=1)
+    assert (nearest < 1e-4).all()
+
+
+def test_unknown_scenarios_and_predictions_that_are_none_are_refused(
+    da: DeepAccident, scenario: str, tmp_path: Path
+) -> None:
+    sample = f"{scenario}/ego_vehicle/002"
+
+    def predicted(prediction: Any, **choices: Any) -> Any:
+        return exported(da, scenario, tmp_path, prediction=prediction, **choices)
+
+    assert_refused(
+        (lambda: export_mcap(da, "nowhere/nothing", tmp_path / "a.mcap"), TokenError, "no token 'nowhere/nothing'"),
+        (lambda: predicted([sample]), ConfigError, ("prediction", "expected Results, or a mapping", "found list")),
+        (lambda: predicted({sample: "an accident"}), ConfigError, ("Accident or DetectedBoxes", "found str")),
+        (lambda: predicted({sample: []}, frames=[3]), NotAvailableError, ("prediction", scenario, "agents and frames")),
+    )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("package", ["mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google.protobuf"])
+def test_without_the_extra_the_error_names_it(
+    da: DeepAccident, scenario: str, tmp_path: Path, package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in list(sys.modules):
+        if name.startswith(("deepaccident_devkit.export.mcap.", f"{package}.")) and not name.endswith(".config"):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    assert_refused(
+        (lambda: export_mcap(da, scenario, tmp_path / "a.mcap"), MissingExtraError, ("pip install '.[mcap]'",))
+    )
+
+
+def test_the_configuration_is_in_order_and_of_all_agents() -> None:
+    config = McapConfig(channels=[LIDAR, "Camera_Back", LIDAR], frames=[3, 1, 3])
+    assert (config.channels, config.frames, config.frame_numbers(3)) == (("Camera_Back", LIDAR), (1, 3), (1, 3))
+    assert McapConfig().frame_numbers(2) == (1, 2)
+
+
+def test_the_verb_writes_the_first_accident(da: DeepAccident, tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    arguments = ["mcap", da.dataroot, "--out", out, "--frame-range", "2..3", "--channels", "lidar01", "--points", "10"]
+    done = CliRunner().invoke(export, [str(each) for each in (*arguments, "--agents", "ego_vehicle,infrastructure")])
+    assert done.exit_code == 0, done.output
+    first = next(record["token"] for record in da.scenario if record["collision"] is not None)
+    assert f"{out}: {first}, " in done.output
+    file = read_mcap(out)
+    assert len(file.only("/tf")) == 2
+    assert {topic for topic in file.messages if LIDAR in topic} == {
+        f"/{agent}/{LIDAR}/points" for agent in ("ego_vehicle", AGENTS[-1])
+    }
+
+
+def test_the_verb_takes_a_scenario_and_predictions(da: DeepAccident, tmp_path: Path) -> None:
+    token, out = da.scenario[1]["token"], tmp_path / "a.mcap"
+    with ResultsWriter(tmp_path / "results.json", "accident") as writer:
+        writer.add(f"{token}/ego_vehicle/002", [])
+    arguments = [da.dataroot, token, "--out", out, "--frame-range", 2, "--results", tmp_path / "results.json"]
+    done = CliRunner().invoke(export, ["mcap", *map(str, arguments), "--channels", "Camera_Front"])
+    assert done.exit_code == 0, done.output
+    file = read_mcap(out)
+    assert file.metadata["deepaccident_devkit"]["scenario"] == token
+    assert len(file.only("/ego_vehicle/prediction/accidents")) == 1
+
+
+def test_the_verb_refuses_what_it_cannot_read(tmp_path: Path) -> None:
+    words = ["mcap", str(tmp_path), "--out", "a.mcap"]
+    done = CliRunner().invoke(export, [*words, "--frame-range", "4..2"])
+    assert (done.exit_code, "expected frame numbers such as 20..40, found '4..2'" in done.output) == (2, True)
+    unknown = partial(export.main, [*words, "--agents", "nobody"], standalone_mode=False)
+    assert_refused((unknown, ChoiceError, ("--agents", "nobody")))
