@@ -100,9 +100,7 @@ def test_points_are_a_scan_of_32_channels(scenarios):
     cloud = read_lidar(scenarios[0].channel_path("infrastructure", "lidar01", 1))
     reach = np.linalg.norm(cloud.xyz, axis=1)
     elevation = np.rad2deg(np.arcsin(cloud.xyz[:, 2] / reach))
-    assert reach.max() <= 70.3
-    assert 25_000 < len(cloud) <= 32 * 1400
-    assert len(np.unique(elevation.round(3))) <= 32
-    assert elevation.min() == pytest.approx(-30, abs=1e-3)
+    assert (reach.max() <= 70.3, 25_000 < len(cloud) <= 32 * 1400) == (True, True)
+    assert (len(np.unique(elevation.round(3))) <= 32, elevation.min()) == (True, pytest.approx(-30, abs=1e-3))
     assert 0 <= cloud.intensity.min() < cloud.intensity.max() <= 1
     assert cloud.intensity.std() > 0.05

@@ -18,8 +18,7 @@ def test_turns_are_driven_along_the_path_to_its_end(turning):
     for row, user in enumerate(users):
         along, left = user.path.project(run.poses[:, row, :2])
         assert along[-1] > user.route.exit_s
-        assert np.abs(left).max() < 0.85
-        assert abs(left[-1]) < 0.1
+        assert (np.abs(left).max() < 0.85, abs(left[-1]) < 0.1) == (True, True)
 
 
 def test_the_wheels_are_turned_no_farther_nor_faster_than_they_can_be(turning):
