@@ -4,7 +4,6 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from tiny import NAME, TYPE, write_tiny_release
-from verbs import called, ran
+from verbs import called, commands, ran
 
 from deepaccident_devkit import DeepAccident, __version__
 from deepaccident_devkit.cli import deepaccident, verbs
@@ -55,15 +54,6 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
     assert ("left out as broken:" in skipped.stdout, "WARNING: left out" in skipped.stderr) == (True, True)
 
 
-def commands(group: click.Group, *words: str) -> Iterator[tuple[str, ...]]:
-    """The words of all commands below a group, and of the group itself."""
-    yield words
-    for name in group.list_commands(click.Context(group)):
-        command = group.get_command(click.Context(group), name)
-        assert command is not None
-        yield from commands(command, *words, name) if isinstance(command, click.Group) else [(*words, name)]
-
-
 OF_FILES = ("--version", "--workers", "--scheduler")
 NOT_OF_ALL = {"validate": OF_FILES, "train": (), "explore": (), "results": ()}
 """Verb on a release → the options of a release that it has; those that are left out run in one process, say."""
@@ -71,7 +61,7 @@ NOT_OF_ALL = {"validate": OF_FILES, "train": (), "explore": (), "results": ()}
 
 @pytest.mark.slow
 def test_all_verbs_have_one_grammar_and_a_help_that_says_everything() -> None:
-    for words in commands(deepaccident):
+    for words, _ in commands(deepaccident):
         text = called(*words, "--help").output
         options, _, advanced = text.partition("\nAdvanced:\n")
         assert not re.search(r"^  (-\w, )?--[\w-]+( [A-Z]+)?$(?!\n {4})", text, re.MULTILINE), (
@@ -82,7 +72,7 @@ def test_all_verbs_have_one_grammar_and_a_help_that_says_everything() -> None:
         if " DATAROOT" in text.splitlines()[0]:
             for name in NOT_OF_ALL.get(words[-1], (*OF_FILES, "--index-dir", "--on-error")):
                 assert f"  {name} " in (options if name in OF_FILES[:2] else advanced), words
-    assert len({words[0] for words in commands(deepaccident) if words}) == 16
+    assert len({words[0] for words, _ in commands(deepaccident) if words}) == 16
 
 
 def test_versions_for_a_report() -> None:

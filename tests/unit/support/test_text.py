@@ -1,13 +1,14 @@
 """Words that the devkit knows are taken in any case of letters; of another word, the error says which was meant."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import click
 import numpy as np
 import pytest
 from refusals import assert_refused
+from verbs import commands
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
@@ -98,18 +99,9 @@ def test_what_is_told_of_a_split_is_its_name() -> None:
     assert [SampleSelection(split=each).split for each in ("VAL_mini", "Mine.txt")] == ["val_mini", "Mine.txt"]
 
 
-def verbs(group: click.Group, context: click.Context) -> Iterator[click.Command]:
-    for name in group.list_commands(context):
-        verb = group.get_command(context, name)
-        assert verb is not None
-        yield verb
-        if isinstance(verb, click.Group):
-            yield from verbs(verb, context)
-
-
 def test_every_option_with_words_takes_them_in_any_case() -> None:
     context = click.Context(deepaccident)
-    options = [(verb, option) for verb in verbs(deepaccident, context) for option in verb.params]
+    options = [(verb, option) for _, verb in commands(deepaccident) for option in verb.params]
     of_words = [(verb, option) for verb, option in options if isinstance(option.type, click.Choice)]
     assert len(of_words) > 40
     for verb, option in of_words:

@@ -174,18 +174,16 @@ def test_findings_of_what_is_no_scenario(da: DeepAccident, scenario) -> None:
 
 def test_every_faulty_file_is_named(tmp_path: Path) -> None:
     root = tiny.write_tiny_release(tmp_path)
-    for frame in (1, 3):
-        (root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_{frame:03d}.txt").write_text("")
-    (root / tiny.TYPE / "other_vehicle" / "calib" / tiny.NAME / f"{tiny.NAME}_002.pkl").write_bytes(b"")
-    (root / tiny.TYPE / "meta" / f"{tiny.NAME}.txt").write_text("x\n")
-    report = validate_release(root)
-    named = sorted((finding.code, Path(finding.where.split(":")[0]).name) for finding in report.findings)
-    assert named == [
-        ("calib-unreadable", f"{tiny.NAME}_002.pkl"),
-        ("label-unreadable", f"{tiny.NAME}_001.txt"),
-        ("label-unreadable", f"{tiny.NAME}_003.txt"),
-        ("meta-unreadable", f"{tiny.NAME}.txt"),
-    ]
+    names = {
+        f"other_vehicle/calib/{tiny.NAME}/{tiny.NAME}_002.pkl": "calib-unreadable",
+        f"ego_vehicle/label/{tiny.NAME}/{tiny.NAME}_001.txt": "label-unreadable",
+        f"ego_vehicle/label/{tiny.NAME}/{tiny.NAME}_003.txt": "label-unreadable",
+        f"meta/{tiny.NAME}.txt": "meta-unreadable",
+    }
+    for name in names:
+        (root / tiny.TYPE / name).write_text("x\n" if "meta" in name else "")
+    found = {finding.where.split(":")[0]: finding.code for finding in validate_release(root).findings}
+    assert found == {str(root / tiny.TYPE / name): code for name, code in names.items()}
 
 
 def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
