@@ -127,5 +127,10 @@ def test_a_word_that_is_like_none_has_no_suggestion(wrong: Any) -> None:
 def test_files_of_a_release_are_read_exactly(da: DeepAccident) -> None:
     """What stands in a file, or names one, has one spelling."""
     assert da.get("sample", da.sample[0]["token"]) == da.sample[0]
-    with pytest.raises(TokenError, match=r"the scenario's agents are .*; did you mean 'ego_vehicle'\?$"):
-        da.get("sample", f"{da.scenario[0]['token']}/Ego_Vehicle/001")
+    assert_refused(
+        (
+            lambda: da.get("sample", f"{da.scenario[0]['token']}/Ego_Vehicle/001"),
+            TokenError,
+            r"the scenario's agents are .*; did you mean 'ego_vehicle'\?$",
+        )
+    )

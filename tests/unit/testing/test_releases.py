@@ -134,8 +134,7 @@ def test_options_choose_what_is_written(tmp_path: Path) -> None:
     ],
 )
 def test_options_that_cannot_be_carried_out(options, sentence) -> None:
-    with pytest.raises(ConfigError, match=sentence):
-        SmallRelease(**options)
+    assert_refused((lambda: SmallRelease(**options), ConfigError, sentence))
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
@@ -155,5 +154,4 @@ def test_it_needs_neither_the_generator_nor_what_tests_need(tmp_path: Path) -> N
     )
     subprocess.run([sys.executable, "-c", code], check=True)
     (path,) = (tmp_path / "release").glob("*/ego_vehicle/Camera_Front/*/*.jpg")
-    with pytest.raises(ValueError, match="not a readable image"):
-        read_image(path)
+    assert_refused((lambda: read_image(path), ValueError, "not a readable image"))

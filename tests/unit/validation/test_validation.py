@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tiny
 from PIL import Image
+from refusals import assert_refused
 from scripts import loaded_script
 from verbs import called
 
@@ -162,14 +163,12 @@ def test_findings_of_one_scenario_even_if_it_is_left_out(tmp_path: Path) -> None
     assert (finding.code, finding.where, finding.what) == told
     assert [str(finding)] == list(release.problems[0].messages)  # one implementation: what indexing said
     assert not [found for found in release.findings(release.scenario[0]) if found.severity == "error"]
-    with pytest.raises(TokenError, match="has no scenario 'nowhere'"):
-        release.findings("nowhere")
+    assert_refused((lambda: release.findings("nowhere"), TokenError, "has no scenario 'nowhere'"))
 
 
 @pytest.mark.parametrize("scenario", [None, 5, {}, {"token": None}, ["a/b"]])
 def test_findings_of_what_is_no_scenario(da: DeepAccident, scenario) -> None:
-    with pytest.raises(TokenError, match="expected a token or a record with one, found"):
-        da.findings(scenario)
+    assert_refused((lambda: da.findings(scenario), TokenError, "expected a token or a record with one, found"))
 
 
 def test_every_faulty_file_is_named(tmp_path: Path) -> None:

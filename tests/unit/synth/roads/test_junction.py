@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction, RoadSpec
@@ -139,5 +140,4 @@ def test_a_three_way_junction_has_no_way_north():
     ],
 )
 def test_what_is_not_there_is_refused(ask, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        ask(Junction(RoadSpec(kind="three-way")))
+    assert_refused((lambda: ask(Junction(RoadSpec(kind="three-way"))), ConfigError, sentence))

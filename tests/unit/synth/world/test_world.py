@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, ROAD_CODES, SIDEWALK, TREE, Hump, Junction, RoadSpec
@@ -122,5 +123,10 @@ def test_a_junction_with_a_hump_lies_level():
     [("four-way", ("west", "east"), "west, south, east, north"), ("three-way", ("west", "north"), "west, south, east")],
 )
 def test_arms_without_a_corner_are_refused(name, between, arms):
-    with pytest.raises(ConfigError, match=f"between: the arms .* no corner in common; choose two neighbours of {arms}"):
-        world_of(name, view="hidden", between=between)
+    assert_refused(
+        (
+            lambda: world_of(name, view="hidden", between=between),
+            ConfigError,
+            f"between: the arms .* no corner in common; choose two neighbours of {arms}",
+        )
+    )
