@@ -267,8 +267,7 @@ def test_sensor_data_is_where_it_should_be(da: DeepAccident) -> None:
             assert well_hit.any()
             counts = boxes.contains(cloud.xyz).sum(axis=1)
             np.testing.assert_allclose(counts[well_hit], boxes.num_lidar_pts[well_hit], atol=1)
-        image = da.load_image(f"{sample['token']}/{CAMERAS[0]}")
-        assert image.shape == (36, 64, 3)
+        assert da.load_image(f"{sample['token']}/{CAMERAS[0]}").shape == (36, 64, 3)
         assert da.load_bev(sample).semantic.shape == (1200, 1200)
 
 

@@ -88,8 +88,7 @@ def test_versions_for_a_report() -> None:
 def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> None:
     ran("index", own_release)
     label = next(own_release.glob("train/*/ego_vehicle/label/*/*_001.txt"))
-    lines = label.read_text().splitlines()
-    label.write_text("\n".join(lines[:-1]) + "\n")
+    label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
     before, after = (json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"] for _ in range(2))
     ran("index", own_release, "--check")
     checked = json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"]
@@ -158,8 +157,7 @@ def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
     for number in range(14):
         write_tiny_release(root, frames=6, agents=("ego_vehicle",), name=f"{name}{number:02d}")
     made = ran("split", root, "--out", tmp_path / "new", "--json")
-    sizes = {"train": 10, "val": 2, "test": 2, "train_mini": 2, "val_mini": 0}
-    assert json.loads(made.stdout)["scenarios"] == sizes
+    assert json.loads(made.stdout)["scenarios"] == {"train": 10, "val": 2, "test": 2, "train_mini": 2, "val_mini": 0}
     assert f"written: {tmp_path / 'new' / 'val_mini.txt'}" in made.stderr
     by_library = official_split(DeepAccident(dataroot=root)).by_name()
     assert {path.stem: tuple(read_split_file(path)) for path in (tmp_path / "new").iterdir()} == by_library
@@ -225,8 +223,7 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
     verb = ("labels", own_release, "--split", "train", "--out", out, "--workers", 2)
     switches = ("--switch", "half_cell_shift=no", "--switch", "own_box_default=no")
     made = ran(*verb, "--agents", ",".join(agents), *switches)
-    release = DeepAccident(dataroot=own_release)
-    scenarios = release.split_scenarios("train")
+    scenarios = DeepAccident(dataroot=own_release).split_scenarios("train")
     whole = f"{8 * len(scenarios)} samples in {out}: {2 * len(scenarios)} files written, 0 were there already\n"
     assert (made.stdout, "motion labels: 100%" in made.stderr) == (whole, True)
     rules = replace(LABEL_PROTOCOLS["released"], half_cell_shift=False, own_box_default=False)

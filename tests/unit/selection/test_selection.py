@@ -169,8 +169,7 @@ def test_the_released_evaluations_groups(da: DeepAccident, changes, told: dict[s
 
 @pytest.mark.parametrize("field", ["weather=Wet", "length=5..7", "collision=true", "accident_type=1", "town=Town07"])
 def test_not_equal_finds_all_that_equal_leaves_out(da: DeepAccident, field: str) -> None:
-    found = numbers(da, field)
-    assert sorted(found + numbers(da, field.replace("=", "!="))) == [1, 2, 3, 4, 5]
+    assert sorted(numbers(da, field) + numbers(da, field.replace("=", "!="))) == [1, 2, 3, 4, 5]
 
 
 def test_a_mix_of_texts_and_keywords_and_the_callers_own_records(da: DeepAccident) -> None:

@@ -104,8 +104,7 @@ def test_a_release_of_images_is_gone_on_with_when_the_disk_has_room_again(tmp_pa
     config = SynthConfig(scenarios=2, frames=3, image_size=(32, 18), seed=7)
     whole, out = digests(make(tmp_path / "whole", config)), tmp_path / "broken"
     stop_at(out, 4, config, OSError("disk full"))
-    parts = tmp_path / ".broken.unfinished" / "parts"
-    (part,) = parts.glob("*_normal_*")
+    (part,) = (tmp_path / ".broken.unfinished" / "parts").glob("*_normal_*")
     write_bytes(part.with_name(part.name.replace("1of3", "2of3")) / "half.tmp", b"left by the break")
     del recorded[:]
     assert digests(make(out, config)) == whole

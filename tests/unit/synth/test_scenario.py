@@ -59,8 +59,7 @@ def test_ids_are_unique_and_of_their_kind(built):
         ids = scenario.actors.actor_id
         assert len(set(ids.tolist())) == len(set(scenario.actors.object_id.tolist())) == len(ids)
         assert list(scenario.agents) == list(VEHICLE_AGENTS)
-        speed = np.hypot(*scenario.actors.at(1.0).velocities.T)
-        np.testing.assert_array_equal(speed[ids >= 20000], 0)
+        np.testing.assert_array_equal(np.hypot(*scenario.actors.at(1.0).velocities.T)[ids >= 20000], 0)
         assert ids[ids < 20000].max() < 3000
 
 

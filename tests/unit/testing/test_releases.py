@@ -41,8 +41,7 @@ def test_nothing_is_wrong_with_it(deepaccident_release: Path) -> None:
 @pytest.mark.parametrize("seed", [1, 7])
 def test_nothing_is_wrong_with_others(tmp_path: Path, frames: int, seed: int) -> None:
     options = SmallRelease(frames=frames, seed=seed, splits=("val",), image_size=(32, 18), channels=CHANNELS[:-1])
-    report = validate_release(write_small_release(tmp_path / "release", options), deep=True, workers=1)
-    assert not report.findings
+    assert not validate_release(write_small_release(tmp_path / "release", options), deep=True, workers=1).findings
 
 
 def test_it_lies_in_the_layout_asked_for(deepaccident_release: Path, deepaccident_layout: str) -> None:

@@ -278,8 +278,7 @@ def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
     first.write_text(first.read_text()[:-20])
     (finding,) = json.loads(run("--json", status=1))["findings"]
     assert set(finding) == {"code", "severity", "scenario", "where", "what", "remedy", "known"}
-    told = f"{finding['scenario']}  (1 error)\n  error   label-unreadable: {finding['where']}: "
-    assert told in run(status=1)
+    assert f"{finding['scenario']}  (1 error)\n  error   label-unreadable: {finding['where']}: " in run(status=1)
     assert json.loads(run("--scenario", finding["scenario"], "--json", status=1))["scenarios"] == 1
 
 

@@ -34,8 +34,7 @@ def clear_of_props(world, start, end):
     """Whether the sight from one point to another passes above or beside every block, seen in steps of 5 cm."""
     line = np.linspace(start, end, int(np.linalg.norm(np.subtract(end, start)) / 0.05))[1:-1]
     low, high = world.props.corners.min(axis=1), world.props.corners.max(axis=1)
-    inside = ((line[:, None] > low) & (line[:, None] < high)).all(axis=2)
-    return not inside.any()
+    return not ((line[:, None] > low) & (line[:, None] < high)).all(axis=2).any()
 
 
 def test_nothing_stands_on_the_road_and_no_house_on_the_sidewalk(named):
