@@ -217,10 +217,10 @@ def test_workers_get_their_own_copy(da: DeepAccident, method: str) -> None:
 
 
 def test_tables_behave_like_sequences(da: DeepAccident) -> None:
-    assert len(da.scenario) == len(list(da.scenario)) == len(da.scenario[:]) == 4
-    assert da.scenario[-1] == da.scenario[3] == da.scenario[2:][1]
-    assert repr(da.scenario).startswith("<table 'scenario': 4 rows of token, name")
-    assert da.arrow("scenario").num_rows == 4
+    scenarios = da.scenario
+    assert {len(scenarios), len(list(scenarios)), len(scenarios[:]), da.arrow("scenario").num_rows} == {4}
+    assert scenarios[-1] == scenarios[3] == scenarios[2:][1]
+    assert repr(scenarios).startswith("<table 'scenario': 4 rows of token, name")
 
 
 @pytest.mark.parametrize(
@@ -267,8 +267,7 @@ def test_sensor_data_is_where_it_should_be(da: DeepAccident) -> None:
             assert well_hit.any()
             counts = boxes.contains(cloud.xyz).sum(axis=1)
             np.testing.assert_allclose(counts[well_hit], boxes.num_lidar_pts[well_hit], atol=1)
-        image = da.load_image(f"{sample['token']}/{CAMERAS[0]}")
-        assert image.shape == (36, 64, 3)
+        assert da.load_image(f"{sample['token']}/{CAMERAS[0]}").shape == (36, 64, 3)
         assert da.load_bev(sample).semantic.shape == (1200, 1200)
 
 

@@ -55,8 +55,7 @@ def test_each_evaluation_is_verified(release: Path, folder: Path, task: str, nam
     summary = json.loads((out / "metrics_summary.json").read_text())
     assert (summary["task"], summary["protocol"], summary["counts"]["samples"]) == (task, protocol, 20)
     assert (out / "report.html").stat().st_size > 50_000
-    verified = told("evaluate", "verify", out, "--dataroot", release, *results)
-    assert "all numbers are equal" in verified
+    assert "all numbers are equal" in told("evaluate", "verify", out, "--dataroot", release, *results)
 
 
 def test_five_agents_are_compared_with_one(release: Path, folder: Path) -> None:

@@ -50,8 +50,9 @@ def test_predict_takes_names_and_the_agents_that_are_there(da_motion: DeepAccide
     for agents, meta in (("available", "available"), ("ego_vehicle,other_vehicle", ["ego_vehicle", "other_vehicle"])):
         run(*words, "--agents", agents, "--out", tmp_path / agents)
         assert read_results(tmp_path / agents / "accident.json").meta["agents"] == meta
-    with pytest.raises(NotAvailableError, match="use agents='available'"):
-        run(*words, "--agents", "all", "--out", tmp_path / "all")
+    assert_refused(
+        (lambda: run(*words, "--agents", "all", "--out", tmp_path / "all"), NotAvailableError, "use agents='available'")
+    )
 
 
 def test_predict_of_scenarios_without_an_accident_names_the_scope(da_motion: DeepAccident, tmp_path: Path) -> None:
@@ -59,8 +60,7 @@ def test_predict_of_scenarios_without_an_accident_names_the_scope(da_motion: Dee
     save_selection(da_motion.find(designed_accident=False), normal)
     words = ("constant_velocity", da_motion.dataroot, "--split", normal, "--task", "accident", "--workers", 1)
     told = r"has no samples to predict; the scope accident, .* leaves out all 1 of its scenarios, .* \(--scope all\)$"
-    with pytest.raises(NotAvailableError, match=told):
-        run(*words, "--out", tmp_path / "out")
+    assert_refused((lambda: run(*words, "--out", tmp_path / "out"), NotAvailableError, told))
     run(*words, "--scope", "all", "--out", tmp_path / "out")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 from PIL import Image
+from refusals import assert_refused
 from verbs import called
 
 from deepaccident_devkit import DeepAccident
@@ -126,8 +127,15 @@ def test_evaluation_draws_a_sample_of_the_results(da_motion: DeepAccident, tmp_p
     results = predict_results(da_motion, "accident", tokens, tmp_path / "results.json", workers=1)
     text = run("evaluation", da_motion.dataroot, "--results", results, "--out", tmp_path / "a.png", "--size", "600x300")
     assert tokens[0] in text
-    with pytest.raises(TokenError, match="has no prediction of 'no/such/ego_vehicle/001'"):
-        run("evaluation", da_motion.dataroot, "no/such/ego_vehicle/001", "--results", results, "--out", tmp_path)
+    assert_refused(
+        (
+            lambda: run(
+                "evaluation", da_motion.dataroot, "no/such/ego_vehicle/001", "--results", results, "--out", tmp_path
+            ),
+            TokenError,
+            "has no prediction of 'no/such/ego_vehicle/001'",
+        )
+    )
 
 
 def test_video_writes_what_is_asked_for(da: DeepAccident, accident: str, tmp_path: Path) -> None:
@@ -153,8 +161,13 @@ def test_a_release_without_an_accident_shows_its_first_scenario(da: DeepAccident
     for verb in ("frame", "sample", "bev", "sample-data", "instance"):
         assert f"rendered: {first}" in run(verb, root, "--out", tmp_path / "a.png", "--size", "480x480")
     run("video", root, "--out", tmp_path / "a.gif", "--frame-range", "1", "--size", "320x180", "--workers", 1)
-    with pytest.raises(NotAvailableError, match=f"no scenario ends in an accident .*, such as {first}$"):
-        run("accident", root, "--out", tmp_path / "a.png")
+    assert_refused(
+        (
+            lambda: run("accident", root, "--out", tmp_path / "a.png"),
+            NotAvailableError,
+            f"no scenario ends in an accident .*, such as {first}$",
+        )
+    )
 
 
 def test_what_a_picture_lacks_is_logged(
@@ -180,5 +193,6 @@ def test_pictures_of_all_kinds_have_the_same_bytes_each_time(
     assert contents[0].startswith(start)
     if suffix != ".svg":  # its ids are drawn by chance
         assert contents[0] == contents[1]
-    with pytest.raises(ChoiceError, match=r"path: expected a file that ends in \.png"):
-        save_picture(ax, tmp_path / "a.bmp")
+    assert_refused(
+        (lambda: save_picture(ax, tmp_path / "a.bmp"), ChoiceError, r"path: expected a file that ends in \.png")
+    )

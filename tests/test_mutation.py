@@ -68,7 +68,8 @@ def test_a_mutant_is_planted_wherever_it_is_held(tmp_path: Path, monkeypatch, be
     monkeypatch.setitem(sys.modules, "planted_here", module)
     spec.loader.exec_module(module)
     near, limits = module.near, module.limits
-    assert not plant(module, ast.parse(SOURCE))
-    assert (near.__wrapped__(2), *limits()) == (False, 2, 4, 5, (3,))
-    assert plant(module, ast.parse(SOURCE.replace(before, after)))
-    assert (near.__wrapped__(2), *limits()) == found
+    for source, planted, held in (
+        (SOURCE, False, (False, 2, 4, 5, (3,))),
+        (SOURCE.replace(before, after), True, found),
+    ):
+        assert (plant(module, ast.parse(source)), near.__wrapped__(2), *limits()) == (planted, *held)

@@ -83,9 +83,8 @@ def tables(da: DeepAccident, _: DeepAccident, __: Path) -> Pins:
 
 def turns(column: str, values: Any) -> Any:
     """A column; rotations as matrices, headings by cosine and sine: half a turn has two quaternions and two angles."""
-    if column == "rotation":
-        return to_matrix(values)
-    return [np.cos(values), np.sin(values)] if column == "yaw" else values
+    angles = {"rotation": to_matrix, "yaw": lambda yaw: [np.cos(yaw), np.sin(yaw)]}
+    return angles.get(column, lambda each: each)(values)
 
 
 def pairs(_: DeepAccident, da: DeepAccident, __: Path) -> Pins:
@@ -110,20 +109,17 @@ def labels(_: DeepAccident, da: DeepAccident, __: Path) -> Pins:
 
 def evaluations(_: DeepAccident, da: DeepAccident, folder: Path) -> Pins:
     """Predictions of a baseline; counts and numbers of each task and protocol."""
-    split = folder / "everything.txt"
+    split, mine = folder / "everything.txt", {"samples": "all", "scope": "all", "agents": ("ego_vehicle",)}
     split.write_text("".join(each["token"].replace("/", " ") + "\n" for each in da.scenario))
-    mine = {"samples": "all", "scope": "all", "agents": ("ego_vehicle",)}
-    tokens = SampleSelection(split=str(split), **mine).tokens(da)
-    found = {}
+    tokens, found = SampleSelection(split=str(split), **mine).tokens(da), {}
     for kind, tasks in EVALUATED.items():
         path = predict_results(da, kind, tokens, folder / (kind if kind == "motion" else f"{kind}.json"))
         for task, protocol in [(task, protocol) for task, protocols in tasks.items() for protocol in protocols]:
             setup = EvaluationSetup(task=task, protocol=protocol)
             run = evaluate_results(da, path, setup, default_selection(setup, split, **mine))
-            summary = run.summary()
-            found[f"{kind} {task} {protocol} counts"] = pin(run.evaluator.counts)
-            found[f"{kind} {task} {protocol} numbers"] = pin(summary["metrics"])
-            found[f"{kind} {task} {protocol} headlines"] = [each["value"] for each in summary["headlines"]]
+            name, summary = f"{kind} {task} {protocol}", run.summary()
+            found |= {f"{name} counts": pin(run.evaluator.counts), f"{name} numbers": pin(summary["metrics"])}
+            found[f"{name} headlines"] = [each["value"] for each in summary["headlines"]]
     return found
 
 

@@ -141,8 +141,7 @@ class Place(ScenarioEditor):
             for row in self.rows(agent, frame)[1:]:
                 actor = int(row[FIELD["id"]])
                 if actor > 0:
-                    place = world_from_lidar @ [*map(float, row[1:4]), 1.0]
-                    seen.setdefault(actor, {})[frame] = place[:3]
+                    seen.setdefault(actor, {})[frame] = (world_from_lidar @ [*map(float, row[1:4]), 1.0])[:3]
         return seen
 
     def steady(self, agent: str, *, moving: bool = False) -> set[int]:
@@ -154,8 +153,7 @@ class Place(ScenarioEditor):
         }
 
     def _moves(self, places: Mapping[int, np.ndarray]) -> bool:
-        way = places[self.frames[-1]] - places[self.frames[0]]
-        return way_length(way) > LEAST_MOVE * (len(self.frames) - 1)
+        return way_length(places[self.frames[-1]] - places[self.frames[0]]) > LEAST_MOVE * (len(self.frames) - 1)
 
     def shared_actor(
         self, rng: np.random.Generator, *, moving: bool = False, within: float = np.inf
@@ -173,8 +171,7 @@ class Place(ScenarioEditor):
 
     def steady_ones(self, rng: np.random.Generator, count: int, *, moving: bool = False) -> tuple[str, list[int]]:
         """An agent and so many of the actors that it sees in every frame."""
-        agents = [agent for agent in self.agents if len(self.steady(agent, moving=moving)) >= count]
-        agent = one_of(agents, rng)
+        agent = one_of([agent for agent in self.agents if len(self.steady(agent, moving=moving)) >= count], rng)
         return agent, rng.choice(sorted(self.steady(agent, moving=moving)), size=count, replace=False).tolist()
 
     def lone_actor(self, rng: np.random.Generator, *, vehicle: bool = False) -> tuple[str, int]:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import pytest
+from refusals import assert_refused
 from report_page import Page
 
 from deepaccident_devkit.errors import ConfigError
@@ -37,8 +37,7 @@ def test_all_forms_have_the_same_numbers(tmp_path: Path) -> None:
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="is a file; give a folder"):
-        Speeds(speeds={}).to_csv(tmp_path / "file")
+    assert_refused((lambda: Speeds(speeds={}).to_csv(tmp_path / "file"), ConfigError, "is a file; give a folder"))
 
 
 def test_notes_stand_below_a_table() -> None:

@@ -169,8 +169,7 @@ def test_the_released_evaluations_groups(da: DeepAccident, changes, told: dict[s
 
 @pytest.mark.parametrize("field", ["weather=Wet", "length=5..7", "collision=true", "accident_type=1", "town=Town07"])
 def test_not_equal_finds_all_that_equal_leaves_out(da: DeepAccident, field: str) -> None:
-    found = numbers(da, field)
-    assert sorted(found + numbers(da, field.replace("=", "!="))) == [1, 2, 3, 4, 5]
+    assert sorted(numbers(da, field) + numbers(da, field.replace("=", "!="))) == [1, 2, 3, 4, 5]
 
 
 def test_a_mix_of_texts_and_keywords_and_the_callers_own_records(da: DeepAccident) -> None:
@@ -199,8 +198,7 @@ def test_parsed_texts(text: str, parsed: Filter) -> None:
 
 @pytest.mark.parametrize("text", ["", "town", "=Town03", "town=", "town=Town03,", "length>", "to wn=Town03"])
 def test_texts_that_are_no_filter(text: str) -> None:
-    with pytest.raises(ChoiceError, match="expected field=value"):
-        parse_where(text)
+    assert_refused((lambda: parse_where(text), ChoiceError, "expected field=value"))
 
 
 NUMBER = "num_frames: expected a number, a range such as 40..60"
@@ -293,8 +291,9 @@ def test_values_that_no_field_has_are_our_error(da: DeepAccident, field: str, va
 
 @pytest.mark.parametrize("text", [None, 5, ["town=Town03"], {"town": "Town03"}, np.array(["town=Town03"])])
 def test_a_text_that_is_none_is_our_error(da: DeepAccident, text) -> None:
-    with pytest.raises(DeepAccidentError, match=r"expected a text such as town=Town03,Town05, found .*as keywords"):
-        da.find(text)
+    assert_refused(
+        (lambda: da.find(text), DeepAccidentError, r"expected a text such as town=Town03,Town05, found .*as keywords")
+    )
 
 
 @pytest.mark.parametrize(

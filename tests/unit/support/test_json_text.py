@@ -94,5 +94,4 @@ def test_a_record_is_read() -> None:
     ],
 )
 def test_a_record_that_is_something_else(content: bytes, told: str) -> None:
-    with pytest.raises(ValueError, match=told):
-        parsed_record(content, Record)
+    assert_refused((lambda: parsed_record(content, Record), ValueError, told))

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from report_page import Page
@@ -45,10 +46,16 @@ def test_results_have_three_decimals_or_digits() -> None:
     ]
 
 
-def test_names_are_broken_between_words() -> None:
-    assert breakable("ego_vehicle/030 <b>") == "ego_<wbr>vehicle/<wbr>030 &lt;b&gt;"
-    assert breakable("accuracy@5") == "accuracy<wbr>@5"
-    assert breakable(breakable("a_b")) == "a_<wbr>b"
+@pytest.mark.parametrize(
+    ("name", "broken"),
+    [
+        ("ego_vehicle/030 <b>", "ego_<wbr>vehicle/<wbr>030 &lt;b&gt;"),
+        ("accuracy@5", "accuracy<wbr>@5"),
+        (breakable("a_b"), "a_<wbr>b"),
+    ],
+)
+def test_names_are_broken_between_words(name: str, broken: str) -> None:
+    assert breakable(name) == broken
 
 
 def test_templates_are_read_when_the_first_page_is_made() -> None:

@@ -1,13 +1,14 @@
 """Words that the devkit knows are taken in any case of letters; of another word, the error says which was meant."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import click
 import numpy as np
 import pytest
 from refusals import assert_refused
+from verbs import commands
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
@@ -98,18 +99,9 @@ def test_what_is_told_of_a_split_is_its_name() -> None:
     assert [SampleSelection(split=each).split for each in ("VAL_mini", "Mine.txt")] == ["val_mini", "Mine.txt"]
 
 
-def verbs(group: click.Group, context: click.Context) -> Iterator[click.Command]:
-    for name in group.list_commands(context):
-        verb = group.get_command(context, name)
-        assert verb is not None
-        yield verb
-        if isinstance(verb, click.Group):
-            yield from verbs(verb, context)
-
-
 def test_every_option_with_words_takes_them_in_any_case() -> None:
     context = click.Context(deepaccident)
-    options = [(verb, option) for verb in verbs(deepaccident, context) for option in verb.params]
+    options = [(verb, option) for _, verb in commands(deepaccident) for option in verb.params]
     of_words = [(verb, option) for verb, option in options if isinstance(option.type, click.Choice)]
     assert len(of_words) > 40
     for verb, option in of_words:
@@ -135,8 +127,13 @@ def test_a_word_that_is_like_none_has_no_suggestion(wrong: Any) -> None:
 def test_files_of_a_release_are_read_exactly(da: DeepAccident) -> None:
     """What stands in a file, or names one, has one spelling."""
     assert da.get("sample", da.sample[0]["token"]) == da.sample[0]
-    with pytest.raises(TokenError, match=r"the scenario's agents are .*; did you mean 'ego_vehicle'\?$"):
-        da.get("sample", f"{da.scenario[0]['token']}/Ego_Vehicle/001")
+    assert_refused(
+        (
+            lambda: da.get("sample", f"{da.scenario[0]['token']}/Ego_Vehicle/001"),
+            TokenError,
+            r"the scenario's agents are .*; did you mean 'ego_vehicle'\?$",
+        )
+    )
 
 
 def test_what_differs_is_told_with_both_values() -> None:

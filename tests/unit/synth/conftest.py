@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepaccident_devkit.release import ScenarioFolder, find_release, read_calib, read_label
+from deepaccident_devkit.release import ScenarioFolder, find_release
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 CONFIG = SynthConfig(scenarios=2, frames=3, image_size=(192, 108), seed=5)
@@ -23,23 +23,6 @@ def release_root(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def scenarios(release_root) -> tuple[ScenarioFolder, ...]:
     return find_release(release_root).scenarios
-
-
-@pytest.fixture(scope="session")
-def accident(scenarios) -> ScenarioFolder:
-    return next(scenario for scenario in scenarios if scenario.scenario_type.endswith("accident"))
-
-
-@pytest.fixture(scope="session")
-def world_boxes():
-    """Boxes of one label file in the world frame, and its calib."""
-
-    def read(scenario, agent, frame):
-        calib = read_calib(scenario.calib_path(agent, frame))
-        boxes = read_label(scenario.label_path(agent, frame)).boxes()
-        return boxes.transform(calib.world_from_ego @ calib.ego_from_lidar, "world"), calib
-
-    return read
 
 
 @pytest.fixture(scope="session")

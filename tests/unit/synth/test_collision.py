@@ -26,8 +26,7 @@ def test_gap_and_overlap_equal_shapely(pose_a, size_a, pose_b, size_b):
 
 def test_touching_is_zero():
     size = np.array([4.0, 2.0])
-    crossing = separation(np.zeros(3), size, np.array([3.0, 0.0, np.pi / 2]), size)
-    assert crossing == pytest.approx(0.0, abs=1e-12)
+    assert separation(np.zeros(3), size, np.array([3.0, 0.0, np.pi / 2]), size) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_arrays_broadcast():

@@ -104,8 +104,7 @@ def test_a_release_of_images_is_gone_on_with_when_the_disk_has_room_again(tmp_pa
     config = SynthConfig(scenarios=2, frames=3, image_size=(32, 18), seed=7)
     whole, out = digests(make(tmp_path / "whole", config)), tmp_path / "broken"
     stop_at(out, 4, config, OSError("disk full"))
-    parts = tmp_path / ".broken.unfinished" / "parts"
-    (part,) = parts.glob("*_normal_*")
+    (part,) = (tmp_path / ".broken.unfinished" / "parts").glob("*_normal_*")
     write_bytes(part.with_name(part.name.replace("1of3", "2of3")) / "half.tmp", b"left by the break")
     del recorded[:]
     assert digests(make(out, config)) == whole
@@ -331,9 +330,7 @@ def test_what_broke_off_goes_on(out, unfinished, whole, digests, recorded, stop_
     for name in (cut, kept):
         temporary_path(next(unfinished.part(name).rglob("*_001.txt"))).touch()
     assert digests(make(out)) == whole
-    assert len(recorded) == 2
-    assert cut in recorded
-    assert kept not in recorded
+    assert (len(recorded), cut in recorded, kept in recorded) == (2, True, False)
 
 
 def test_a_call_that_makes_nothing_leaves_nothing(out, stop_at):

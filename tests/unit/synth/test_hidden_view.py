@@ -55,8 +55,7 @@ def test_ego_and_other_see_each_other_late_and_the_pole_sees_the_other(folder):
 @pytest.mark.parametrize("number", [0, 1])
 def test_nobody_walks_or_parks_in_the_house(side, number):
     """The house takes the sidewalk of its corner; its quadrant lies between ego and other."""
-    config = HIDDEN[side]
-    scenario = build(config, number)
+    scenario = build(HIDDEN[side], number)
     sign = 1 if scenario.meta.spawn_side == "left" else -1
     for time in np.linspace(0, 2.1, 22):
         x, y = scenario.actors.at(time).poses[:, :2].T

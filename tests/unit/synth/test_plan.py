@@ -23,8 +23,8 @@ def test_accidents_and_twins_by_turns_go_round_the_designs():
     assert {plan.traits.subtype for plan in plans[:4]} == {1, 2}
     for accident, twin in zip(plans[::2], plans[1::2], strict=True):
         assert (accident.name, accident.split, accident.traits) == (twin.name, twin.split, twin.traits)
-        assert accident.scenario_type == f"type1_subtype{accident.traits.subtype}_accident"
-        assert twin.scenario_type == f"type1_subtype{twin.traits.subtype}_normal"
+        kind = f"type1_subtype{accident.traits.subtype}"
+        assert (accident.scenario_type, twin.scenario_type) == (f"{kind}_accident", f"{kind}_normal")
 
 
 def test_names_are_the_release_s_and_unique():
@@ -53,8 +53,7 @@ def test_a_draw_has_the_plan_s_traits(design):
         for seed in range(3):
             spec = plan.draw(np.random.default_rng(seed))
             assert spec.road.signalized == (plan.traits.subtype == 1) == (design < 7)
-            assert f"{spec.road.kind} junction" == plan.traits.road_type
-            assert spec.spawn_side == plan.traits.spawn_side
+            assert (f"{spec.road.kind} junction", spec.spawn_side) == (plan.traits.road_type, plan.traits.spawn_side)
             assert spec.view == "open" or design in (1, 2, 6, 7, 8, 12)
 
 
@@ -80,8 +79,7 @@ def test_the_first_three_pairs_of_a_small_release_fill_the_splits():
     assert [plan.split for plan in plans] == ["train", "train", "val", "val", "test", "test"]
     splits = plan_splits(plans)
     assert splits.train == splits.train_mini == tuple(sorted(plan.token for plan in plans[:2]))
-    assert splits.val == splits.val_mini
-    assert plan_splits(plans[:2]).val_mini == ()
+    assert (splits.val_mini, plan_splits(plans[:2]).val_mini) == (splits.val, ())
 
 
 def test_a_large_release_is_split_by_the_official_procedure():
@@ -106,8 +104,8 @@ def test_minis_are_whole_pairs_a_fifth_at_most_and_never_empty(scenarios):
 def test_unplanned_accidents_come_at_their_rate():
     share = np.mean([plan.unplanned for plan in plans_of(scenarios=800, unplanned=0.25)])
     assert share == pytest.approx(0.25, abs=0.05)
-    assert not any(plan.unplanned for plan in plans_of(scenarios=40, unplanned=0.0))
-    assert not any(plan.unplanned for plan in plans_of(scenarios=40, unplanned=1.0, view="hidden"))
+    none = (*plans_of(scenarios=40, unplanned=0.0), *plans_of(scenarios=40, unplanned=1.0, view="hidden"))
+    assert not any(plan.unplanned for plan in none)
 
 
 def test_a_hidden_view_has_designs_that_a_house_can_hide_and_faster_cars():

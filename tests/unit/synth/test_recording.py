@@ -7,26 +7,8 @@ from deepaccident_devkit.release import (
     read_calib,
     read_label,
     read_lidar,
-    read_meta,
 )
 from deepaccident_devkit.taxonomy import AGENTS
-
-FRAMES = (1, 2, 3)
-
-
-@pytest.mark.parametrize("frame", FRAMES)
-def test_actors_have_one_world_pose_in_all_agents_labels(scenarios, world_boxes, frame):
-    for scenario in scenarios:
-        own = dict(zip(AGENTS, read_meta(scenario.meta_path).agent_ids, strict=False))
-        seen: dict[int, list[np.ndarray]] = {}
-        for agent in AGENTS:
-            boxes, _ = world_boxes(scenario, agent, frame)
-            for row, actor in enumerate(boxes.actor_id.tolist()):
-                if actor != -1:
-                    seen.setdefault(own[agent] if actor == -100 else actor, []).append(boxes.corners()[row])
-        assert max(map(len, seen.values())) == 5
-        for poses in seen.values():
-            np.testing.assert_allclose(poses, np.broadcast_to(poses[0], np.shape(poses)), atol=1e-4)
 
 
 def test_ids_of_all_kinds_occur(scenarios):
@@ -44,7 +26,7 @@ def test_ids_of_all_kinds_occur(scenarios):
 
 
 def test_own_box_lies_around_the_ego_origin(scenarios):
-    """Where exactly; that velocities, contacts and pictures agree with the boxes, `validate` says of each release."""
+    """Where exactly; that poses, velocities, contacts and pictures agree, `validate` says of each release."""
     for scenario in scenarios:
         for agent in AGENTS[:4]:
             label = read_label(scenario.label_path(agent, 1))
@@ -100,9 +82,7 @@ def test_points_are_a_scan_of_32_channels(scenarios):
     cloud = read_lidar(scenarios[0].channel_path("infrastructure", "lidar01", 1))
     reach = np.linalg.norm(cloud.xyz, axis=1)
     elevation = np.rad2deg(np.arcsin(cloud.xyz[:, 2] / reach))
-    assert reach.max() <= 70.3
-    assert 25_000 < len(cloud) <= 32 * 1400
-    assert len(np.unique(elevation.round(3))) <= 32
-    assert elevation.min() == pytest.approx(-30, abs=1e-3)
+    assert (reach.max() <= 70.3, 25_000 < len(cloud) <= 32 * 1400) == (True, True)
+    assert (len(np.unique(elevation.round(3))) <= 32, elevation.min()) == (True, pytest.approx(-30, abs=1e-3))
     assert 0 <= cloud.intensity.min() < cloud.intensity.max() <= 1
     assert cloud.intensity.std() > 0.05

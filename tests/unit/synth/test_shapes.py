@@ -37,8 +37,7 @@ def test_shapes_fill_their_boxes_and_keep_within(shape):
 def test_solids_are_convex_and_turned_outwards(shape):
     _, _, solids = shape
     normals, offsets = face_planes(face_corners(solids.corners))
-    middle = np.repeat(solids.corners.mean(axis=1), 6, axis=0)
-    assert (np.einsum("fk,fk->f", normals, middle) < offsets).all()
+    assert (np.einsum("fk,fk->f", normals, np.repeat(solids.corners.mean(axis=1), 6, axis=0)) < offsets).all()
 
 
 def test_vehicles_have_lamps_in_front_and_behind(shape):

@@ -41,8 +41,7 @@ def test_nothing_is_wrong_with_it(deepaccident_release: Path) -> None:
 @pytest.mark.parametrize("seed", [1, 7])
 def test_nothing_is_wrong_with_others(tmp_path: Path, frames: int, seed: int) -> None:
     options = SmallRelease(frames=frames, seed=seed, splits=("val",), image_size=(32, 18), channels=CHANNELS[:-1])
-    report = validate_release(write_small_release(tmp_path / "release", options), deep=True, workers=1)
-    assert not report.findings
+    assert not validate_release(write_small_release(tmp_path / "release", options), deep=True, workers=1).findings
 
 
 def test_it_lies_in_the_layout_asked_for(deepaccident_release: Path, deepaccident_layout: str) -> None:
@@ -134,8 +133,7 @@ def test_options_choose_what_is_written(tmp_path: Path) -> None:
     ],
 )
 def test_options_that_cannot_be_carried_out(options, sentence) -> None:
-    with pytest.raises(ConfigError, match=sentence):
-        SmallRelease(**options)
+    assert_refused((lambda: SmallRelease(**options), ConfigError, sentence))
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
@@ -155,5 +153,4 @@ def test_it_needs_neither_the_generator_nor_what_tests_need(tmp_path: Path) -> N
     )
     subprocess.run([sys.executable, "-c", code], check=True)
     (path,) = (tmp_path / "release").glob("*/ego_vehicle/Camera_Front/*/*.jpg")
-    with pytest.raises(ValueError, match="not a readable image"):
-        read_image(path)
+    assert_refused((lambda: read_image(path), ValueError, "not a readable image"))

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction, RoadSpec
@@ -26,8 +27,7 @@ def test_routes_begin_and_end_on_lane_centres(junction):
         ):
             out = np.array(OUTWARD[arm], dtype=float)
             heading = sign * out
-            right = np.array([heading[1], -heading[0]])
-            np.testing.assert_allclose(point, REACH * out + center * right, atol=1e-6)
+            np.testing.assert_allclose(point, REACH * out + center * np.array([heading[1], -heading[0]]), atol=1e-6)
             np.testing.assert_allclose([np.cos(yaw), np.sin(yaw)], heading, atol=1e-9)
 
 
@@ -55,8 +55,7 @@ def test_stop_line_then_junction_then_arm(junction):
         inward, outward = OUTWARD[route.from_arm], OUTWARD[route.to_arm]
         found = [stop @ inward, enter @ inward, leave @ outward]
         np.testing.assert_allclose(found, [spec.stop_line[1], spec.mouth, spec.mouth], atol=1e-3)
-        line = junction.stop_line(route.from_arm)
-        assert np.linalg.norm(line - stop, axis=1).max() < spec.lanes_edge
+        assert np.linalg.norm(junction.stop_line(route.from_arm) - stop, axis=1).max() < spec.lanes_edge
 
 
 def test_conflicts_are_symmetric_and_true(junction):
@@ -90,8 +89,7 @@ def test_conflicts_are_symmetric_and_true(junction):
 )
 def test_who_meets_whom(first, second, meet):
     junction = Junction(RoadSpec())
-    meeting = junction.conflicts(junction.route(*first), junction.route(*second))
-    assert (meeting is not None) == meet
+    assert (junction.conflicts(junction.route(*first), junction.route(*second)) is not None) == meet
 
 
 def test_crosswalks_go_from_sidewalk_to_sidewalk(junction):
@@ -139,5 +137,4 @@ def test_a_three_way_junction_has_no_way_north():
     ],
 )
 def test_what_is_not_there_is_refused(ask, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        ask(Junction(RoadSpec(kind="three-way")))
+    assert_refused((lambda: ask(Junction(RoadSpec(kind="three-way"))), ConfigError, sentence))

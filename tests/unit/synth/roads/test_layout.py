@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ROAD_CODES, Hump, Junction, RoadSpec
@@ -24,8 +25,7 @@ from deepaccident_devkit.synth.roads.layout import SLOT_LENGTH
     ],
 )
 def test_impossible_junctions_are_refused(fields, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        RoadSpec(**fields)
+    assert_refused((lambda: RoadSpec(**fields), ConfigError, sentence))
 
 
 @pytest.mark.parametrize("lanes", [1, 2])

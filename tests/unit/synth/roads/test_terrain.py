@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ARMS, Hump, Terrain
@@ -78,5 +79,4 @@ def test_the_default_hump_hides_a_pedestrian():
     ],
 )
 def test_impossible_humps_are_refused(fields, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        Hump(**fields)
+    assert_refused((lambda: Hump(**fields), ConfigError, sentence))

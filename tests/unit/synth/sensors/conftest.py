@@ -67,8 +67,7 @@ def rig_of(actor):
         where = {**AGENT_PLACES, **(places or {})}
         cars = [actor(k, "car", *where[name]) for k, name in enumerate(VEHICLE_AGENTS)]
         ids = {name: car.actor_id for name, car in zip(VEHICLE_AGENTS, cars, strict=True)}
-        actors = Actors.of([*cars, *others])
-        return make_rig(world, actors, ids, sky=sky, image_size=image_size, seed=seed, **options)
+        return make_rig(world, Actors.of([*cars, *others]), ids, sky=sky, image_size=image_size, seed=seed, **options)
 
     return make
 

@@ -46,8 +46,7 @@ def test_points_lie_on_surfaces_within_the_noise(world, bare, rig_of):
 @pytest.mark.parametrize("kind", ["flat", "hilly"])
 def test_points_of_the_ground_lie_on_the_terrain(world, hilly_world, rig_of, kind):
     place = world if kind == "flat" else hilly_world
-    rig = rig_of(place, sensors="none", places={"ego_vehicle": (-48.0, -1.75, 0.0)})
-    scene, pose, points = scan_of(rig)
+    scene, pose, points = scan_of(rig_of(place, sensors="none", places={"ego_vehicle": (-48.0, -1.75, 0.0)}))
     ground = pose.apply(points.xyz[points.face == GROUND].astype(np.float64))
     above = ground[:, 2] - scene.setting.terrain.height(ground[:, :2])
     assert len(ground) > 5000
@@ -113,13 +112,11 @@ def test_the_own_body_is_met_where_it_is(world, rig_of):
 
 
 def test_more_gets_lost_in_rain_and_of_what_comes_back_weak(world, bare, rig_of):
-    far = Block((19.0, 20.0), (-60.0, 60.0), (-0.1, 12.0), RED)
-    rig = rig_of(bare(world, [far]), sensors="none")
+    rig = rig_of(bare(world, [Block((19.0, 20.0), (-60.0, 60.0), (-0.1, 12.0), RED)]), sensors="none")
     clear, rain = (len(scan_of(rig, air=air)[2].xyz) for air in (DRY, RAIN))
     assert rain < 0.95 * clear
     reach = np.repeat(np.array([5.0, 30.0, 69.0], dtype=np.float32), 10_000)
-    luck = np.tile(np.linspace(0, 1, 10_000, dtype=np.float32), 3)
-    kept = returns(reach, luck, DRY).reshape(3, -1).mean(axis=1)
+    kept = returns(reach, np.tile(np.linspace(0, 1, 10_000, dtype=np.float32), 3), DRY).reshape(3, -1).mean(axis=1)
     expected = 1 - 0.4 * np.maximum(1 - np.exp(-0.03 * np.array([5.0, 30.0, 69.0])) / 0.8, 0)
     np.testing.assert_allclose(kept, expected, atol=1e-3)
     assert not returns(np.array([70.1, np.inf], dtype=np.float32), np.ones(2, dtype=np.float32), DRY).any()

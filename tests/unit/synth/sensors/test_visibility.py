@@ -25,8 +25,7 @@ def ego_sees(rig, actor_id, agent=0):
 def test_a_rectangle_is_as_large_as_what_is_ahead_of_the_camera(place):
     """Of a box ahead of it, and of boxes that are partly behind it."""
     size, axis = np.array([1.5, 1.5, 3.0]), np.array([np.cos(0.3), np.sin(0.3), 0])
-    axes = np.array([axis, [-axis[1], axis[0], 0], [0, 0, 1]])
-    points = np.array(place) + SHARES @ (axes * size[:, None])
+    points = np.array(place) + SHARES @ (np.array([axis, [-axis[1], axis[0], 0], [0, 0, 1]]) * size[:, None])
     ahead = points[points[:, 2] >= CLOSE]
     pixels = ahead[:, :2] / ahead[:, 2:] / SLOPE + np.array(SIZE) / 2
     (low,), (high,) = rectangles(Boxes.from_arrays([place], [size], [0.3]).corners(), SLOPE, SIZE)
@@ -51,8 +50,7 @@ def test_a_wall_hides_what_is_behind_it(world, bare, actor, rig_of, upper_edge, 
     """The wall ends `width` to the left of the car's right side, seen from the ego at (-30, -1.75)."""
     wall = Block((-16.2, -16.0), (-5.0, -5.0 + width), (-0.1, upper_edge), WALL)
     car = actor(9, "car", -8.0, -1.75)
-    rig = rig_of(bare(world, [wall]), [car])
-    assert ego_sees(rig, 1009) == seen
+    assert ego_sees(rig_of(bare(world, [wall]), [car]), 1009) == seen
     assert ego_sees(rig_of(bare(world), [car]), 1009)
 
 
@@ -67,8 +65,7 @@ def test_a_truck_hides_the_car_before_it(world, bare, actor, rig_of, hidden):
 def test_a_rise_hides_a_pedestrian_behind_it(hilly_world, bare, actor, rig_of, x, seen):
     """The crest lies 55 m from the middle; the ego waits 30 m from it or on it, the pedestrian stands far behind."""
     places = {"ego_vehicle": (x, -1.75, np.pi), "ego_vehicle_behind": (20.0, -1.75, 0.0)}
-    rig = rig_of(bare(hilly_world), [actor(9, "pedestrian", -86.0, -1.75)], places=places)
-    assert ego_sees(rig, 1009) == seen
+    assert ego_sees(rig_of(bare(hilly_world), [actor(9, "pedestrian", -86.0, -1.75)], places=places), 1009) == seen
 
 
 def test_nobody_sees_itself_and_all_around_is_seen(world, bare, actor, rig_of):

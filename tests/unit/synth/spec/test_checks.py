@@ -1,4 +1,5 @@
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.spec import parse_spec
@@ -27,8 +28,7 @@ from deepaccident_devkit.synth.spec import parse_spec
     ],
 )
 def test_an_impossible_entry_is_refused(with_other, entries, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        parse_spec(with_other(entries), "f.yaml")
+    assert_refused((lambda: parse_spec(with_other(entries), "f.yaml"), ConfigError, sentence))
 
 
 @pytest.mark.parametrize(
@@ -46,8 +46,7 @@ def test_an_impossible_entry_is_refused(with_other, entries, sentence):
     ],
 )
 def test_an_impossible_road_is_refused(small, more, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        parse_spec(f"{small}\n{more}", "f.yaml")
+    assert_refused((lambda: parse_spec(f"{small}\n{more}", "f.yaml"), ConfigError, sentence))
 
 
 def scenario(*actors: str, more: str = "") -> str:
@@ -105,8 +104,7 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
     ],
 )
 def test_an_impossible_scenario_is_refused(text, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        parse_spec(text, "f.yaml")
+    assert_refused((lambda: parse_spec(text, "f.yaml"), ConfigError, sentence))
 
 
 def test_actors_that_record_nothing_may_be_several():

@@ -48,8 +48,7 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
     ],
 )
 def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        parse_spec(with_other(entries), "f.yaml")
+    assert_refused((lambda: parse_spec(with_other(entries), "f.yaml"), ConfigError, sentence))
 
 
 @pytest.mark.parametrize(
@@ -66,8 +65,7 @@ def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sente
     ],
 )
 def test_a_wrong_line_is_refused(small, line, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        parse_spec(f"{small}\n{line}", "f.yaml")
+    assert_refused((lambda: parse_spec(f"{small}\n{line}", "f.yaml"), ConfigError, sentence))
 
 
 @pytest.mark.parametrize(
@@ -82,8 +80,7 @@ def test_a_wrong_line_is_refused(small, line, sentence):
     ],
 )
 def test_a_file_that_is_no_scenario_is_refused(text, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        parse_spec(text)
+    assert_refused((lambda: parse_spec(text), ConfigError, sentence))
 
 
 def test_a_file_is_read_in_utf8_and_named_in_its_errors(tmp_path, small):
@@ -91,8 +88,7 @@ def test_a_file_is_read_in_utf8_and_named_in_its_errors(tmp_path, small):
     path.write_text(small.replace("small", "Straße"), encoding="utf-8")
     assert read_spec(path).name == "Straße"
     path.write_text(small + "\nview: x", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"mein.yaml:7: view: expected one of open, hidden"):
-        read_spec(path)
+    assert_refused((lambda: read_spec(path), ConfigError, r"mein.yaml:7: view: expected one of open, hidden"))
     path.write_bytes(b"\xff")
     assert_refused(
         (lambda: read_spec(path), ConfigError, r"mein.yaml: cannot be read .*; give a YAML file in UTF-8"),
@@ -128,5 +124,6 @@ def test_long_words_are_cut_in_messages(tmp_path, text):
 def test_what_is_too_large_for_a_scenario_is_not_parsed(tmp_path, small):
     path = tmp_path / "big.yaml"
     path.write_text(small + "# comment\n" * 20_000, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"big.yaml: has more than 200000 characters; give a scenario file"):
-        read_spec(path)
+    assert_refused(
+        (lambda: read_spec(path), ConfigError, r"big.yaml: has more than 200000 characters; give a scenario file")
+    )

@@ -27,8 +27,7 @@ def test_a_draw_has_what_the_file_says_and_defaults_for_the_rest(small):
     (spec,) = draws(small, 1)
     said = {"ego": "west", "other": "north", "ego_behind": None, "other_behind": None}
     actors = tuple(ActorSpec(role=role, from_arm=arm) if arm else ActorSpec(role=role) for role, arm in said.items())
-    meet = MeetSpec(actors=("ego", "other"), offset=0.5)
-    assert spec == ScenarioSpec(name="small", actors=actors, meet=meet)
+    assert spec == ScenarioSpec(name="small", actors=actors, meet=MeetSpec(actors=("ego", "other"), offset=0.5))
 
 
 def test_the_same_numbers_give_the_same_draw():
@@ -36,8 +35,7 @@ def test_the_same_numbers_give_the_same_draw():
 
 
 def test_ranges_are_filled_and_kept(with_other):
-    text = with_other("max_speed: [8, 12], turn: [straight, left, left]") + "background: {parked: [3, 5]}\n"
-    made = draws(text)
+    made = draws(with_other("max_speed: [8, 12], turn: [straight, left, left]") + "background: {parked: [3, 5]}\n")
     speeds = [spec.actor("other").max_speed for spec in made]
     assert (min(speeds), max(speeds)) == pytest.approx((8.1, 11.9), abs=0.1)
     assert {spec.background.parked for spec in made} == {3, 4, 5}

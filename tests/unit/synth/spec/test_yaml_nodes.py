@@ -1,4 +1,5 @@
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.spec.reading import parse_yaml
@@ -41,8 +42,7 @@ def test_every_value_knows_the_line_of_its_key_or_item():
     ],
 )
 def test_what_is_no_plain_yaml_is_refused_with_its_line(text, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        parse_yaml(text, "f.yaml")
+    assert_refused((lambda: parse_yaml(text, "f.yaml"), ConfigError, sentence))
 
 
 @pytest.mark.parametrize(

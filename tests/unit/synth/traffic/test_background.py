@@ -37,8 +37,7 @@ def test_everyone_starts_with_room(scene):
     _, named, background = scene
     users = [*named, *(user for user in background if not user.walks)]
     poses = np.array([[value[()] for value in user.path.at(user.start)[:3]] for user in users])
-    size = np.array([user.body.size[:2] for user in users])
-    assert touching_pairs(poses[None], size, 0.5) == []
+    assert touching_pairs(poses[None], np.array([user.body.size[:2] for user in users]), 0.5) == []
 
 
 def test_nobody_starts_between_the_named_ones_and_the_junction(scene):
@@ -76,5 +75,4 @@ def test_nobody_parks_where_one_steps_onto_the_road():
     rng, junction = np.random.default_rng(4), Junction(SPEC.road)
     users = [user for user in cast_actors(rng, spec, junction, 6.0).users if user.walks]
     vehicles = parked_vehicles(rng, spec, junction, users)
-    nearest = min(abs(vehicle.pose[0] + 40.0) - vehicle.body.size[0] / 2 for vehicle in vehicles)
-    assert 0.5 < nearest < 8.0
+    assert 0.5 < min(abs(vehicle.pose[0] + 40.0) - vehicle.body.size[0] / 2 for vehicle in vehicles) < 8.0

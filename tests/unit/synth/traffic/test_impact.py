@@ -45,8 +45,7 @@ def last_step(first, second, velocities):
     ],
 )
 def test_the_side_that_is_hit(second, velocities, side):
-    run = last_step((0, 0, 0), second, velocities)
-    assert impact_of(run, (0, 1), SIZE).side == side
+    assert impact_of(last_step((0, 0, 0), second, velocities), (0, 1), SIZE).side == side
 
 
 def test_the_boxes_just_touch_at_its_time():

@@ -88,8 +88,7 @@ def test_nobody_touches_anybody(design, kind):
     for run in runs(design, kind):
         parked = np.array([vehicle.pose for vehicle in run.stage.parked]).reshape(-1, 3)
         size = np.array([vehicle.body.size[:2] for vehicle in run.stage.parked]).reshape(-1, 2)
-        standing = np.broadcast_to(parked, (len(run.time), *parked.shape))
-        poses = np.concatenate([run.poses, standing], axis=1)
+        poses = np.concatenate([run.poses, np.broadcast_to(parked, (len(run.time), *parked.shape))], axis=1)
         assert touching_pairs(poses, np.concatenate([run.size, size]), 0.0) == []
 
 
@@ -114,8 +113,7 @@ def test_nobody_jumps(design, kind):
         assert change.min() >= -HARDEST_BRAKING - 1e-6
         assert change.max() < 3.5
         between = (run.velocities[1:] + run.velocities[:-1]) / 2
-        driving = np.diff(run.poses[:, run.driving, :2], axis=0) / PERIOD - between[:, run.driving]
-        assert np.abs(driving).max() < 0.05
+        assert np.abs(np.diff(run.poses[:, run.driving, :2], axis=0) / PERIOD - between[:, run.driving]).max() < 0.05
 
 
 @over_scenes
@@ -149,8 +147,7 @@ def test_traffic_flows_on(design, kind):
         since, lights = max(len(run.time) - round(5.0 / PERIOD), 0), run.stage.signals
         arms = {row: run.users[row].route.from_arm for row in run.driving}
         free = [row for row in arms if not lights or (lights.state(arms[row], run.time[since::25]) == GREEN).all()]
-        standing = (run.states[since:, free, 3] < 0.3).all(axis=0).sum()
-        assert standing <= 2 + len(free) / 4
+        assert (run.states[since:, free, 3] < 0.3).all(axis=0).sum() <= 2 + len(free) / 4
 
 
 @over_scenes

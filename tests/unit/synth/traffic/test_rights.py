@@ -43,8 +43,7 @@ def test_drivers_wait_for_walkers_but_not_the_reverse_and_walkers_pass_each_othe
 
 
 def test_a_rule_that_is_ignored_does_not_count(driver, walker):
-    users = [driver("south", ignores=("priority",)), driver("west"), walker()]
-    rights = find_rights(users, minor=("south", "north"))
+    rights = find_rights([driver("south", ignores=("priority",)), driver("west"), walker()], minor=("south", "north"))
     assert rights.waits[0].tolist() == [False, False, True]
 
 
@@ -62,8 +61,7 @@ def test_one_who_has_to_wait_lets_the_other_pass(driver, other, before):
     minor = ("west", "east") if other[0] == "north" else ()
     run = simulate(users, begin=0.0, end=12.0, rights=find_rights(users, minor=minor))
     assert not touching_pairs(run.poses, sizes(users), 0.1)
-    along = users[0].path.project(run.poses[-1:, 0, :2])[0][0]
-    assert along > users[0].route.exit_s - 5.0
+    assert users[0].path.project(run.poses[-1:, 0, :2])[0][0] > users[0].route.exit_s - 5.0
     assert run.states[:, 1, 3].min() > 6.0
 
 
@@ -77,8 +75,7 @@ def test_one_on_foot_is_let_over_the_road(driver, walker):
 
 def test_one_on_foot_does_not_step_before_a_car_that_cannot_stop(driver, walker):
     users = [driver("west", before=2.0, speed=10.0), walker(start=(-12.0, -4.3), delay=0.0)]
-    run = simulate(users, begin=0.0, end=4.0, rights=find_rights(users))
-    assert not touching_pairs(run.poses, sizes(users), 0.1)
+    assert not touching_pairs(simulate(users, begin=0.0, end=4.0, rights=find_rights(users)).poses, sizes(users), 0.1)
 
 
 def gap_of_the_first(users, *, held=False):
@@ -104,8 +101,7 @@ def test_it_waits_for_one_who_is_near_and_not_for_one_who_is_far(driver, before,
 
 @pytest.mark.parametrize("held", [False, True])
 def test_it_does_not_wait_for_one_whom_a_red_light_holds(driver, held):
-    users = [driver("south", before=10.0), driver("west", before=25.0)]
-    assert np.isinf(gap_of_the_first(users, held=held)) == held
+    assert np.isinf(gap_of_the_first([driver("south", before=10.0), driver("west", before=25.0)], held=held)) == held
 
 
 @pytest.mark.parametrize(("fastest", "waits"), [(1.2, False), (5.0, True)])

@@ -29,5 +29,4 @@ def test_lanterns_stand_behind_the_kerb_on_both_sides():
     spec = RoadSpec(lanes=2)
     places = np.array([middle(each) for each in lanterns(spec)])
     assert (Junction(spec).ground_map().at(places) == SIDEWALK).all()
-    east = places[places[:, 0] > 30]
-    assert set(np.sign(east[:, 1])) == {-1, 1}
+    assert set(np.sign(places[places[:, 0] > 30][:, 1])) == {-1, 1}

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import FIRST_BUILDING, POLE, ROAD_CODES, SIDEWALK, TREE, Hump, Junction, RoadSpec
@@ -33,8 +34,7 @@ def clear_of_props(world, start, end):
     """Whether the sight from one point to another passes above or beside every block, seen in steps of 5 cm."""
     line = np.linspace(start, end, int(np.linalg.norm(np.subtract(end, start)) / 0.05))[1:-1]
     low, high = world.props.corners.min(axis=1), world.props.corners.max(axis=1)
-    inside = ((line[:, None] > low) & (line[:, None] < high)).all(axis=2)
-    return not inside.any()
+    return not ((line[:, None] > low) & (line[:, None] < high)).all(axis=2).any()
 
 
 def test_nothing_stands_on_the_road_and_no_house_on_the_sidewalk(named):
@@ -122,5 +122,10 @@ def test_a_junction_with_a_hump_lies_level():
     [("four-way", ("west", "east"), "west, south, east, north"), ("three-way", ("west", "north"), "west, south, east")],
 )
 def test_arms_without_a_corner_are_refused(name, between, arms):
-    with pytest.raises(ConfigError, match=f"between: the arms .* no corner in common; choose two neighbours of {arms}"):
-        world_of(name, view="hidden", between=between)
+    assert_refused(
+        (
+            lambda: world_of(name, view="hidden", between=between),
+            ConfigError,
+            f"between: the arms .* no corner in common; choose two neighbours of {arms}",
+        )
+    )
