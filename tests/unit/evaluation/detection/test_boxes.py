@@ -190,6 +190,9 @@ def test_detected_boxes_say_their_frame_and_change_it() -> None:
     moved = DetectedBoxes.from_arrays(*arrays, frame="lidar").transform(SE3.from_yaw(0, (10, 0, 0)), "world")
     assert (moved.boxes.frame, moved.boxes.center.tolist(), moved.scores.tolist()) == ("world", [[11, 2, 3]], [0.9])
     assert (len(moved), moved.scores.flags.writeable) == (1, False)
+    for velocity in ([[3.0, 4.0]], [[3.0, 4.0, 0.0]], None):
+        given = DetectedBoxes.from_arrays(*arrays, frame="lidar", velocity=velocity).boxes.velocity
+        np.testing.assert_array_equal(given, [[math.nan] * 3] if velocity is None else [[3, 4, 0]])
     assert_refused(
         (lambda: DetectedBoxes(boxes=moved.boxes, scores=[0.5, 0.6]), GeometryError, ("scores",)),
         (lambda: DetectedBoxes(boxes=moved.boxes, scores=[math.nan]), GeometryError, ("not all numbers are finite",)),
