@@ -72,7 +72,7 @@ def changed(**switches: object) -> MotionLabelConfig:
 @pytest.mark.parametrize(
     "config",
     [
-        *(config for name, config in PRESETS.items() if name != "fiery"),  # test_fiery_preset.py
+        *(config for name, config in PRESETS.items() if name != "fiery"),  # test_it_draws_as_fierys_class
         MotionLabelConfig(protocol="clean"),
         MotionLabelConfig(agents="single"),
         MotionLabelConfig(agents=("infrastructure", "other_vehicle"), protocol="beverse"),
