@@ -158,9 +158,8 @@ def test_a_siren_prevents_and_costs_the_most_and_silence_nothing(seed: int) -> N
     groups = result.references["always"][GROUP], result.groups[GROUP], result.references["never"][GROUP]
     for setting in SETTINGS:
         figures = [each.right[0.0][setting] for each in groups]
-        avoided, cost = zip(
-            *((each.shares["avoided"], each.braking_seconds_per_minute) for each in figures), strict=True
-        )
+        avoided = [each.shares["avoided"] for each in figures]
+        cost = [each.braking_seconds_per_minute for each in figures]
         assert (avoided, cost) == (sorted(avoided, reverse=True), sorted(cost, reverse=True))
         assert (avoided[-1], cost[-1], figures[-1].shares["unchanged"]) == (0, 0, 1)
 
