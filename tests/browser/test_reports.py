@@ -20,22 +20,21 @@ pytestmark = pytest.mark.slow
 def test_the_page_shows_pictures_replay_and_report(width: int, made_demo: tuple[Path, str], browser: Browser) -> None:
     out, _ = made_demo
     browser.open(out / "index.html", width)
-    assert browser.script("return document.compatMode") == "CSS1Compat"
-    assert browser.script("return document.images.length") == 4
-    assert browser.script("return [...document.images].filter((each) => !each.naturalWidth).length") == 0
-    assert browser.overflowing() == []
-    assert browser.script("return document.documentElement.scrollWidth") <= width
-    frames = browser.driver.find_elements("tag name", "iframe")
+    assert (browser.value("document.compatMode"), browser.value("document.images.length")) == ("CSS1Compat", 4)
+    assert browser.faults() == {}
     titles = []
-    for frame in frames:
+    for frame in browser.driver.find_elements("tag name", "iframe"):
         browser.driver.execute_script("arguments[0].scrollIntoView()", frame)  # the browser loads it when it is near
         browser.driver.switch_to.frame(frame)
-        titles.append(browser.script("return document.title"))
-        assert browser.script("return document.documentElement.scrollWidth <= innerWidth")
+        titles.append(browser.value("document.title").split(":")[0])
+        assert browser.value("document.documentElement.scrollWidth <= innerWidth")
         browser.driver.switch_to.default_content()
-    assert [title.split(":")[0] for title in titles] == ["Accident replay", "DeepAccident evaluation"]
+    assert titles == ["Accident replay", "DeepAccident evaluation"]
     assert browser.complaints() == []
     assert [each for each in browser.requests() if not each.startswith(out.as_uri())] == []
+
+
+OPEN_DETAILS = "document.querySelectorAll('details').forEach((each) => { each.open = true; });"
 
 
 LONG = "a_name_without_any_blank_that_is_much_longer_than_a_telephone_is_wide_" * 3
@@ -61,14 +60,10 @@ def test_a_report_opens_without_a_complaint(
     page = save_report(run, tmp_path)
     for width in (1200, 400):
         browser.open(page, width)
-        browser.script("document.querySelectorAll('details').forEach((each) => { each.open = true; });")
-        assert browser.script("return document.compatMode") == "CSS1Compat"
-        assert browser.script("return [...document.images].filter((each) => !each.naturalWidth).length") == 0
-        assert browser.script("return document.images.length") >= 2
-        assert browser.overflowing() == []
-        assert browser.script("return document.documentElement.scrollWidth") <= width
-        assert browser.complaints() == []
-        assert browser.requests() == [page.as_uri()]
+        browser.script(OPEN_DETAILS)
+        assert (browser.faults(), browser.requests()) == ({}, [page.as_uri()])
+        assert browser.value("document.compatMode") == "CSS1Compat"
+        assert browser.value("document.images.length") >= 2
 
 
 COLUMN = """
@@ -90,27 +85,22 @@ def page(da_b: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_opens_without_a_complaint(page: Path, browser: Browser, scheme: str) -> None:
     for width in (1280, 400):
         browser.open(page, width)
-        browser.script("document.querySelectorAll('details').forEach((each) => { each.open = true; });")
-        assert browser.overflowing() == []
-        assert browser.complaints() == []
-        assert browser.requests() == [page.as_uri()]
-        assert browser.script("return [...document.images].filter((each) => !each.naturalWidth).length") == 0
-    assert browser.scheme() == scheme
+        browser.script(OPEN_DETAILS)
+        assert (browser.faults(), browser.requests(), browser.scheme()) == ({}, [page.as_uri()], scheme)
 
 
 def test_a_click_sorts(page: Path, browser: Browser) -> None:
     browser.open(page, 1280)
-    browser.script(CLICK % "closing")
-    values = [*map(float, browser.script(COLUMN % "closing"))]
-    assert len(values) >= 3
-    assert len(set(values)) > 1
-    assert values == sorted(values)
-    browser.script(CLICK % "closing")
-    assert [*map(float, browser.script(COLUMN % "closing"))] == values[::-1]
-    browser.script(CLICK % "scenario")
-    names = browser.script(COLUMN % "scenario")
-    assert names == sorted(names)
-    assert browser.complaints() == []
+
+    def sorted_by(heading: str) -> list[str]:
+        browser.script(CLICK % heading)
+        return [*browser.script(COLUMN % heading)]
+
+    values, reverse = (list(map(float, sorted_by("closing"))) for _ in range(2))
+    assert (values, reverse) == (sorted(values), values[::-1])
+    assert (len(values) >= 3, len(set(values)) > 1) == (True, True)
+    names = sorted_by("scenario")
+    assert (names, browser.complaints()) == (sorted(names), [])
 
 
 def test_a_link_leads_to_a_replay(page: Path, browser: Browser) -> None:

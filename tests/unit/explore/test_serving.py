@@ -17,7 +17,6 @@ import pytest
 from asking import TinyApp, ask, cookie_of
 from click.testing import CliRunner
 from refusals import assert_refused
-from wording import lacking
 
 import deepaccident_devkit.explore as package
 from deepaccident_devkit.cli import deepaccident
@@ -181,54 +180,55 @@ def test_a_server_that_fails_later_is_an_error(monkeypatch: pytest.MonkeyPatch) 
         assert_refused((served.wait, RuntimeError, ("server failed",)))
 
 
-def lines_of(*, host: str = "127.0.0.1", bound: str = "127.0.0.1", root: str = "") -> list[str]:
-    """What a server there would say."""
-    access = Access(port=9000, root=RootPath.parse(root), token="secret")  # noqa: S106
-    return Served(host, ip_address(bound), access, Mock(), Mock()).lines()
+ELSEWHERE = "warning: anyone who can reach this machine can try to open the pages"
 
 
-@pytest.fixture
-def _node17(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(socket, "gethostname", lambda: "node17")
+OPEN = "the explorer runs until Ctrl-C; open http://{}:9000/?token=secret"
 
 
-@pytest.mark.usefixtures("_node17")
-def test_the_address_and_a_tunnel_are_said() -> None:
-    assert lines_of() == [
-        "the explorer runs until Ctrl-C; open http://127.0.0.1:9000/?token=secret",
-        "from another machine: ssh -L 9000:localhost:9000 node17, and there http://localhost:9000/?token=secret",
-    ]
+TUNNEL = "from another machine: ssh -L 9000:{}:9000 node17, and there http://localhost:9000/?token=secret"
 
 
 @pytest.mark.parametrize(
-    ("root", "line"),
+    ("where", "said"),
     [
-        ("/user/me/proxy/8000/", "on your notebook server or portal: /user/me/proxy/8000/?token=secret"),
-        ("https://hub.example.org/x", "behind the proxy: https://hub.example.org/x/?token=secret"),
-        ("https://hub.example.org", "behind the proxy: https://hub.example.org/?token=secret"),
+        ({}, [OPEN.format("127.0.0.1"), TUNNEL.format("localhost")]),
+        *(
+            ({"root": root}, [OPEN.format("127.0.0.1"), said, TUNNEL.format("localhost")])
+            for root, said in (
+                ("/user/me/proxy/8000/", "on your notebook server or portal: /user/me/proxy/8000/?token=secret"),
+                ("https://hub.example.org/x", "behind the proxy: https://hub.example.org/x/?token=secret"),
+                ("https://hub.example.org", "behind the proxy: https://hub.example.org/?token=secret"),
+            )
+        ),
+        *(
+            (
+                {"host": anywhere, "bound": anywhere},
+                [
+                    ELSEWHERE,
+                    OPEN.format(here),
+                    "on other machines: http://node17:9000/?token=secret",
+                    TUNNEL.format("localhost"),
+                ],
+            )
+            for anywhere, here in ((ANYWHERE, "127.0.0.1"), ("::", "[::1]"))
+        ),
+        *(
+            ({"host": host, "bound": bound}, [ELSEWHERE, OPEN.format(said), TUNNEL.format(said)])
+            for host, bound, said in (
+                ("login1", "192.0.2.1", "login1"),
+                ("2001:db8::1", "2001:db8::1", "[2001:db8::1]"),
+            )
+        ),
     ],
 )
-def test_the_address_behind_a_proxy_is_said(root: str, line: str) -> None:
-    assert lines_of(root=root)[1] == line
-
-
-@pytest.mark.usefixtures("_node17")
-def test_a_server_for_the_network_warns() -> None:
-    warning, address, network, tunnel = lines_of(host=ANYWHERE, bound=ANYWHERE)
-    assert not lacking(warning, "warning: anyone who can reach this machine", "Nothing is encrypted", "SSH tunnel")
-    assert address.endswith("open http://127.0.0.1:9000/?token=secret")
-    assert network == "on other machines: http://node17:9000/?token=secret"
-    assert "ssh -L 9000:localhost:9000 node17," in tunnel
-    assert "open http://[::1]:9000/" in lines_of(host="::", bound="::")[1]
-
-
-@pytest.mark.parametrize(
-    ("host", "bound", "said"), [("login1", "192.0.2.1", "login1"), ("2001:db8::1", "2001:db8::1", "[2001:db8::1]")]
-)
-@pytest.mark.usefixtures("_node17")
-def test_a_host_is_said_as_it_was_given(host: str, bound: str, said: str) -> None:
-    lines = "\n".join(lines_of(host=host, bound=bound))
-    assert not lacking(lines, f"open http://{said}:9000/", f"ssh -L 9000:{said}:9000 node17,")
+def test_the_addresses_are_said(monkeypatch: pytest.MonkeyPatch, where: dict[str, str], said: list[str]) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "node17")
+    access = Access(port=9000, root=RootPath.parse(where.get("root", "")), token="secret")  # noqa: S106
+    bound = ip_address(where.get("bound", "127.0.0.1"))
+    lines = Served(where.get("host", "127.0.0.1"), bound, access, Mock(), Mock()).lines()
+    assert [line[: len(part)] for line, part in zip(lines, said, strict=True)] == said
+    assert ("Nothing is encrypted: prefer an SSH tunnel" in lines[0]) == (said[0] == ELSEWHERE)
 
 
 def test_a_browser_is_opened_with_a_token_for_one_use(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,6 @@ import pytest
 from drawing import texts, title_of, tokens_of
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex
-from numpy.testing import assert_allclose
 from refusals import assert_refused
 from wording import lacking
 
@@ -82,10 +81,10 @@ def test_the_pair_is_where_it_is_and_red(da_motion: DeepAccident) -> None:
         boxes = tracks.at(scenario["num_frames"] - round(left * 10))
         corners, pair = boxes.bottom_corners()[..., :2], np.isin(boxes.actor_id, contact.actor_ids)
         shapes = next(each for each in ax.collections if isinstance(each, PolyCollection))
-        assert_allclose([path.vertices[:4] for path in shapes.get_paths()], corners)
+        np.testing.assert_allclose([path.vertices[:4] for path in shapes.get_paths()], corners)
         assert [to_hex(color) == COLLIDER_COLOR for color in shapes.get_edgecolor()] == pair.tolist()
         crosses = [line for line in ax.lines if line.get_marker() == "x"]
-        assert_allclose(crosses[0].get_xydata(), [contact.point[:2]])
+        np.testing.assert_allclose(crosses[0].get_xydata(), [contact.point[:2]])
         speeds = np.linalg.norm(boxes.velocity[pair], axis=1)
         assert ax.get_title().endswith(f"O {speeds[0]:.1f}, E {speeds[1]:.1f} m/s")
         low, high = ax.viewLim.get_points()
@@ -138,7 +137,7 @@ def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccide
     places = [path.vertices[:4].mean(axis=0) for path, is_red in zip(boxes.get_paths(), red, strict=True) if is_red]
     ids = da.collision(accident).actor_ids
     wanted = [da.track.get(f"{accident}/004/actor/{actor}")["translation"][:2] for actor in ids]
-    assert_allclose(sorted(map(tuple, places)), sorted(map(tuple, wanted)), atol=0.05)
+    np.testing.assert_allclose(sorted(map(tuple, places)), sorted(map(tuple, wanted)), atol=0.05)
 
 
 def test_an_agent_that_is_not_asked_for_has_an_empty_place(da: DeepAccident, accident: str) -> None:

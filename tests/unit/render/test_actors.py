@@ -8,7 +8,6 @@ from drawing import of_kind, texts, tokens_of
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.colors import to_hex
-from numpy.testing import assert_allclose, assert_array_equal
 from wording import lacking
 
 from deepaccident_devkit import DeepAccident
@@ -27,7 +26,7 @@ def test_an_annotation_is_shown_large_from_above_and_in_words(da: DeepAccident, 
     camera, above, words = render_annotation(da, f"{sample}/{row}", margin=8, fig=detached_figure((10, 5))).axes
     assert camera.get_title() == "Camera_Front"
     assert np.ptp(camera.get_xlim()) <= 64
-    assert_allclose(np.mean([above.get_xlim(), above.get_ylim()], axis=1), boxes.center[row, :2], atol=1e-9)
+    np.testing.assert_allclose(np.mean([above.get_xlim(), above.get_ylim()], axis=1), boxes.center[row, :2], atol=1e-9)
     assert np.ptp(above.get_xlim()) == pytest.approx(16)
     length, width, height = boxes.size[row]
     assert not lacking(
@@ -63,9 +62,9 @@ def drawn(da: DeepAccident, instance: str, **how: Any) -> dict[str, Any]:
 def test_the_path_is_where_all_agents_labels_have_the_actor(da: DeepAccident, other: str) -> None:
     path, centers = drawn(da, other)["path"], da.trajectory(other).center[:, :2]
     line, star = of_kind(path, LineCollection)[0], of_kind(path, PathCollection)[0]
-    assert_allclose(line.get_segments(), np.stack([centers[:-1], centers[1:]], axis=1)[::-1, ::-1])
+    np.testing.assert_allclose(line.get_segments(), np.stack([centers[:-1], centers[1:]], axis=1)[::-1, ::-1])
     assert to_hex(line.get_color()[0]) == COLLIDER_COLOR
-    assert_allclose(star.get_offsets(), centers[-1:])
+    np.testing.assert_allclose(star.get_offsets(), centers[-1:])
     assert texts(path) == ["0 s", "impact"]
     low, high = np.array([path.get_xlim(), path.get_ylim()]).T
     assert ((low < centers) & (centers < high)).all()
@@ -75,10 +74,10 @@ def test_the_path_is_where_all_agents_labels_have_the_actor(da: DeepAccident, ot
 def test_speed_and_points_are_drawn_over_time(da: DeepAccident, other: str) -> None:
     panels, track = drawn(da, other), da.trajectory(other)
     speeds = np.linalg.norm(track.velocity, axis=1)
-    assert_allclose(panels["speed"].lines[0].get_xydata(), np.column_stack([track.timestamp, speeds]))
+    np.testing.assert_allclose(panels["speed"].lines[0].get_xydata(), np.column_stack([track.timestamp, speeds]))
     scenario, actor = other.split("/actor/")
     ego = next(line for line in panels["points"].lines if line.get_label() == "ego")
-    assert_array_equal(ego.get_ydata(), sightings(da, scenario, "ego_vehicle", int(actor)).points)
+    np.testing.assert_array_equal(ego.get_ydata(), sightings(da, scenario, "ego_vehicle", int(actor)).points)
     assert to_hex(ego.get_color()) == AGENT_COLORS["ego_vehicle"]
     assert panels["speed"].lines[-1].get_xdata() == [0.5, 0.5]
 
@@ -91,7 +90,7 @@ def test_a_bar_an_agent_says_when_it_sees_the_actor(da: DeepAccident, other: str
         known = sightings(da, scenario, agent, int(actor))
         assert (len(full.get_paths()), len(pale.get_paths())) == (known.seen.sum(), (~known.seen).sum())
         starts = [path.vertices[:, 0].min() for path in full.get_paths()]
-        assert_allclose(starts, known.timestamp[known.seen] - 0.05, atol=1e-9)
+        np.testing.assert_allclose(starts, known.timestamp[known.seen] - 0.05, atol=1e-9)
         assert (full.get_alpha(), pale.get_alpha() < 0.5) == (1, True)
     assert [(one.get_text(), one.get_position()[1]) for one in ax.texts] == [("is the actor itself", 2)]
 

@@ -10,7 +10,6 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.quiver import Quiver
-from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import SE3
@@ -51,9 +50,9 @@ def test_boxes_and_points_are_where_the_sample_has_them(da: DeepAccident, approa
     near = boxes.select((np.abs(boxes.center[:, :2]) < 35).all(axis=1))
     assert set(outlines(ax)) == footprints(near)
     (points,) = of_kind(ax, PathCollection)
-    assert_allclose(points.get_offsets(), cloud[(np.abs(cloud[:, :2]) < 30).all(axis=1), :2])
+    np.testing.assert_allclose(points.get_offsets(), cloud[(np.abs(cloud[:, :2]) < 30).all(axis=1), :2])
     assert to_hex(points.get_facecolor()[0]) == POINT_COLOR
-    assert_allclose([ax.get_xlim(), ax.get_ylim()], [(-30, 30), (-30, 30)], atol=1e-9)
+    np.testing.assert_allclose([ax.get_xlim(), ax.get_ylim()], [(-30, 30), (-30, 30)], atol=1e-9)
     assert plt.get_fignums() == []
 
 
@@ -74,13 +73,13 @@ def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAc
     assert [to_hex(color) for color in marks.get_edgecolor()] == [OWN_COLOR, *[CASING_COLOR] * 4]
     world_from_ego = [da.world_from(f"{scenario}/{agent}/{number}", "ego") for agent in AGENTS]
     tips = [pose.apply([[1.8, 0, 0]])[0, :2] for pose in world_from_ego]
-    assert_allclose([path.vertices[0] for path in marks.get_paths()], tips)
-    assert_allclose([text.xy for text in ax.texts], [pose.translation[:2] for pose in world_from_ego])
+    np.testing.assert_allclose([path.vertices[0] for path in marks.get_paths()], tips)
+    np.testing.assert_allclose([text.xy for text in ax.texts], [pose.translation[:2] for pose in world_from_ego])
     assert texts(ax) == [short_name(agent) for agent in AGENTS]
     entries = legend_words(ax)
     assert entries[:2] == ["colliding pair", "car"]  # agents with a cloud are named once
     assert entries[-5:] == texts(ax)
-    assert_allclose(np.mean([ax.get_xlim(), ax.get_ylim()], axis=1), world_from_ego[0].translation[:2])
+    np.testing.assert_allclose(np.mean([ax.get_xlim(), ax.get_ylim()], axis=1), world_from_ego[0].translation[:2])
 
 
 def test_several_agents_boxes_are_drawn_once_an_actor(da: DeepAccident, approach: str) -> None:
@@ -93,11 +92,11 @@ def test_several_agents_boxes_are_drawn_once_an_actor(da: DeepAccident, approach
 def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAccident, approach: str) -> None:
     both, link = ("ego_vehicle", "infrastructure"), Link(pose_noise=PoseNoise(mean=3.0, std=0.0))
     true, wrong = (render_bev(da, approach, agents=both, link=one, ax=new_axes()) for one in (None, link))
-    assert_allclose(places(true), places(wrong))
+    np.testing.assert_allclose(places(true), places(wrong))
     first, second = places(true, 1), places(wrong, 1)
     assert first.shape != second.shape or np.abs(first - second).max() > 1
     marks = [of_kind(ax, PolyCollection)[-1].get_paths()[1].vertices for ax in (true, wrong)]
-    assert_allclose(marks[0], marks[1])
+    np.testing.assert_allclose(marks[0], marks[1])
 
 
 def test_the_receiver_s_own_box_is_where_it_is_and_the_title_says_what_the_link_does(
@@ -162,7 +161,7 @@ def test_trajectories_fade_from_the_present_to_where_the_actors_were_and_will_be
     for lines, ends in zip(of_kind(ax, LineCollection), ways, strict=True):
         expected, segments = np.stack([ends[:-1], ends[1:]], axis=1), np.array(lines.get_segments())
         start = next(row for row in range(len(segments)) if np.allclose(segments[row], expected[0]))
-        assert_allclose(segments[start : start + len(expected)], expected)
+        np.testing.assert_allclose(segments[start : start + len(expected)], expected)
         opacity = lines.get_color()[start : start + len(expected), 3]
         assert (opacity[0], (np.diff(opacity) < 0).all()) == (1, True)
 

@@ -8,7 +8,6 @@ from drawing import has_color, new_axes, of_kind, on_canvas, rendered
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.quiver import Quiver
-from numpy.testing import assert_allclose
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -97,12 +96,12 @@ def test_a_line_leads_to_the_front_and_each_box_has_its_colour() -> None:
     draw_boxes_from_above(drawn, ax, ["#ff0000", "#00ff00", "#0000ff"], linestyle="dashed", fill=0.5)
     outlines, headings = ax.collections
     assert (type(outlines), type(headings)) == (PolyCollection, LineCollection)
-    assert_allclose(outlines.get_edgecolor(), [[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]])
-    assert_allclose(outlines.get_facecolor()[:, 3], 0.5)
+    np.testing.assert_allclose(outlines.get_edgecolor(), [[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]])
+    np.testing.assert_allclose(outlines.get_facecolor()[:, 3], 0.5)
     assert outlines.get_linestyle()[0][1] is not None
     ahead = np.column_stack([np.cos(drawn.yaw), np.sin(drawn.yaw)]) * drawn.size[:, :1] / 2
     centers = drawn.center[:, :2]
-    assert_allclose(headings.get_segments(), np.stack([centers, centers + ahead], axis=1))
+    np.testing.assert_allclose(headings.get_segments(), np.stack([centers, centers + ahead], axis=1))
 
 
 def test_one_box_is_drawn_in_its_category_s_colour_or_the_one_given() -> None:
@@ -111,7 +110,7 @@ def test_one_box_is_drawn_in_its_category_s_colour_or_the_one_given() -> None:
     assert_refused((lambda: draw_box(ax, box), GeometryError, ("box", "found Axes", "draw_box(box, ax)")))  # type: ignore[arg-type]
     draw_box(box, ax, RED)
     first, second = ax.collections[0], ax.collections[2]
-    assert_allclose(first.get_paths()[0].vertices[:4], box.bottom_corners()[:2].T)
+    np.testing.assert_allclose(first.get_paths()[0].vertices[:4], box.bottom_corners()[:2].T)
     assert [to_hex(each.get_edgecolor()[0]) for each in (first, second)] == [CATEGORY_COLORS["truck"], RED]
 
 
@@ -121,7 +120,7 @@ def test_edges_are_cut_off_before_the_camera() -> None:
     pixels, drawn = segments_in_image(segments, CAMERA)
     assert drawn.tolist() == [True, False, True, True]
     cut = CAMERA.project(np.array([[0, 0.5, NEAREST_DRAWN]]))[0][0]
-    assert_allclose(pixels, [[[200, 150], cut], [[300, 250], [250, 200]], [cut, [200, 150]]])
+    np.testing.assert_allclose(pixels, [[[200, 150], cut], [[300, 250], [250, 200]], [cut, [200, 150]]])
     assert segments[0, 1, 2] == -0.9
 
 
@@ -164,7 +163,7 @@ def test_velocities_are_arrows_of_a_second_where_they_are_known_and_not_zero() -
     ax = new_axes()
     draw_velocities_from_above(boxes(), ax, [RED, "blue", "blue"])
     (arrows,) = of_kind(ax, Quiver)
-    assert_allclose(np.column_stack([arrows.XY, arrows.U, arrows.V]), [[12, -2, 3, 1]])
+    np.testing.assert_allclose(np.column_stack([arrows.XY, arrows.U, arrows.V]), [[12, -2, 3, 1]])
     assert to_hex(arrows.get_facecolor()[0]) == RED
 
 
@@ -184,13 +183,13 @@ def test_velocities_in_an_image_lead_to_where_the_centre_would_be() -> None:
     ax = image_axes()
     draw_velocities_in_image(in_front(boxes()), CAMERA, ax, [RED] * 3)
     places = OPTICAL_FROM_EGO.apply(np.array([[12.0, -2, 0], [15, -1, 0]]))
-    assert_allclose(ax.collections[0].get_segments(), [CAMERA.project(places)[0]])
+    np.testing.assert_allclose(ax.collections[0].get_segments(), [CAMERA.project(places)[0]])
 
 
 def test_a_box_beside_the_camera_is_cut_off_at_the_camera() -> None:
     # 2 m to the right, from 4 m behind the camera to 4 m before it; its front looks at the camera
     both = in_front(Boxes.from_arrays([[0.0, -3, 0], [-9, -3, 0]], [[2.0, 8, 1]] * 2, [np.pi / 2] * 2, frame="ego"))
-    assert_allclose(bounds_in_image(both, CAMERA)[0], [200 + 200 * 2 / 4, 0, 400, 300])
+    np.testing.assert_allclose(bounds_in_image(both, CAMERA)[0], [200 + 200 * 2 / 4, 0, 400, 300])
     ax = new_axes()
     assert draw_boxes_in_image(both, CAMERA, ax, [RED, RED]).tolist() == [True, False]
     (front,) = next(each for each in ax.collections if isinstance(each, PolyCollection)).get_paths()

@@ -9,7 +9,6 @@ from matplotlib import colormaps
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.colors import to_hex
-from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -40,7 +39,7 @@ def corners_of_ego(da: DeepAccident, behind: str) -> Any:
 def test_the_image_fills_the_pixels_of_its_calibration(da: DeepAccident, behind: str) -> None:
     ax = render_sample_data(da, f"{behind}/Camera_Front", ax=new_axes())
     (image,) = ax.images
-    assert_array_equal(image.get_array(), da.load_image(f"{behind}/Camera_Front"))
+    np.testing.assert_array_equal(image.get_array(), da.load_image(f"{behind}/Camera_Front"))
     assert (tuple(image.get_extent()), ax.get_xlim(), ax.get_ylim()) == ((0, 64, 36, 0), (0, 64), (36, 0))
     assert title_of(ax) == "Night, wet cloudy, Town02: the impact, ego vehicle behind, Camera_Front"
     assert plt.get_fignums() == []
@@ -64,7 +63,7 @@ def test_points_have_the_colour_of_their_depth(da: DeepAccident, behind: str) ->
     assert {*map(tuple, shown)} <= {*map(tuple, np.column_stack([points.pixels, points.depth]).tolist())}
     assert len(depths) == points.mask.sum() > 50
     assert (np.diff(depths) <= 0).all()
-    assert_allclose(drawn.get_facecolor(), colormaps[DEPTH_COLORMAP](depths / 50))
+    np.testing.assert_allclose(drawn.get_facecolor(), colormaps[DEPTH_COLORMAP](depths / 50))
 
 
 @pytest.mark.parametrize(("channel", "frame"), [("lidar01", "lidar"), ("BEV_instance_camera", "ego")])
@@ -88,8 +87,8 @@ def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAcc
     height = da.world_from(behind, "ego").inverse().apply(cloud.xyz)[:, 2]
     order = np.flatnonzero(points.mask)[np.argsort(-points.depth[points.mask])]
     assert len(order) > 20
-    assert_allclose(drawn.get_offsets(), points.pixels[order])
-    assert_allclose(drawn.get_array(), height[order])
+    np.testing.assert_allclose(drawn.get_offsets(), points.pixels[order])
+    np.testing.assert_allclose(drawn.get_array(), height[order])
     assert drawn.get_cmap().name == HEIGHT_COLORMAP
     assert title_of(ax).endswith("ego vehicle behind, Camera_Front LiDAR: the impact, infrastructure")
 
@@ -97,7 +96,7 @@ def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAcc
 def test_points_by_depth_are_the_camera_s_own_unless_told(da: DeepAccident, behind: str) -> None:
     ax = render_pointcloud_in_image(da, f"{behind}/Camera_Back", ax=new_axes())
     points = map_pointcloud_to_image(da, f"{behind}/Camera_Back", colors=False)
-    assert_allclose(np.sort(ax.collections[0].get_array()), np.sort(points.depth[points.mask]))
+    np.testing.assert_allclose(np.sort(ax.collections[0].get_array()), np.sort(points.depth[points.mask]))
     assert [one.get_ylabel() for one in ax.figure.axes[1:]] == ["depth (m)"]
 
 
@@ -122,7 +121,7 @@ def test_the_best_view_of_the_vehicle_ahead_is_the_front_camera(da: DeepAccident
     pixels, _ = corners_of_ego(da, behind)
     low, high = pixels.min(axis=0).clip(0, (64, 36)), pixels.max(axis=0).clip(0, (64, 36))
     assert view.camera == f"{behind}/Camera_Front"
-    assert_allclose([*view.bounds, view.area], [*low, *high, np.prod(high - low)])
+    np.testing.assert_allclose([*view.bounds, view.area], [*low, *high, np.prod(high - low)])
 
 
 def test_what_no_camera_sees_has_no_best_view(da: DeepAccident, behind: str) -> None:

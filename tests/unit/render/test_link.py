@@ -7,7 +7,6 @@ import pytest
 from drawing import legend_words, of_kind
 from matplotlib.colors import to_hex
 from matplotlib.quiver import Quiver
-from numpy.testing import assert_allclose
 from wording import lacking
 
 from deepaccident_devkit import DeepAccident
@@ -38,7 +37,9 @@ def test_arrows_are_as_long_as_the_poses_are_off(da_motion: DeepAccident, moving
     (found,) = of_kind(ax, Quiver)
     true = da_motion.cooperative_boxes(moving, agents=["other_vehicle"], frame="ego").center[:, :2]
     assert np.linalg.norm(found.XY[:, None] - true, axis=-1).min(axis=1).max() < 1e-9
-    assert_allclose(np.hypot(found.U, found.V), 0.5, atol=2.5e-3)  # the agents may stand on a slope, 10 % at most
+    np.testing.assert_allclose(
+        np.hypot(found.U, found.V), 0.5, atol=2.5e-3
+    )  # the agents may stand on a slope, 10 % at most
     assert ax.get_title().startswith("other: ")
     assert ax.get_title().endswith("\noff by 0.50 m\n(at most 0.50 m)")
     hues = {to_hex(color) for each in ax.collections for color in each.get_edgecolor()}
@@ -51,7 +52,7 @@ def test_latency_moves_only_what_moves(da_motion: DeepAccident, moving: Any) -> 
     start, end = shared.shifts
     parked = shared.true.actor_id[np.isin(shared.true.actor_id, shared.received.actor_id)] >= 20000
     apart = np.linalg.norm(end - start, axis=1)
-    assert_allclose(apart[parked], 0, atol=1e-6)
+    np.testing.assert_allclose(apart[parked], 0, atol=1e-6)
     assert apart.max() > 1.0
 
 

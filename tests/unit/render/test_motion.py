@@ -9,7 +9,6 @@ from drawing import legend_words, new_axes, of_kind, picture, texts, tokens_of
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.quiver import Quiver
-from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -80,17 +79,17 @@ def test_instances_are_where_they_are_and_have_their_colours() -> None:
     labels = two_cars()
     ax, later = panel(labels, "instance"), panel(labels, "instance", 2)
     car = color_at(ax, 10.2, 5.2)
-    assert_allclose([color_at(ax, 0.2, 0.2), color_at(ax, 5, -10)], [to_rgb(OWN_COLOR), (1, 1, 1)])
+    np.testing.assert_allclose([color_at(ax, 0.2, 0.2), color_at(ax, 5, -10)], [to_rgb(OWN_COLOR), (1, 1, 1)])
     assert not np.allclose(car, 1)
-    assert_allclose(color_at(later, 16.2, 8.2), car)  # the same in all frames
+    np.testing.assert_allclose(color_at(later, 16.2, 8.2), car)  # the same in all frames
     one, both = (panel(labels, "instance", marked=marked) for marked in ({7}, {7, -100}))
-    assert_allclose([color_at(one, 10.2, 5.2), color_at(both, 0.2, 0.2)], [to_rgb(COLLIDER_COLOR)] * 2)
+    np.testing.assert_allclose([color_at(one, 10.2, 5.2), color_at(both, 0.2, 0.2)], [to_rgb(COLLIDER_COLOR)] * 2)
     assert len(both.collections) == 1  # the own box's edge
 
 
 def test_recording_vehicles_have_their_hues_and_others_shades_in_the_picture_and_its_key() -> None:
     ax, key = figure_of(two_cars().to_present(), agents={-100: "ego_vehicle"}, style="trail").axes
-    assert_allclose(color_at(ax, 0.2, 0.2), to_rgb(AGENT_COLORS["ego_vehicle"]))
+    np.testing.assert_allclose(color_at(ax, 0.2, 0.2), to_rgb(AGENT_COLORS["ego_vehicle"]))
     assert to_hex(color_at(ax, 10.2, 5.2)) in INSTANCE_COLORS
     assert legend_words(key) == ["ego", "own box"]
 
@@ -102,7 +101,9 @@ def test_the_flow_says_where_it_ends() -> None:
 def test_arrows_lead_from_instances_to_where_they_are_next() -> None:
     flow, last, offset = panel(two_cars(), "flow"), panel(two_cars(), "flow", 2), panel(two_cars(), "offset")
     (found,) = of_kind(flow, Quiver)
-    assert_allclose(np.column_stack([found.XY, found.U, found.V]), [(0.25, 0.25, 0, 0), (10.25, 5.25, *STEP)])
+    np.testing.assert_allclose(
+        np.column_stack([found.XY, found.U, found.V]), [(0.25, 0.25, 0, 0), (10.25, 5.25, *STEP)]
+    )
     assert of_kind(last, Quiver) + of_kind(offset, Quiver) == []  # nothing is known of what comes after the last
     assert len(np.unique(picture(flow).reshape(-1, 3), axis=0)) == 3  # nothing, no way, a way
 
@@ -115,7 +116,7 @@ def test_forward_is_to_the_right_in_every_orientation(name: str) -> None:
 
     first, *others = (panel(two_cars(replace(CONFIG, orientation=each)), name) for each in ORIENTATIONS)
     for other in others:
-        assert_allclose(picture(other), picture(first))
+        np.testing.assert_allclose(picture(other), picture(first))
         assert other.images[0].get_extent() == first.images[0].get_extent() == [-20, 30, -15, 15]
         assert arrows(other) == arrows(first)
 
@@ -134,7 +135,7 @@ def test_an_empty_road_is_drawn() -> None:
     nobody = FramePolygons(corners=np.zeros((0, 4, 2)), key=np.zeros(0))
     figure = figure_of(labels_from_polygons([nobody] * 3, np.zeros((3, 6)), CONFIG), marked={7})
     figure.canvas.draw()
-    assert_array_equal(picture(figure.axes[0]), 1)
+    np.testing.assert_array_equal(picture(figure.axes[0]), 1)
 
 
 def test_a_sample_of_an_accident(da_motion: DeepAccident) -> None:
@@ -147,7 +148,7 @@ def test_a_sample_of_an_accident(da_motion: DeepAccident) -> None:
     pair = [labels.id_map[OWN_BOX_ID if actor == -100 else actor] for actor in collider_ids(da_motion, sample)]
     assert len(pair) == 2
     red = [np.isclose(picture(ax), to_rgb(COLLIDER_COLOR)).all(axis=-1) for ax in figure.axes[:5]]
-    assert_array_equal(red, np.isin(labels.instance, pair))
+    np.testing.assert_array_equal(red, np.isin(labels.instance, pair))
     own = da_motion.render_motion_labels(sample["token"], at_present=False)  # a new figure
     assert own is not figure
     assert own.get_supxlabel() == "x forward (m), in each frame's own ego frame"
@@ -173,10 +174,10 @@ def test_a_trail_is_opaque_at_the_present_and_paler_after(labels: MotionLabels) 
     ax = draw_motion_trail(instances_of(instance, grid), marked={1}, ax=new_axes())
     opacity = [1, 1, (1 + PALEST) / 2, PALEST]  # the present is on top
     expected = 1 - np.outer(opacity, 1 - np.array(to_rgb(COLLIDER_COLOR)))
-    assert_allclose(picture(ax)[101, [51, 57, 60, 69]], expected)
-    assert_allclose(picture(ax)[90, 51], 1)
+    np.testing.assert_allclose(picture(ax)[101, [51, 57, 60, 69]], expected)
+    np.testing.assert_allclose(picture(ax)[90, 51], 1)
     (path,) = next(each for each in ax.collections if isinstance(each, LineCollection)).get_segments()
-    assert_allclose(path, [(-50 + 0.5 * (column + 4), 1.0) for column in columns])
+    np.testing.assert_allclose(path, [(-50 + 0.5 * (column + 4), 1.0) for column in columns])
     none = draw_motion_trail(instances_of(instance, grid), layers=["ids"], ax=new_axes())
     assert (len(none.images), texts(none)) == (0, ["1"])
 
@@ -186,10 +187,10 @@ def test_outputs_are_drawn_as_they_lie(labels: MotionLabels, orientation: Any) -
     heads = MotionHeads.from_labels(labels).in_orientation(orientation)
     output = MotionOutput(grid=labels.config.grid.with_orientation(orientation), heads=(heads,))
     shown = picture(draw_motion_map(output, "instance", 0, ax=new_axes()))
-    assert_array_equal((shown != 1).any(axis=-1), labels.segmentation[0] == 1)
+    np.testing.assert_array_equal((shown != 1).any(axis=-1), labels.segmentation[0] == 1)
     for name in ("offset", "flow"):
         mine, true = (picture(draw_motion_map(each, name, 0, ax=new_axes())) for each in (output, labels))
-        assert_allclose(mine, true, atol=1e-6)
+        np.testing.assert_allclose(mine, true, atol=1e-6)
 
 
 def test_outputs_have_the_rows_that_they_have(labels: MotionLabels) -> None:

@@ -8,7 +8,6 @@ from drawing import legend_words, of_kind, picture
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_hex
-from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, render_calibration, render_frame, render_sample
@@ -44,7 +43,7 @@ def test_a_frame_shows_its_agents_in_their_order(da: DeepAccident, frame: str) -
     assert titles(fig)[:5] == list(AGENTS)
     scenario = frame.rsplit("/", 1)[0]
     for ax in fig.axes[:5]:
-        assert_array_equal(picture(ax), da.load_image(f"{scenario}/{ax.get_title()}/004/Camera_Front"))
+        np.testing.assert_array_equal(picture(ax), da.load_image(f"{scenario}/{ax.get_title()}/004/Camera_Front"))
     for ax in fig.axes[5:]:
         assert {COLLIDER_COLOR, *(AGENT_COLORS[AGENTS[each]] for each in (1, 3))} <= edges(ax)
     assert "0.2 s to the impact" in fig.get_suptitle()
@@ -128,7 +127,7 @@ def test_a_sample_shows_six_cameras_as_they_look_and_the_view_from_above(da: Dee
         assert left.x1 <= middle.x0 < middle.x1 <= right.x0 < right.x1 < panels[""].x0
     assert panels["Camera_Back"].y1 < panels["Camera_Front"].y0
     for ax in (ax for ax in fig.axes if ax.get_title()):
-        assert_array_equal(picture(ax), da.load_image(f"{sample['token']}/{ax.get_title()}"))
+        np.testing.assert_array_equal(picture(ax), da.load_image(f"{sample['token']}/{ax.get_title()}"))
 
 
 @pytest.mark.slow
@@ -153,7 +152,7 @@ def test_of_a_sample_all_agents_points_are_in_its_six_cameras(da: DeepAccident, 
     for ax, (agent, cloud) in ((ax, each) for ax in fig.axes for each in zip(AGENTS, range(5), strict=True)):
         camera, sample = f"{calibrated}/{ax.get_title()}", f"{scenario}/{agent}/{number}"
         points, shown = map_pointcloud_to_image(da, camera, sample, colors=False), of_kind(ax, PathCollection)[cloud]
-        assert_allclose(np.reshape(shown.get_offsets(), (-1, 2)), points.pixels[points.mask], atol=1e-6)
+        np.testing.assert_allclose(np.reshape(shown.get_offsets(), (-1, 2)), points.pixels[points.mask], atol=1e-6)
         assert {to_hex(color) for color in shown.get_facecolor()} <= {AGENT_COLORS[agent]}
     assert [len(ax.images) for ax in fig.axes] == [1] * 6
     assert (legend_words(fig)[::4], plt.get_fignums()) == (["ego", "infrastructure"], [])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from drawing import legend_words, texts
 from matplotlib.colors import to_hex, to_rgba
-from numpy.testing import assert_allclose, assert_array_equal
 from wording import lacking
 
 from deepaccident_devkit import DeepAccident
@@ -49,7 +48,7 @@ def test_dots_are_at_who_is_visible_by_the_rule(hidden: DeepAccident) -> None:
         seen = hidden.visible_instances(f"{scenario}/{agent}/010", agents=[agent])
         known = boxes.select(np.isin(boxes.actor_id, [int(token.rsplit("/", 1)[1]) for token in seen]))
         tops = known.bottom_corners()[..., 1].max(axis=1)
-        assert_allclose(dots(ax)[agent], np.column_stack([known.center[:, 0], tops]))
+        np.testing.assert_allclose(dots(ax)[agent], np.column_stack([known.center[:, 0], tops]))
     (other,) = (each for each in ax.collections if each.get_label() == AGENTS[2])
     assert to_hex(other.get_facecolor()[0]) == AGENT_COLORS[AGENTS[2]]
 
@@ -61,7 +60,7 @@ def test_a_dot_is_drawn_right_above_its_actor(hidden: DeepAccident) -> None:
     (drawn,) = (each for each in ax.collections if each.get_label() == "ego_vehicle")
     centers = ax.transData.transform(drawn.get_offsets())
     moved = drawn.get_offset_transform().transform(drawn.get_offsets())
-    assert_allclose(moved - centers, np.tile([0, 5 / 72 * ax.figure.dpi], (len(centers), 1)), atol=0.01)
+    np.testing.assert_allclose(moved - centers, np.tile([0, 5 / 72 * ax.figure.dpi], (len(centers), 1)), atol=0.01)
 
 
 def test_the_hidden_collider_stands_out(hidden: DeepAccident) -> None:
@@ -88,7 +87,7 @@ def test_frames_agents_and_layers_are_the_callers(hidden: DeepAccident) -> None:
     assert visibility_of(hidden, token).sample.endswith("ego_vehicle/010")  # the first agent there
     bare, wide = panel(hidden, token, layers=["ids"]), panel(hidden, token, view_range=12.0)
     assert (dots(bare), len(bare.texts)) == ({}, len(visibility_of(hidden, token).boxes))
-    assert_allclose(np.diff([wide.get_xlim(), wide.get_ylim()]), 24.0)
+    np.testing.assert_allclose(np.diff([wide.get_xlim(), wide.get_ylim()]), 24.0)
 
 
 def test_the_matrix_has_a_cell_for_each_actor_and_agent(hidden: DeepAccident) -> None:
@@ -103,7 +102,7 @@ def test_the_matrix_has_a_cell_for_each_actor_and_agent(hidden: DeepAccident) ->
         full[row, column] = to_rgba(each.get_facecolor())[3] > 0
     rows = [known.boxes.actor_id.tolist().index(actor) for actor in actors]
     order = [known.agents.index(agent) for agent in AGENTS]
-    assert_array_equal(full, known.seen[np.ix_(rows, order)])
+    np.testing.assert_array_equal(full, known.seen[np.ix_(rows, order)])
     assert not lacking(ax.get_xlabel(), "0: none", "–: not in the agent's label")
     assert texts(ax).count("itself") == 4  # the pole has no body
 
@@ -119,7 +118,9 @@ def test_two_that_see_each_other_have_two_lines_and_the_legend_says_what_marks_m
     lines = lines_of(ax)
     ways = {to_hex(color): line for color, line in zip(lines.get_colors(), lines.get_segments(), strict=True)}
     out, back = ways[AGENT_COLORS["ego_vehicle"]], ways[AGENT_COLORS["other_vehicle"]]
-    assert_allclose(out[1] - out[0], back[0] - back[1], atol=0.5)  # a car's box is about its agent, not at it
+    np.testing.assert_allclose(
+        out[1] - out[0], back[0] - back[1], atol=0.5
+    )  # a car's box is about its agent, not at it
     assert 0.3 < np.linalg.norm(out[0] - back[1]) < 2  # side by side
     assert not lacking(legend_words(ax), "an agent", "whose view: ego", "sees one of the pair", "colliding pair")
 

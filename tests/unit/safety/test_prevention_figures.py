@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 from drawing import new_axes, words
-from numpy.testing import assert_allclose, assert_array_equal
 from wording import lacking
 
 from deepaccident_devkit.evaluation.warning import PreventedResult, PreventionCurve, PreventionFigures
@@ -54,8 +53,8 @@ def test_lines_are_the_curves_and_points_the_predictors() -> None:
     avoided, nominal = result.curves[GROUP].avoided, SETTINGS.index(NOMINAL)
     lines = {line.get_label(): line for line in ax.lines}
     at = lines[f"at {NOMINAL}"]
-    assert_array_equal(at.get_xydata(), np.column_stack([[0, 0.5, 20], avoided[:, nominal]]))
-    assert_allclose(lines["or milder"].get_ydata(), 1.2 * avoided[:, nominal])
+    np.testing.assert_array_equal(at.get_xydata(), np.column_stack([[0, 0.5, 20], avoided[:, nominal]]))
+    np.testing.assert_allclose(lines["or milder"].get_ydata(), 1.2 * avoided[:, nominal])
     drawn = [np.asarray(line.get_ydata()).tolist() for line in ax.lines]
     assert not lacking(drawn, *avoided.T.tolist())
     points = [tuple(line.get_xydata()[0]) for line in ax.lines if line.get_marker() == "o"]

@@ -3,8 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from drawing import new_axes
-from numpy.testing import assert_allclose, assert_array_equal
+from drawing import new_axes, texts
+from matplotlib.colors import to_hex
+from numpy.testing import assert_array_equal
 from picture_texts import text_faults
 
 from deepaccident_devkit.evaluation import DetectionEvaluator, Resampling
@@ -17,41 +18,27 @@ from deepaccident_devkit.render.styles import AGENT_COLORS
 
 
 def test_breakdowns_have_a_bar_and_an_interval_a_group(detected: DetectionResult) -> None:
-    group = Group(
-        value="infrastructure",
-        result=detected,
-        samples=5,
-        scenarios=2,
-        clusters=2,
-        notes=(),
-        intervals={"mean_average_precision": (40.0, 50.0)},
-    )
-    single = Group(
-        value=None,
-        result=DetectionEvaluator("paper").compute(),
-        samples=1,
-        scenarios=1,
-        clusters=1,
-        intervals={},
-        notes=(),
-    )
-    broken = Breakdown(by="agent", groups=(group, single), without_infrastructure=(), resampling=Resampling())
+    def group(value: str | None, result: Any, samples: int, **intervals: tuple[float, float]) -> Group[Any]:
+        counts = {"samples": samples, "scenarios": samples // 2 or 1, "clusters": samples // 2 or 1}
+        return Group(value=value, result=result, notes=(), intervals=intervals, **counts)
+
+    known = group("infrastructure", detected, 5, mean_average_precision=(40.0, 50.0))
+    groups = (known, group(None, DetectionEvaluator("paper").compute(), 1))
+    broken = Breakdown(by="agent", groups=groups, without_infrastructure=(), resampling=Resampling())
     ax = render_breakdown("detection", broken, "mean_average_precision", ax=new_axes())
     (bar,) = ax.patches
-    assert bar.get_width() == 43.75
-    assert_allclose(
-        bar.get_facecolor()[:3], [int(AGENT_COLORS["infrastructure"][at : at + 2], 16) / 255 for at in (1, 3, 5)]
-    )
+    assert (bar.get_width(), to_hex(bar.get_facecolor())) == (43.75, AGENT_COLORS["infrastructure"])
     assert_array_equal(ax.lines[0].get_xdata(), (40, 50))
-    assert [text.get_text() for text in ax.texts] == ["43.75 %", "–"]
-    assert [label.get_text() for label in ax.get_yticklabels()] == [
-        "infrastructure\n5 samples, 2 scen.",
-        "not known\n1 sample, 1 scen.",
-    ]
-    assert ax.get_xlabel() == "mAP (%)"
+    assert (texts(ax), ax.get_xlabel()) == (["43.75 %", "–"], "mAP (%)")
+    named = [label.get_text() for label in ax.get_yticklabels()]
+    assert named == ["infrastructure\n5 samples, 2 scen.", "not known\n1 sample, 1 scen."]
 
 
 SIZE = (7.2, 5.0)
+
+
+PLACES = [(-0.1, 0), (0.6, 0), (0.25, 0), (0.25, 1)]
+"""Of the whisker's ends, its dot and one without a whisker."""
 
 
 def compared(name: str, **changes: Any) -> ComparedNumber:
@@ -77,15 +64,13 @@ def test_a_number_is_at_its_difference() -> None:
         compared("other", headline=None),
         compared("unknown", b=None, difference=None),
     )
-    fig = render_comparison(comparison(*numbers), fig=detached_figure(SIZE))
-    shares, metres = fig.axes
+    shares, metres = render_comparison(comparison(*numbers), fig=detached_figure(SIZE)).axes
     assert [label.get_text() for label in shares.get_yticklabels()] == ["apa\n0.500 → 0.750", "recall\n0.500 → 0.750"]
-    assert [text.get_text() for text in (*shares.texts, *metres.texts)] == ["+0.250", "+0.250", "−0.500, b is better"]
+    assert (texts(shares), texts(metres)) == (["+0.250", "+0.250"], ["−0.500, b is better"])
     _, whisker, dot, alone = shares.lines
-    assert_array_equal(whisker.get_xydata(), [(-0.1, 0), (0.6, 0)])
-    assert_array_equal([dot.get_xydata()[0], alone.get_xydata()[0]], [(0.25, 0), (0.25, 1)])
+    assert_array_equal([*whisker.get_xydata(), *dot.get_xydata(), *alone.get_xydata()], PLACES)
     assert dot.get_markerfacecolor() == "white" != metres.lines[-1].get_markerfacecolor()
-    assert [ax.get_xlabel() for ax in fig.axes] == ["b − a", "b − a (m)"]
+    assert (shares.get_xlabel(), metres.get_xlabel()) == ("b − a", "b − a (m)")
 
 
 def test_no_words_are_cut_and_partial_runs_are_marked() -> None:

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from drawing import legend_words, new_axes, words
-from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 from wording import lacking
 
@@ -51,10 +50,10 @@ def boxes() -> AccidentEvaluator:
 def test_the_accuracy_curve_goes_through_the_official_points() -> None:
     evaluator = boxes()
     result, curve = evaluator.compute(), accuracy_by_distance(evaluator, np.array([0.0, 5, 10, 15]))
-    assert_array_equal(curve, [0, *(each.accuracy for each in result.within.values())])
+    np.testing.assert_array_equal(curve, [0, *(each.accuracy for each in result.within.values())])
     ax = render_accuracy(evaluator, ax=new_axes())
     x, y = ax.lines[0].get_data()
-    assert_array_equal(y[np.isin(x, (5, 10, 15))], curve[1:])
+    np.testing.assert_array_equal(y[np.isin(x, (5, 10, 15))], curve[1:])
     assert not lacking(words(ax), f"APA {result.apa:.3f}", f"{result.within[10].accuracy:.3f}")
 
 
@@ -70,9 +69,11 @@ def test_the_area_under_the_alarms_is_the_average_precision() -> None:
     evaluator = boxes()
     result, (recall, precision) = evaluator.compute(), alarm_precision_recall(evaluator)
     area = np.sum(np.diff(recall, prepend=0) * precision)
-    assert_allclose([area, recall[-1], precision[-1]], [result.average_precision, result.recall, result.precision])
+    np.testing.assert_allclose(
+        [area, recall[-1], precision[-1]], [result.average_precision, result.recall, result.precision]
+    )
     ax = render_alarms(evaluator, ax=new_axes())
-    assert_array_equal(ax.lines[0].get_xydata(), np.column_stack([recall, precision]))
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), np.column_stack([recall, precision]))
     assert "no alarms" in words(render_alarms(AccidentEvaluator("paper"), ax=new_axes()))
 
 
@@ -94,7 +95,7 @@ def test_errors_are_counted() -> None:
 
 def test_precision_is_drawn_up_to_the_recall_that_is_reached(detected: DetectionResult) -> None:
     ax, nobody = (render_precision_recall(detected, name, ax=new_axes()) for name in ("car", "truck"))
-    assert_array_equal(ax.lines[0].get_xydata(), [(0.25, 1), (0.5, 0.5), (0.75, 0.5)])
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), [(0.25, 1), (0.5, 0.5), (0.75, 0.5)])
     assert (legend_words(ax), words(ax)) == (["0.5: AP 50.0 %", "2: AP 75.0 %"], "car: 8 true, 9 detected")
     assert (len(nobody.lines), "none in the truth" in words(nobody)) == (0, True)
     assert_refused(
@@ -122,7 +123,7 @@ def moving() -> MotionEvaluator:
 
 def test_motion_is_drawn_by_frame() -> None:
     ax = render_quality_by_time(moving(), ax=new_axes())
-    assert_allclose(ax.lines[0].get_xydata(), [(0, 80), (0.5, 40)])
+    np.testing.assert_allclose(ax.lines[0].get_xydata(), [(0, 80), (0.5, 40)])
     assert np.isnan(ax.lines[1].get_ydata()).all()
     assert "nothing to count" in words(render_quality_by_time(MotionEvaluator(), ax=new_axes()))
 

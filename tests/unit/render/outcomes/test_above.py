@@ -8,7 +8,6 @@ import pytest
 from drawing import new_axes, picture, rendered, title_of
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex, to_rgb
-from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import (
@@ -86,8 +85,8 @@ def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sampl
         to_hex(each.get_edgecolor()[0]): [path.vertices[:4].mean(axis=0) for path in each.get_paths()]
         for each in shapes
     }
-    assert_allclose(centers[OUTCOME_COLORS["false"]], [(20, -45)])
-    assert_allclose(centers[OUTCOME_COLORS["missed"]], truth.center[:2, :2], atol=1e-6)
+    np.testing.assert_allclose(centers[OUTCOME_COLORS["false"]], [(20, -45)])
+    np.testing.assert_allclose(centers[OUTCOME_COLORS["missed"]], truth.center[:2, :2], atol=1e-6)
     assert len(centers[OUTCOME_COLORS["right"]]) == len(some)
     assert ax.get_title() == f"at 2 m: {len(some)} TP, 1 FP, 2 FN;\ncentres off by 0.30 m on average"
     boxes = detected.boxes.transform(da_motion.ego_from(sample, "lidar01"), "ego")
@@ -125,8 +124,8 @@ def test_motion_outcomes_are_those_that_are_counted(da_motion: DeepAccident, sam
     assert right.get_title().endswith(f"{counted.true_positive} right, {counted.false_positive} false")
     assert f"PQ {counted.pq:.1f} %" in title_of(figure)
     missed = picture(left)[labels.instance[0] == 3]
-    assert_allclose(missed, np.tile(to_rgb(OUTCOME_COLORS["missed"]), (len(missed), 1)))
-    assert_allclose(picture(right)[4, 4], to_rgb(OUTCOME_COLORS["false"]))
+    np.testing.assert_allclose(missed, np.tile(to_rgb(OUTCOME_COLORS["missed"]), (len(missed), 1)))
+    np.testing.assert_allclose(picture(right)[4, 4], to_rgb(OUTCOME_COLORS["false"]))
 
 
 def test_what_lies_beyond_the_range_is_not_judged(labels: MotionLabels, monkeypatch: pytest.MonkeyPatch) -> None:

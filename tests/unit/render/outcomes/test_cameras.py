@@ -10,7 +10,6 @@ import pytest
 from drawing import has_color, legend_words, new_axes, of_kind, on_canvas, rendered, texts, title_of, words
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgba
-from numpy.testing import assert_allclose
 from picture_texts import text_faults
 from wording import lacking
 
@@ -178,7 +177,9 @@ def test_cells_are_polygons_on_the_ground(da_motion: DeepAccident, sample: str, 
         ground = on_the_ground(da_motion, sample, "Camera_Front", corners_of(rectangle))
         corners, _ = camera_of(da_motion, f"{sample}/Camera_Front").project(ground)
         assert gaps(corners, [line]).max() < 1e-6
-        assert_allclose([line[:, 1].min(), line[:, 1].max()], [corners[:, 1].min(), corners[:, 1].max()], atol=1e-6)
+        np.testing.assert_allclose(
+            [line[:, 1].min(), line[:, 1].max()], [corners[:, 1].min(), corners[:, 1].max()], atol=1e-6
+        )
         shapes = [each for each in ax.collections if isinstance(each, PolyCollection) and len(each.get_paths())]
         (filled,) = [each for each in shapes if to_hex(each.get_facecolor()[0]) == color]
         assert filled.get_paths()[0].contains_point(corners.mean(axis=0))
@@ -194,7 +195,7 @@ def test_cells_behind_the_camera_are_cut_off(da_motion: DeepAccident, sample: st
     assert (near[:, 2] < 0).all()
     share = (NEAREST_DRAWN - near[:, 2:]) / (far - near)[:, 2:]
     pixels, depth = lens.project(np.concatenate([near + share * (far - near), far]))
-    assert_allclose(depth[:2], NEAREST_DRAWN)
+    np.testing.assert_allclose(depth[:2], NEAREST_DRAWN)
     assert gaps(pixels, [line]).max() < 1e-6
     assert pixels[:2, 1].min() > 5 * lens.height
 
@@ -248,13 +249,13 @@ def test_places_of_accidents_are_on_the_ground(da: DeepAccident, approach: str, 
     lines = lines_in(ax, COLLIDER_COLOR)
     rings = [grounded(line) for line in lines if len(line) > 4]
     for ring, place in zip(rings, true.positions, strict=True):
-        assert_allclose(np.linalg.norm(ring - place, axis=1), 1.0)
-        assert_allclose(ring.min(axis=0), place - 1)
+        np.testing.assert_allclose(np.linalg.norm(ring - place, axis=1), 1.0)
+        np.testing.assert_allclose(ring.min(axis=0), place - 1)
     joined = [grounded(line) for line in lines if len(line) == 2 and abs(line[0, 0] - line[1, 0]) > 0.5]
-    assert_allclose(joined[0], true.positions)
+    np.testing.assert_allclose(joined[0], true.positions)
     crosses = np.array([grounded(line) for line in lines_in(ax, FORESEEN_COLOR) if len(line) == 2][-4:])
-    assert_allclose(crosses.mean(axis=1), np.repeat(alarm.positions, 2, axis=0), atol=1e-9)
-    assert_allclose(np.linalg.norm(np.diff(crosses, axis=1), axis=-1), 2.0)
+    np.testing.assert_allclose(crosses.mean(axis=1), np.repeat(alarm.positions, 2, axis=0), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(crosses, axis=1), axis=-1), 2.0)
     tops = on_the_ground(da, sample, "Camera_Front", alarm.positions, ground + 1.5)
     assert gaps(lens.project(tops)[0], lines_in(ax, FORESEEN_COLOR)).max() < 1e-6
 
@@ -266,7 +267,7 @@ def test_words_stand_between_the_places_that_are_seen(da: DeepAccident, approach
     front, back = (in_camera(da, verdict, channel, size=(8, 4.5)) for channel in ("Camera_Front", "Camera_Back"))
     assert (texts(front), texts(back)) == (["in 1.2 s, score 0.8"], ["in 0.7 s, score 0.3"])
     places = on_the_ground(da, approach, "Camera_Front", alarm.positions[:1])
-    assert_allclose(front.texts[0].xy, camera_of(da, f"{approach}/Camera_Front").project(places)[0][0])
+    np.testing.assert_allclose(front.texts[0].xy, camera_of(da, f"{approach}/Camera_Front").project(places)[0][0])
     for ax in (front, back):
         rendered(ax)
         assert ax.texts[0].get_visible()

@@ -10,7 +10,6 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.contour import ContourSet
-from numpy.testing import assert_allclose
 from picture_texts import text_faults
 from refusals import assert_refused
 
@@ -52,7 +51,9 @@ def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample
     assert title_of(figure).endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
     assert right.get_title() == f"an accident comes in {true.time:.1f} s;\nforeseen 6.0 m off in sum, +0.5 s"
     assert (texts(left), texts(right)) == ([], [f"in {near.time:.1f} s, score 0.9", "3.0 m", "3.0 m"])
-    assert_allclose([left.lines[0].get_xydata(), right.lines[1].get_xydata()], [true.positions, near.positions])
+    np.testing.assert_allclose(
+        [left.lines[0].get_xydata(), right.lines[1].get_xydata()], [true.positions, near.positions]
+    )
     assert left.get_xlim() == right.get_xlim()
     assert title_of(silent).endswith("5 m: FN, 10 m: FN, 15 m: FN")
     assert silent.axes[1].get_title().endswith("none is foreseen")
@@ -75,9 +76,9 @@ def test_motion_is_seen_as_accidents_by_every_protocol(
     compared = compared_accidents(output, labels, context, PROTOCOLS[protocol])
     marks = [(line.get_marker(), line.get_xydata()) for ax in figure.axes for line in ax.lines]
     drawn = {marker: [places for each, places in marks if each == marker] for marker in ("o", "x")}
-    assert_allclose(drawn["o"], 2 * [compared.true.positions] if compared.true else [])
+    np.testing.assert_allclose(drawn["o"], 2 * [compared.true.positions] if compared.true else [])
     (predicted,) = compared.predicted
-    assert_allclose(drawn["x"], [predicted.positions])
+    np.testing.assert_allclose(drawn["x"], [predicted.positions])
 
 
 def test_the_pair_that_collides_is_red_in_every_task(
@@ -175,6 +176,6 @@ def test_detections_are_judged_in_the_frame_of_the_protocol(da_motion: DeepAccid
     verdict = sample_verdict(da_motion, sample, given, protocol="paper")
     assert isinstance(verdict, DetectionVerdict)
     assert verdict.detected.boxes.frame == verdict.rules.frame == truth.frame
-    assert_allclose(verdict.detected.boxes.center, truth.center, atol=1e-6)
+    np.testing.assert_allclose(verdict.detected.boxes.center, truth.center, atol=1e-6)
     assert verdict.matches.detection.tolist() == verdict.matches.truth.tolist()
     assert len(verdict.matches.truth) > 5

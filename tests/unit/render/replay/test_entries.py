@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from refusals import assert_refused
 from replay_page import accident, data_of, normal
 from wording import lacking
@@ -37,10 +36,12 @@ def test_actors_are_where_their_tracks_say(da: DeepAccident, data: dict[str, Any
         assert shown == tracks.index[rows].tolist()
         assert actor["title"].startswith(f"{boxes.category_names[0]} {actor['id']}")
         places = np.column_stack([states[:, :2] / 100 + origin, states[:, 4] / 100])
-        assert_allclose(places, boxes.center, atol=0.00501)
-        assert_allclose(states[:, 2] / 1000, boxes.yaw, atol=0.000501)
-        assert_allclose([actor[side] / 100 for side in ("length", "width", "height")], boxes.size[0], atol=0.00501)
-        assert_allclose(states[:, 5:] / 1000, quaternions.to_matrix(boxes.rotation)[:, :2, 2], atol=0.000501)
+        np.testing.assert_allclose(places, boxes.center, atol=0.00501)
+        np.testing.assert_allclose(states[:, 2] / 1000, boxes.yaw, atol=0.000501)
+        np.testing.assert_allclose(
+            [actor[side] / 100 for side in ("length", "width", "height")], boxes.size[0], atol=0.00501
+        )
+        np.testing.assert_allclose(states[:, 5:] / 1000, quaternions.to_matrix(boxes.rotation)[:, :2, 2], atol=0.000501)
 
 
 def test_agents_are_where_they_drive(da: DeepAccident, data: dict[str, Any]) -> None:
@@ -51,7 +52,7 @@ def test_agents_are_where_they_drive(da: DeepAccident, data: dict[str, Any]) -> 
     for agent in data["agents"]:
         for frame, (x, y, yaw, *_) in enumerate(agent["poses"], 1):
             there = da.world_from(f"{scenario}/{agent['name']}/{frame:03d}", "ego")
-            assert_allclose(np.array([x, y]) / 100 + origin, there.translation[:2], atol=0.00501)
+            np.testing.assert_allclose(np.array([x, y]) / 100 + origin, there.translation[:2], atol=0.00501)
             assert yaw / 1000 == pytest.approx(math.atan2(there.matrix[1, 0], there.matrix[0, 0]), abs=0.000501)
 
 
@@ -85,13 +86,13 @@ def test_cameras_are_where_they_record(da: DeepAccident, data: dict[str, Any]) -
         for camera, (frame, pose) in ((each, at) for each in cameras for at in enumerate(each["poses"], 1)):
             sample, channel = f"{scenario}/{agent}/{frame:03d}", f"Camera_{camera['title']}"
             lens, there = da.camera(sample, channel), da.world_from(sample, channel)
-            assert_allclose(np.array(pose[:3]) / 100 + origin, there.translation, atol=0.00501)
+            np.testing.assert_allclose(np.array(pose[:3]) / 100 + origin, there.translation, atol=0.00501)
             turned = quaternions.to_matrix(np.array(pose[3:]) / 10_000) @ ahead[0]
-            assert_allclose(turned, there.rotation @ ahead[0], atol=0.01)
+            np.testing.assert_allclose(turned, there.rotation @ ahead[0], atol=0.01)
             width, height, fx, fy, cx, cy = camera["lens"]
             assert (width, height) == (lens.width, lens.height)
             pixel = np.array([fx, fy]) * ahead[0, :2] / ahead[0, 2] + [cx, cy]
-            assert_allclose([pixel], lens.project(ahead)[0], atol=0.01)
+            np.testing.assert_allclose([pixel], lens.project(ahead)[0], atol=0.01)
 
 
 def test_the_countdown_ends_at_the_impact(da: DeepAccident, data: dict[str, Any]) -> None:
@@ -99,7 +100,7 @@ def test_the_countdown_ends_at_the_impact(da: DeepAccident, data: dict[str, Any]
     contact, collision = da.collision(scenario), scenario["collision"]
     assert data["countdown"] == [0.5, 0.4, 0.3, 0.2, 0.1, 0.0]
     origin = recording_of(da, scenario["token"], None).origin
-    assert_allclose(np.array(data["impact"]) / 100 + origin, contact.point[:2], atol=0.00501)
+    np.testing.assert_allclose(np.array(data["impact"]) / 100 + origin, contact.point[:2], atol=0.00501)
     pair = zip(collision["classes"], collision["ids"], collision["agents"], strict=True)
     first, second = (f"{kind} {actor} ({agent.removesuffix('_vehicle')})" for kind, actor, agent in pair)
     facts = dict(data["facts"])
@@ -156,7 +157,7 @@ def test_each_sample_has_its_verdict(
     assert (len(others), many["more"], "names an unknown actor" in unknown["text"]) == (2, 1, True)
     # the foreseen places are those of the pair at the end, in the page's own ground: centimetres; a slope takes a few
     pair = [actor["states"][-1][:2] for actor in data["actors"] if actor["role"] == "pair"]
-    assert_allclose(sorted(hit["places"]), sorted(pair), atol=8)
+    np.testing.assert_allclose(sorted(hit["places"]), sorted(pair), atol=8)
 
 
 def test_alarms_without_an_accident_are_false_or_not_judged(da_motion: DeepAccident, tmp_path: Path) -> None:
