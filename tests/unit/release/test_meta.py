@@ -55,14 +55,12 @@ ACCIDENT_META = Meta(
 )
 
 
-def test_the_real_accident(write) -> None:
-    assert read_meta(write(ACCIDENT)) == ACCIDENT_META
+QUIET_META = Meta(weather="Clear", time_of_day="Noon", collision=None, simulated_frames=110)
 
 
-def test_no_collision(write) -> None:
-    assert read_meta(write(NO_COLLISION)) == Meta(
-        weather="Clear", time_of_day="Noon", collision=None, simulated_frames=110
-    )
+@pytest.mark.parametrize(("text", "meta"), [(ACCIDENT, ACCIDENT_META), (NO_COLLISION, QUIET_META)])
+def test_the_real_files(write, text: str, meta: Meta) -> None:
+    assert read_meta(write(text)) == meta
 
 
 @pytest.mark.parametrize(
@@ -168,11 +166,12 @@ def test_binary_garbage_and_a_missing_file(write, tmp_path: Path) -> None:
     )
 
 
-def test_written_text_is_as_the_release_has_it(tmp_path: Path) -> None:
-    write_meta(tmp_path / "meta.txt", ACCIDENT_META)
-    assert (tmp_path / "meta.txt").read_text() == ACCIDENT.removesuffix("\n")
-    write_meta(tmp_path / "meta.txt", Meta(weather="Clear", time_of_day="Noon", collision=None, simulated_frames=110))
-    assert (tmp_path / "meta.txt").read_text().splitlines() == [NO_COLLISION, " colliding agents: none none"]
+@pytest.mark.parametrize(
+    ("meta", "text"), [(ACCIDENT_META, ACCIDENT), (QUIET_META, f"{NO_COLLISION}\n colliding agents: none none\n")]
+)
+def test_written_text_is_as_the_release_has_it(tmp_path: Path, meta: Meta, text: str) -> None:
+    write_meta(tmp_path / "meta.txt", meta)
+    assert (tmp_path / "meta.txt").read_text() == text.removesuffix("\n")
 
 
 @pytest.mark.parametrize("names", ["other other_behind", "ego none"])
