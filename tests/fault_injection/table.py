@@ -68,7 +68,10 @@ def rows_of(outcomes: Iterable[Outcome]) -> list[Row]:
 def to_markdown(outcomes: Sequence[Outcome]) -> str:
     """The whole page."""
     rows = rows_of(outcomes)
-    parts = [_HEAD.format(**_counts(rows)), _summary(rows)]
+    must = [row for row in rows if row.mutation.beyond is None]
+    told = dict(zip(("found", "harmless", "missed"), _tally(must), strict=True))
+    head = _HEAD.format(**told, count=sum(told.values()), kinds=len(must), beyond=len(rows) - len(must))
+    parts = [head, _summary(must)]
     for group in dict.fromkeys(row.mutation.group for row in rows):
         lines = [_line(row.cells()) for row in rows if row.mutation.group == group]
         parts.append("\n".join([f"## {group[0].upper()}{group[1:]}", "", *_header(_COLUMNS), *lines, ""]))
@@ -81,29 +84,18 @@ def verdicts_of(markdown: str) -> dict[str, str]:
     return {cells[0].strip("`"): cells[_COLUMNS.index("verdict")].strip() for cells in lines}
 
 
-def _counts(rows: Sequence[Row]) -> dict[str, int]:
-    must = [row for row in rows if row.mutation.beyond is None]
-    count, found = sum(len(row.outcomes) for row in must), sum(row.found for row in must if row.verdict != "harmless")
-    harmless = sum(len(row.outcomes) for row in must if row.verdict == "harmless")
-    return {
-        "count": count,
-        "kinds": len(must),
-        "found": found,
-        "harmless": harmless,
-        "missed": count - found - harmless,
-        "beyond": len(rows) - len(must),
-    }
+def _tally(rows: Sequence[Row]) -> tuple[int, int, int]:
+    """How many applications were found, are harmless and were missed."""
+    harmless = sum(len(row.outcomes) for row in rows if row.verdict == "harmless")
+    found = sum(row.found for row in rows if row.verdict != "harmless")
+    return found, harmless, sum(len(row.outcomes) for row in rows) - found - harmless
 
 
 def _summary(rows: Sequence[Row]) -> str:
     lines = []
-    rows = [row for row in rows if row.mutation.beyond is None]
     for group in dict.fromkeys(row.mutation.group for row in rows):
         of_group = [row for row in rows if row.mutation.group == group]
-        harmless = sum(len(row.outcomes) for row in of_group if row.verdict == "harmless")
-        found = sum(row.found for row in of_group if row.verdict != "harmless")
-        counts = (found, harmless, sum(len(row.outcomes) for row in of_group) - found - harmless)
-        lines.append(_line([group, str(len(of_group)), *map(str, counts)]))
+        lines.append(_line([group, str(len(of_group)), *map(str, _tally(of_group))]))
     return "\n".join([*_header(("files", "kinds", "found", "harmless", "missed")), *lines, ""])
 
 
