@@ -45,6 +45,7 @@ UNUSED = [
     ("render bev release --out a.png --agents all --seed 3", "--seed changes nothing without --pose-noise"),
     ("export mcap release --out a.mcap --channels Camera_Front --points 3", "--points changes nothing without the cha"),
     ("validate release --json --all", "--all changes nothing with --json"),
+    ("validate release --files --deep", "--deep changes nothing with --files, which opens no file"),
     ("split release --seed 3 --out mine.txt", "--seed changes nothing with --where or a split file"),
     ("split release --overwrite", "--overwrite changes nothing without --out"),
     ("info release --out out", "--out changes nothing without --statistics"),
