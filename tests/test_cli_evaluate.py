@@ -250,8 +250,8 @@ class TestVerify:
 @pytest.fixture(scope="module")
 def two(da_motion: DeepAccident, folder: Path) -> list[Path]:
     """Of two scenarios each; the second is worse."""
-    selection, setup = SampleSelection(split="train", scope="all", agents=AGENTS), EvaluationSetup("accident", "boxes")
-    made = []
+    made, selection = [], SampleSelection(split="train", scope="all", agents=AGENTS)
+    setup = EvaluationSetup(task="accident", protocol="boxes")
     for name, moved in (("a", 0.1), ("b", 1.0)):
         results = write_accidents(da_motion, folder / f"{name}.json", selection.tokens(da_motion), moved)
         made.append(save_run(evaluate_results(da_motion, results, setup, selection, workers=1), folder / name))

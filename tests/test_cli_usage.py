@@ -51,6 +51,7 @@ UNUSED = [
     (EVALUATE.format("accident") + " --protocol fiery", "'fiery' is a protocol of labels"),
     ("labels release --split train --out out --preset clean", "'clean' is a protocol of labels: give protocol='clean'"),
     ("validate release --json --all", "--all changes nothing with --json"),
+    ("validate release --files --deep", "--deep changes nothing with --files, which opens no file"),
     ("split release --seed 3 --out mine.txt", "--seed changes nothing with --where or a split file"),
     ("split release --overwrite", "--overwrite changes nothing without --out"),
     ("info release --out out", "--out changes nothing without --statistics"),

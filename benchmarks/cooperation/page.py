@@ -124,7 +124,8 @@ joins an agent's own past with its present, joins the maps of up to five agents,
 
 `tiny` has cells of 1 m and learns the labels `clean`. So all numbers here are **clean, 1 m**: limits that the metrics
 count in cells are twice as long in metres as the released ones, and the labels are others. They never stand beside
-numbers of the released protocol, nor beside the paper's ([which numbers compare](numbers.md#which-number-beside-which-published-one)).
+numbers of the released protocol, nor beside the paper's ([which numbers
+compare](numbers.md#which-number-beside-which-published-one)).
 
 ## Does cooperation help?
 

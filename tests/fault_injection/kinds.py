@@ -55,15 +55,6 @@ class Group:
                 Mutation(name=name, group=self.name, title=title, apply=apply, **{"deep": self.deep, **how})
             )
 
-    def kind(self, **how: Any) -> Callable[[Apply], Apply]:
-        """Enter the decorated function under its own name; its docstring says what it does."""
-
-        def enter(apply: Apply) -> Apply:
-            self.add({apply.__name__: (apply.__doc__ or "", apply)}, **how)
-            return apply
-
-        return enter
-
 
 def in_file(kind: str, change: Callable[[bytes, np.random.Generator], bytes]) -> Apply:
     """Change the bytes of a file of a kind (`ENDINGS`, or `Camera` for any of them) at a frame of an agent."""

@@ -76,32 +76,24 @@ def to_markdown(outcomes: Sequence[Outcome]) -> str:
 def summary(outcomes: Sequence[Outcome]) -> str:
     """What docs/validation.md says of a run."""
     rows = rows_of(outcomes)
-    return _SUMMARY.format(**_counts(rows)) + _groups(rows)
-
-
-def _counts(rows: Sequence[Row]) -> dict[str, int]:
     must = [row for row in rows if row.mutation.beyond is None]
-    count, found = sum(len(row.outcomes) for row in must), sum(row.found for row in must if row.verdict != "harmless")
-    harmless = sum(len(row.outcomes) for row in must if row.verdict == "harmless")
-    return {
-        "count": count,
-        "kinds": len(must),
-        "found": found,
-        "harmless": harmless,
-        "missed": count - found - harmless,
-        "beyond": len(rows) - len(must),
-    }
+    told = dict(zip(("found", "harmless", "missed"), _tally(must), strict=True))
+    counts = {**told, "count": sum(told.values()), "kinds": len(must), "beyond": len(rows) - len(must)}
+    return _SUMMARY.format(**counts) + _groups(must)
+
+
+def _tally(rows: Sequence[Row]) -> tuple[int, int, int]:
+    """How many applications were found, are harmless and were missed."""
+    harmless = sum(len(row.outcomes) for row in rows if row.verdict == "harmless")
+    found = sum(row.found for row in rows if row.verdict != "harmless")
+    return found, harmless, sum(len(row.outcomes) for row in rows) - found - harmless
 
 
 def _groups(rows: Sequence[Row]) -> str:
     lines = []
-    rows = [row for row in rows if row.mutation.beyond is None]
     for group in dict.fromkeys(row.mutation.group for row in rows):
         of_group = [row for row in rows if row.mutation.group == group]
-        harmless = sum(len(row.outcomes) for row in of_group if row.verdict == "harmless")
-        found = sum(row.found for row in of_group if row.verdict != "harmless")
-        counts = (found, harmless, sum(len(row.outcomes) for row in of_group) - found - harmless)
-        lines.append(_line([group, str(len(of_group)), *map(str, counts)]))
+        lines.append(_line([group, str(len(of_group)), *map(str, _tally(of_group))]))
     return "\n".join([*_header(("files", "kinds", "found", "harmless", "missed")), *lines, ""])
 
 

@@ -81,9 +81,18 @@ GROUP.add(
 )
 
 
-@GROUP.kind(deep=True)
-def image_size_of_another_release(place: Place, rng: np.random.Generator) -> None:
-    """All intrinsics of an agent are those of images twice as large."""
+def _of_larger_images(place: Place, rng: np.random.Generator) -> None:
     agent = place.any_agent(rng)
     for camera in CAMERAS:
         place.edit_calib(agent, place.frames, f"intrinsic_{camera}", lambda intrinsic: intrinsic * _LARGER)
+
+
+GROUP.add(
+    {
+        "image_size_of_another_release": (
+            "All intrinsics of an agent are those of images twice as large.",
+            _of_larger_images,
+        ),
+    },
+    deep=True,
+)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fault_injection.kinds import Apply, Group, cut, emptied, garbage, in_file
-from fault_injection.place import FIELD, Place
+from fault_injection.place import FIELD
 
 GROUP = Group("label, form")
 _NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw")
@@ -64,18 +64,10 @@ GROUP.add(
             _in_line(lambda row, rng: row.insert(int(rng.integers(1, len(row))), "0.5")),
         ),
         "label_nan": ("A position, size or yaw is NaN.", _set(_NUMBERS, "nan")),
-    },
-)
-
-
-@GROUP.kind()
-def label_infinite(place: Place, rng: np.random.Generator) -> None:
-    """A position is infinite."""
-    _set(_NUMBERS[:3], str(rng.choice(["inf", "-inf"])))(place, rng)
-
-
-GROUP.add(
-    {
+        "label_infinite": (
+            "A position is infinite.",
+            lambda place, rng: _set(_NUMBERS[:3], str(rng.choice(["inf", "-inf"])))(place, rng),
+        ),
         "label_number_garbled": ("A number has a second decimal point.", _in_line(_garble)),
         "label_class_unknown": (
             "A line names a class that does not exist.",

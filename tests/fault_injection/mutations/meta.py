@@ -129,11 +129,15 @@ GROUP.add(
 )
 
 
-@GROUP.kind(only="normal")
-def meta_of_twin(place: Place, rng: np.random.Generator) -> None:
-    """A normal scenario has the meta file of its accident twin."""
+def _twins_own(place: Place, rng: np.random.Generator) -> None:
     twin = place.root / "type1_subtype1_accident" / "meta" / place.scenario.meta_path.name
     place.write(place.scenario.meta_path, twin.read_bytes())
+
+
+GROUP.add(
+    {"meta_of_twin": ("A normal scenario has the meta file of its accident twin.", _twins_own)},
+    only="normal",
+)
 
 
 def _permute_ids(place: Place, rng: np.random.Generator) -> None:

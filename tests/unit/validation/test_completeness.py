@@ -189,7 +189,6 @@ def test_some_scenarios_are_counted_alone(release_root: Path) -> None:
     token = "/".join((release_root / "train.txt").read_text().split()[:2])
     found = json.loads(run(release_root, "--scenario", token, "--json").stdout)
     assert (found["scenarios"], found["whole"], list(found["splits"])) == (1, 1, ["train"])
-    assert "--deep changes nothing with --files, which opens no file" in run(release_root, "--deep").stderr
 
 
 def test_validate_ends_with_it(own_release: Path) -> None:

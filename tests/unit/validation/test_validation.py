@@ -288,7 +288,7 @@ def test_the_worst_scenario_comes_first(own_release: Path) -> None:
         path.write_text("")
     rewrite_boxes(sorted(warned.iterdir())[1], lambda row: [row[0], repr(float(row[1]) + 3), *row[2:]])
     findings = validate_release(own_release).findings
-    order = list(dict.fromkeys(str(finding.scenario).split("/")[1] for finding in findings))
+    order = [str(scenario).split("/")[1] for scenario in dict.fromkeys(finding.scenario for finding in findings)]
     severities = [finding.severity for finding in findings]
     assert order == [broken.name, warned.name]
     assert severities == sorted(severities, key=("error", "warning", "note").index)
