@@ -10,6 +10,7 @@ import pytest
 TOP = Path(__file__).parents[1]
 EXCEPTIONS = {
     "questions/README.md": "the page that `export questions` writes beside its questions",
+    "../conventions.md": "as the reference links it, whose pages are made in docs/api",
 }
 """Names that are cited and not there, each with the reason."""
 _NOT_TEXT = re.compile(r"https?://\S+|\$\w+/")
@@ -24,7 +25,7 @@ def repository_files() -> list[str]:
     found = [path for path in TOP.iterdir() if path.is_file()]
     for folder in ("deepaccident_devkit", "docs", "schema", "tests", "tutorials", "benchmarks", ".ci"):
         found += [path for path in (TOP / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
-    return [path.relative_to(TOP).as_posix() for path in found]
+    return [path.relative_to(TOP).as_posix() for path in found if path.parent != TOP / "docs" / "api"]
 
 
 def texts(files: list[str]) -> Iterator[tuple[str, str]]:

@@ -140,8 +140,8 @@ MEASURED = """
   tested; nothing is chosen among them.
 - The test has {samples} samples of `ego_vehicle`, within the last two seconds of {pairs} pairs of an accident and its
   twin; in {positives} of them an accident comes. In brackets are intervals of 95 % over these pairs
-  ([how](numbers.md#intervals)), none where too few of them change a number. The model seeds are pooled: the intervals say how
-  a number varies from scene to scene, not from training to training.
+  ([how](numbers.md#intervals)), none where too few of them change a number. The model seeds are pooled: the intervals
+  say how a number varies from scene to scene, not from training to training.
 - Actors within 50 m that only a partner sees, by the released rule of visibility ({hidden}, beside {seen} that the ego
   sees), are counted apart. One is on the map if the cell of its centre is foreground at the present, and detected if a
   box is within 2 m. The false share is of the foreground cells.

@@ -136,7 +136,7 @@ def test_intervals_of_joined_clusters_are_nearly_the_same() -> None:
 def plain_ends(
     value: float, left_out: list[float], limits: tuple[float, float], having: int, confidence: float
 ) -> tuple[float, float]:
-    """By scipy's t and the formulas of docs/statistics.md, number by number."""
+    """By scipy's t and the formulas of docs/numbers.md, number by number."""
     count, apart, (least, most) = len(left_out), [each - value for each in left_out], limits
     squares, changing = sum(each**2 for each in apart), sum(each != 0 for each in apart)
     error = math.sqrt((count - 1) / count * squares)
