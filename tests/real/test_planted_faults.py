@@ -38,13 +38,13 @@ def sound(real_copy: Path) -> set[str]:
 @pytest.mark.parametrize("name", SHALLOW)
 def test_a_planted_fault_is_told(real_copy: Path, real_places: dict[str, Place], sound: set[str], name: str) -> None:
     try:
-        place, done = mutate(Job(name, 0), real_places)
+        place = mutate(Job(name, 0), real_places)
     except (NoVictimError, FileNotFoundError) as error:
         for place in real_places.values():
             place.restore()
         pytest.skip(f"needs what this scenario does not have: {error}")
     try:
-        assert doubts(real_copy) - sound, done
+        assert doubts(real_copy) - sound, place.changes()
     finally:
         place.restore()
 

@@ -126,7 +126,7 @@ def bits_flipped(content: bytes, rng: Rng) -> bytes:
 @by_content("bytes")
 def bytes_overwritten(content: bytes, rng: Rng) -> bytes:
     begin, end = _span(content, rng)
-    return content[:begin] + garbage(rng, end - begin)[: end - begin] + content[end:]
+    return content[:begin] + garbage(content[begin:end], rng)[: end - begin] + content[end:]
 
 
 @by_content("bytes")
@@ -137,7 +137,7 @@ def cut_off(content: bytes, rng: Rng) -> bytes:
 @by_content("bytes")
 def bytes_inserted(content: bytes, rng: Rng) -> bytes:
     begin, _ = _span(content, rng)
-    return content[:begin] + garbage(rng, 16) + content[begin:]
+    return content[:begin] + garbage(b"", rng) + content[begin:]
 
 
 @by_content("bytes")
@@ -163,7 +163,7 @@ def parts_swapped(content: bytes, rng: Rng) -> bytes:
 
 @by_content("bytes")
 def bytes_appended(content: bytes, rng: Rng) -> bytes:
-    return content + any_of(rng, (garbage(rng, 64), bytes(64), b"\n", content))
+    return content + any_of(rng, (garbage(bytes(64), rng), bytes(64), b"\n", content))
 
 
 @by_content("bytes")
@@ -179,7 +179,7 @@ def emptied(_before: bytes, _rng: Rng) -> bytes:
 
 @by_content("bytes")
 def all_garbage(content: bytes, rng: Rng) -> bytes:
-    return garbage(rng, len(content))
+    return garbage(content, rng)
 
 
 @by_content("bytes", *_TEXTS)
@@ -383,7 +383,7 @@ def archive_of_other_members(content: bytes, rng: Rng) -> bytes:
     elif choice == 2:
         members["another.npy"] = members[name]
     elif choice == 3:
-        members[name] = garbage(rng, 100)
+        members[name] = garbage(bytes(100), rng)
     members = {name: member[:_MOST_BYTES] for name, member in members.items()}
     stored = packed(
         members, any_of(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))

@@ -227,7 +227,7 @@ def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
     assert ImageCache(tmp_path / "out").images == replace(
         IMAGES, decode="scaled", cameras=("Camera_Back", "Camera_Front")
     )
-    assert "0 written now" in command(*words).output
+    assert "0 scenarios written now" in command(*words).output
     assert isinstance(command(*words, "--codec", "jpeg").exception, ConfigError)
 
 

@@ -191,7 +191,7 @@ def test_a_folder_without_that_nuscenes_export_is_refused(da: DeepAccident, tmp_
 
 def test_the_command_makes_the_nuscenes_export_too(da: DeepAccident, tmp_path: Path) -> None:
     where = ("--out", str(tmp_path / "out"), "--split", "val", "--agents", "ego_vehicle")
-    for told in ("2 written now", "0 written now, 2 were there already"):
+    for told in ("2 scenarios written now", "0 scenarios written now, 2 were there already"):
         run = CliRunner().invoke(export, ["mmdet3d", str(da.dataroot), *where, "--workers", "1"])
         assert run.exit_code == 0, run.output
         assert run.output.count(told) == 2

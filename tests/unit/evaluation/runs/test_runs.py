@@ -26,7 +26,7 @@ WRITTEN = {
     "bundles.FILES_FORMAT": "'DeepAccident evaluation bundle'",
     "bundles.checksums_of": "listed=None",
     "bundles.save_run": "include_results=False, overwrite=False, extras=()",
-    "bundles.checked_target": "overwrite=False",
+    "bundles.checked_target": "overwrite=False, asked=None",
     "comparison.compare_bundles": "resampling=None, common=False",
     "evaluation_run.SUMMARY_FORMAT": "'DeepAccident metrics summary'",
     "evaluation_run.SUMMARY_VERSION": "1",
