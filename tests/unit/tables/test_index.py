@@ -23,6 +23,7 @@ from tiny_index import INDEX, OTHER, THIRD, contents, edit, label, opened
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import (
     BrokenReleaseError,
+    ChoiceError,
     DatarootError,
     IndexStoreError,
     NotAvailableError,
@@ -157,6 +158,7 @@ def test_splits_come_from_files_else_folders_else_are_unknown(own_release: Path)
     own = f"or make a split file of your own: deepaccident split {flat} --out mine.txt, then --split mine.txt"
     with pytest.raises(NotAvailableError, match=f"the split of its scenarios is unknown: .*, {re.escape(own)}$"):
         unknown.split_scenarios("train")
+    assert_refused((lambda: unknown.split_scenarios("unknown"), ChoiceError, (own.removeprefix("or "), "train, val")))
     assert re.search(r"^unknown +6$", overview(unknown).to_text(), re.MULTILINE)
 
 

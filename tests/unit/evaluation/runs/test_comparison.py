@@ -4,6 +4,7 @@ import csv
 import itertools
 import json
 import math
+import re
 import shutil
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -407,6 +408,13 @@ def test_unlike_rules_are_told_in_parts(tmp_path: Path, unlike: int, more: str) 
         compare_bundles(*folders, FEW)
     told = "; ".join(f"settings/x{number} 'absent' and {number}" for number in range(min(unlike, 3)))
     assert str(raised.value).endswith(f"by the same rules: {told}{more}; evaluate both in the same way")
+
+
+def test_too_few_clusters_are_told_once(generated: Callable[..., Comparison]) -> None:
+    """And in each row by two words; the first headline, which is tested alone, needs fewer."""
+    text = generated(HARD[:3], [each + 9 for each in HARD[:3]]).to_text()
+    assert re.findall("no decision.*", text) == ["no decision is possible with 3 clusters; at least 7 are needed"]
+    assert len(re.findall(r" too few$", text, re.MULTILINE)) == 2
 
 
 def test_the_note_on_exploration_counts(generated: Callable[..., Comparison]) -> None:

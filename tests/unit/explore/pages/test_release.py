@@ -155,6 +155,13 @@ def test_its_counts_lead_to_as_many_scenarios(of_damaged: Reader, damaged: Damag
     assert len(counted) > 12
 
 
+def test_values_that_would_find_nothing_are_no_filters(reader: Reader) -> None:
+    page = get(reader.app, "/?collision=true").text
+    counts = re.findall(r'name="(\w+)" value="([^"]*)"( checked)?>\n<span>.*?</span> <b>(\d+)</b>', page)
+    assert {name for name, *_ in counts} > {"town", "collision"}
+    assert [each for each in counts if each[3] == "0"] == []
+
+
 def test_hostile_names_are_text(own_release: Path) -> None:
     hostile = "<script>alert(1)</script>'\"&"
     first = DeepAccident("v1", own_release, verbose=False).scenario[0]
