@@ -390,6 +390,11 @@ def test_the_page_says_which_pictures_are_axes_and_which_figures() -> None:
         assert parameter in signature.parameters, name
 
 
+@pytest.mark.parametrize("page", [*sorted(TOP.glob("*.md")), *PAGES], ids=lambda page: page.name)
+def test_a_page_says_for_whom_it_is(page: Path) -> None:
+    assert re.match(r"# [^\n]+\n\nFor everybody ", page.read_text(encoding="utf-8"))
+
+
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "SECURITY.md"])
 def test_the_links_of_pages_that_are_not_on_the_site_lead_somewhere(page: str) -> None:
     links = re.findall(r"\]\((?!http)([^)#]+)", (TOP / page).read_text(encoding="utf-8"))
