@@ -1,5 +1,6 @@
 """Fixtures that all tests share: one synthetic release a session, made and indexed once."""
 
+import fcntl
 import importlib
 import os
 import shutil
@@ -48,13 +49,26 @@ def pytest_configure(config: pytest.Config) -> None:
         manager.register(importlib.import_module("deepaccident_devkit.testing.plugin"), "deepaccident")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Tests of a file run in one process, so that what they share is made once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    return LoadFileScheduling(config, log)
+
+
 def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
-    """A synthetic release of this name, made now if no other session has."""
+    """A synthetic release of this name, made now if no other session, and no other process of this one, has."""
     if MADE is not None:
         return Path(MADE) / name
     from deepaccident_devkit.synth import SynthConfig, make_release
 
-    return make_release(factory.mktemp("synthetic") / name, SynthConfig(**config), workers=2)
+    folder = factory.getbasetemp()
+    root = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "synthetic" / name
+    root.parent.mkdir(exist_ok=True)
+    with root.with_name(f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return root if root.exists() else make_release(root, SynthConfig(**config), workers=2)
 
 
 @pytest.fixture(scope="session")
