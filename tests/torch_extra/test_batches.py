@@ -188,7 +188,7 @@ def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str]
         data.set_epoch(epoch)
         epochs.append(torch.cat([batch["augmentation"] for batch in loader]))
         assert same(epochs[-1], torch.stack([item["augmentation"] for item in data]))
-    assert not torch.equal(epochs[0], epochs[1])
+    assert not torch.equal(*epochs)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")

@@ -59,9 +59,8 @@ def test_masked_partners_leave_the_ego_alone(config: FusionConfig) -> None:
 
 @ALL
 def test_partners_count_in_any_order(config: FusionConfig) -> None:
-    x, mask, infra, delay = batch()
-    swapped = module(config)(*[each[:, [0, 3, 1, 2]] for each in (x, mask, infra, delay)])
-    torch.testing.assert_close(swapped, module(config)(x, mask, infra, delay), atol=1e-5, rtol=0)
+    swapped = module(config)(*[each[:, [0, 3, 1, 2]] for each in batch()])
+    torch.testing.assert_close(swapped, module(config)(*batch()), atol=1e-5, rtol=0)
 
 
 @ALL
@@ -155,21 +154,19 @@ def test_unreached_layers_fuse_all_agents_and_poses() -> None:
 
 def test_disconet_s_weights_are_shares() -> None:
     x, mask, *_ = batch()
-    for config in (DISCONET, replace(DISCONET, last_relu=True)):
-        weights = module(config).weights(x, mask)
-        torch.testing.assert_close(weights.sum(1), torch.ones(2, 7, 9))
-        assert not weights[~mask].any()
-    assert not torch.allclose(module(DISCONET).weights(x, mask), weights)
+    shares = [module(each).weights(x, mask) for each in (DISCONET, replace(DISCONET, last_relu=True))]
+    torch.testing.assert_close(torch.stack(shares).sum(2), torch.ones(2, 2, 7, 9))
+    assert not torch.stack(shares)[:, ~mask].any()
+    assert not torch.allclose(*shares)
 
 
 def test_cobevt_by_slots_depends_on_the_order_and_has_an_end_of_slots() -> None:
-    x, mask, infra, delay = batch()
     model = module(replace(COBEVT, agent_relation="slots", agents=4))
     for name, table in model.named_parameters():
         if name.endswith("bias_table"):
             torch.nn.init.normal_(table)
-    swapped = model(*[each[:, [0, 3, 1, 2]] for each in (x, mask, infra, delay)])
-    assert not torch.allclose(swapped, model(x, mask, infra, delay), atol=1e-4)
+    swapped = model(*[each[:, [0, 3, 1, 2]] for each in batch()])
+    assert not torch.allclose(swapped, model(*batch()), atol=1e-4)
     told = r"for 4 slots, found 5; raise CobevtConfig\.agents"
     assert_refused((lambda: model(*batch(agents=5)), ConfigError, told))
 
