@@ -1,10 +1,13 @@
 """Items and batches with the targets of all egos equal those of each ego by itself."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from refusals import assert_refused
 from torch.testing import assert_close
 from torch.utils.data import DataLoader
+from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingFileError, NotAvailableError
@@ -37,12 +40,11 @@ def test_each_ego_has_its_own_targets_and_its_partners(da: DeepAccident, moment:
     assert (item["egos"], item["agents"][0]) == (tuple(moment), AGENTS[-1])
     for row, ego in enumerate(moment):
         alone = V2XDataset(da, [ego], config)[0]  # the first item in both: the same augmentation
-        targets = item["targets"][row]
-        assert_close(targets, {key: alone[key] for key in targets}, rtol=0, atol=0)
+        assert same(item["targets"][row], {key: alone[key] for key in item["targets"][row]})
         partners = {name for name, is_one in zip(item["agents"], item["partners"][row], strict=True) if is_one}
         assert partners == set(alone["agents"])
         places = [item["agents"].index(name) for name in alone["agents"]]
-        assert_close([item[key][places] for key in SENSORS], [alone[key] for key in SENSORS], rtol=0, atol=0)
+        assert same([item[key][places] for key in SENSORS], [alone[key] for key in SENSORS])
         ego_from_first = torch.linalg.inv(item["ego_from_agent"][places[0], -1].double())
         assert_close((ego_from_first @ item["ego_from_agent"][places].double()).float(), alone["ego_from_agent"])
 
@@ -52,34 +54,29 @@ def test_a_batch_lists_the_egos_of_all_moments(da: DeepAccident, moment: list[st
     data = AllEgosDataset(da, [*moment, *later], V2XConfig(agents="all", **CONFIG))
     batch = collate_all_egos([data[1], data[0]])
     assert batch["egos"] == [*later, *moment]
-    names = [batch["agents"][b][a] for b, a in batch["ego_rows"].tolist()]
-    assert names == [token.split("/")[-2] for token in batch["egos"]]
+    assert [token.split("/")[-2] for token in batch["egos"]] == [
+        batch["agents"][b][a] for b, a in batch["ego_rows"].tolist()
+    ]
     shapes = (batch["partners"].shape, batch["instance"].shape, len(batch["boxes"]))
     assert shapes == ((8, 5), (8, 5, 200, 200), 8)
     [by_default] = DataLoader(data, batch_size=2)
-    assert by_default["egos"] == [*moment, *later]
+    assert same(by_default, collate_all_egos([data[0], data[1]]))
 
 
 def test_absent_agents_are_neither_egos_nor_partners(da_partial: DeepAccident, moment: list[str]) -> None:
     """The release has no other_vehicle_behind, and lacks the ego's front camera, which may be skipped for others."""
     there = [token for token in moment if "other_vehicle_behind" not in token]
-    with pytest.raises(NotAvailableError, match="other_vehicle_behind is not in this release"):
-        AllEgosDataset(da_partial, there, V2XConfig(agents="all", points=False, **CONFIG))
     config = V2XConfig(agents="available", points=False, on_missing="skip", **CONFIG)
-    whole, single = AllEgosDataset(da_partial, there, config)[0], AllEgosDataset(da_partial, there[-2:], config)[0]
-    batch = collate_all_egos([whole, single])
-    assert batch["partners"].shape == (4, 4)
-    assert batch["partners"].all()
-    ego = whole["agents"].index("ego_vehicle")
-    assert whole["agent_valid"].all(dim=1).tolist() == [a != ego for a in range(4)]
-    assert whole["egos"] == tuple(there[:-1])
-    first = AllEgosDataset(da_partial, there[::-1], config)[0]  # the one without its files is the first
-    assert first["egos"] == tuple(there[-2::-1])
-    assert_close(first["targets"][0], whole["targets"][-1], rtol=0, atol=0)
-    with pytest.raises(MissingFileError, match="no agent has all its sensor files"):
-        AllEgosDataset(da_partial, there[-1:], config)[0]
-
-
-def test_a_link_is_refused(da: DeepAccident, moment: list[str]) -> None:
-    late = V2XConfig(link=Link(latency=0.1))
-    assert_refused((lambda: AllEgosDataset(da, moment, late), ConfigError, ("its own messages", "use V2XDataset")))
+    whole, single, first = (
+        AllEgosDataset(da_partial, tokens, config)[0] for tokens in (there, there[-2:], there[::-1])
+    )
+    assert collate_all_egos([whole, single])["partners"].tolist() == [[True] * 4] * 4
+    assert whole["agent_valid"].all(dim=1).tolist() == [name != "ego_vehicle" for name in whole["agents"]]
+    assert (whole["egos"], first["egos"]) == (tuple(there[:-1]), tuple(there[-2::-1]))
+    assert same(first["targets"][0], whole["targets"][-1])  # though the one without its files is the first
+    absent, late = replace(config, agents="all"), replace(config, link=Link(latency=0.1))
+    assert_refused(
+        (lambda: AllEgosDataset(da_partial, there, absent), NotAvailableError, "other_vehicle_behind is not in this"),
+        (lambda: AllEgosDataset(da_partial, there[-1:], config)[0], MissingFileError, "no agent has all its sensor"),
+        (lambda: AllEgosDataset(da_partial, there, late), ConfigError, ("its own messages", "use V2XDataset")),
+    )

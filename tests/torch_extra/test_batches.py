@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 from torch.utils.data import DataLoader
+from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -43,32 +44,21 @@ EVERYTHING = V2XConfig(
 )
 
 
-def same(one: Any, other: Any) -> bool:
-    """Whether two batches, or what stands in them, are equal."""
-    if isinstance(one, torch.Tensor):
-        return torch.equal(one, other)
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(same(left, right) for left, right in zip(one, other, strict=True))
-    return one == other
-
-
 def test_agents_side_by_side(da: DeepAccident, tokens: list[str]) -> None:
     one, two = (
         V2XDataset(da, [token], V2XConfig(agents=agents, images=ImageConfig()))[0]
         for token, agents in zip(tokens, ("single", "all"), strict=False)
     )
     batch = collate([one, two])
-    assert (batch["token"], batch["agents"]) == (tokens[:2], [one["agents"], two["agents"]])
-    assert batch["agent_valid"].tolist() == [[[True]] + [[False]] * 4, [[True]] * 5]
-    assert (batch["images"].shape, batch["world_from_ego"].shape) == ((2, 5, 1, 6, 3, 36, 64), (2, 4, 4))
-    assert_array_equal(batch["images"][0], torch.cat([one["images"], torch.zeros_like(batch["images"][0, 1:])]))
-    assert_array_equal(batch["intrinsics"][0, 1:], np.broadcast_to(np.eye(3), (4, 1, 6, 3, 3)))
-    assert_array_equal(batch["ego_from_agent"][1], two["ego_from_agent"])
-    assert [len(boxes) for boxes in batch["boxes"]] == [len(one["boxes"]), len(two["boxes"])]
-    assert [len(agents) for agents in batch["points"]] == [1, 5]
-    assert "record_len" not in batch
+    first, second = ({key: each[row] for key, each in batch.items()} for row in range(2))
+    assert same(second, two)
+    filling = {
+        "agent_valid": torch.zeros(4, 1, dtype=torch.bool),
+        "images": torch.zeros(4, 1, 6, 3, 36, 64),
+        "intrinsics": torch.eye(3).expand(4, 1, 6, 3, 3),
+    }
+    expected = {key: torch.cat([one[key], blank]) for key, blank in filling.items()}
+    assert same({key: first[key] for key in filling}, expected)
 
 
 def test_agents_one_after_another(da: DeepAccident, tokens: list[str]) -> None:
@@ -77,8 +67,7 @@ def test_agents_one_after_another(da: DeepAccident, tokens: list[str]) -> None:
     assert (batch["record_len"].tolist(), batch["record_len"].dtype) == ([2, 1, 5], torch.int64)
     assert (batch["ego_from_agent"].shape, len(batch["points"])) == ((8, 1, 4, 4), 8)
     pairwise = batch["pairwise_t_matrix"]
-    assert_array_equal(pairwise[1], np.broadcast_to(np.eye(4), (5, 5, 4, 4)))
-    assert_array_equal(pairwise[0, 2:], np.broadcast_to(np.eye(4), (3, 5, 4, 4)))
+    assert_array_equal(torch.cat([pairwise[1], pairwise[0, 2:]]), np.broadcast_to(np.eye(4), (8, 5, 4, 4)))
     frames = [da.get_sample(da.scenario[0], name, 4) for name in items[2]["agents"]]
     expected = [[da.transform(target, source).matrix for target in frames] for source in frames]
     assert_allclose(pairwise[2], expected, atol=1e-3)
@@ -98,11 +87,10 @@ def test_agents_that_a_partial_release_lacks(own_release: Path, start: str) -> N
     arguments = {"batch_size": len(here), "num_workers": 1, "multiprocessing_context": start}
     [side_by_side] = DataLoader(data, collate_fn=collate, **arguments)
     assert side_by_side["agent_valid"].sum(dim=(1, 2)).tolist() == [2 * count for count in counts]
-    assert side_by_side["ego_from_agent"].shape == (len(here), 5, 2, 4, 4)
     [one_after_another] = DataLoader(data, collate_fn=collate_fusion, **arguments)
-    assert one_after_another["record_len"].tolist() == counts
-    assert one_after_another["ego_from_agent"].shape == (sum(counts), 2, 4, 4)
-    assert [len(names) for names in one_after_another["agents"]] == counts
+    assert one_after_another["record_len"].tolist() == [len(names) for names in one_after_another["agents"]] == counts
+    shapes = [batch["ego_from_agent"].shape for batch in (side_by_side, one_after_another)]
+    assert shapes == [(len(here), 5, 2, 4, 4), (sum(counts), 2, 4, 4)]
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -125,23 +113,21 @@ def test_a_loader_without_collate_fn_batches_as_collate_does(da: DeepAccident, s
 def test_skipped_files_are_as_if_they_had_not_arrived(da: DeepAccident, da_partial: DeepAccident, sample: str) -> None:
     """The pole has no LiDAR, and the ego no front camera: with the pole, images are of the other vehicles."""
     both = {"agents": ["ego_vehicle", "other_vehicle", "infrastructure"], "past": 2, "step": 1}
-    with pytest.raises(MissingFileError, match=r"infrastructure.*no such file; .* with on_missing='skip'"):
-        V2XDataset(da_partial, [sample], V2XConfig(**both))[0]
+    images = V2XConfig(**both, on_missing="skip", points=False, images=ImageConfig())
+    skip, fewer = "infrastructure.*no such file; .* with on_missing='skip'", "1 of 6 sensor files .*or fewer cameras"
+    assert_refused(
+        (lambda: V2XDataset(da_partial, [sample], V2XConfig(**both))[0], MissingFileError, skip),
+        (lambda: V2XDataset(da_partial, [sample], images)[0], MissingFileError, fewer),
+    )
     item, whole = (V2XDataset(each, [sample], V2XConfig(**both, on_missing="skip"))[0] for each in (da_partial, da))
-    assert item["agent_valid"].tolist() == [[True, True], [True, True], [False, False]]
-    assert item["files_missing"].tolist() == [[0, 0], [0, 0], [1, 1]]
-    assert not whole["files_missing"].any()
-    assert same(item["points"][:2], whole["points"][:2])
-    assert [len(cloud) for cloud in item["points"][2]] == [0, 0]
+    missing = [[0, 0], [0, 0], [1, 1]]
+    assert (~item["agent_valid"]).long().tolist() == item["files_missing"].tolist() == missing
+    assert same(item["points"], [*whole["points"][:2], [cloud[:0] for cloud in whole["points"][0]]])
     assert_array_equal(item["ego_from_agent"][2], np.broadcast_to(np.eye(4), (2, 4, 4)))
     batch = collate_fusion([item, whole])
     assert batch["agents"] == [("ego_vehicle", "other_vehicle"), tuple(both["agents"])]
-    assert batch["record_len"].tolist() == [2, 3]
-    assert batch["files_missing"].shape == (5, 2)
-    assert collate([item, whole])["files_missing"].shape == (2, 3, 2)
-    images = V2XConfig(**both, on_missing="skip", points=False, images=ImageConfig())
-    with pytest.raises(MissingFileError, match=r"1 of 6 sensor files of this sample's own agent .*or fewer cameras"):
-        V2XDataset(da_partial, [sample], images)[0]
+    assert batch["files_missing"].tolist() == [[0, 0]] * 5
+    assert collate([item, whole])["files_missing"].tolist() == [missing, [[0, 0]] * 3]
     behind = V2XDataset(da_partial, [sample.replace("ego_vehicle", "other_vehicle")], images)[0]
     assert dict(zip(behind["agents"], behind["files_missing"][:, -1].tolist(), strict=True)) == {
         **dict.fromkeys(behind["agents"], 0),
@@ -152,7 +138,6 @@ def test_skipped_files_are_as_if_they_had_not_arrived(da: DeepAccident, da_parti
 
 @pytest.mark.parametrize("collated", [collate, collate_fusion])
 def test_items_that_make_no_batch(da: DeepAccident, tokens: list[str], collated: Callable[..., Any]) -> None:
-    assert_refused((lambda: collated([]), ConfigError, "batch: expected at least one item, found none"))
     plain, small, large, longer = (
         V2XDataset(da, tokens[:1], V2XConfig(points=False, boxes=None, **fields))[0]
         for fields in (
@@ -163,6 +148,7 @@ def test_items_that_make_no_batch(da: DeepAccident, tokens: list[str], collated:
         )
     )
     assert_refused(
+        (lambda: collated([]), ConfigError, "batch: expected at least one item, found none"),
         (
             lambda: collated([plain, small]),
             ConfigError,
@@ -202,7 +188,7 @@ def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str]
         data.set_epoch(epoch)
         epochs.append(torch.cat([batch["augmentation"] for batch in loader]))
         assert same(epochs[-1], torch.stack([item["augmentation"] for item in data]))
-    assert not torch.equal(epochs[0], epochs[1])
+    assert not torch.equal(*epochs)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -226,19 +212,17 @@ def test_the_documented_training_loop_learns(da: DeepAccident, tmp_path: Path, m
     blocks = re.findall(r"```(python|bash)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "training_release").symlink_to(da.dataroot)
     monkeypatch.chdir(tmp_path)
-    for name, value in {"RANK": 0, "WORLD_SIZE": 1, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": 0}.items():
-        monkeypatch.setenv(name, str(value))  # as torchrun does
+    for name, value in {"RANK": "0", "WORLD_SIZE": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "0"}.items():
+        monkeypatch.setenv(name, value)  # as torchrun does
     names: dict[str, Any] = {}
     for language, code in blocks:
         if language == "bash":
-            words = code.replace("deepaccident ", "", 1).split()
-            CliRunner().invoke(deepaccident, words, catch_exceptions=False, standalone_mode=False)
+            CliRunner().invoke(deepaccident, code.split()[1:], catch_exceptions=False, standalone_mode=False)
         else:
             exec(compile(code, str(page), "exec"), names)  # noqa: S102
-    fiery = {name: tuple(tensor.shape) for name, tensor in names["fiery_batch"].items()}
-    assert [fiery[name] for name in ("image", "flow")] == [(2, 3, 6, 3, 224, 480), (2, 7, 2, 200, 200)]
-    assert names["item"]["images"].shape == (5, 1, 6, 3, 12, 32)
-    assert len(names["losses"]) == 5
-    assert names["losses"][-1] < 0.8 * names["losses"][0]
+    shown = (names["item"]["images"], names["fiery_batch"]["image"], names["fiery_batch"]["flow"])
+    shapes = [(5, 1, 6, 3, 12, 32), (2, 3, 6, 3, 224, 480), (2, 7, 2, 200, 200)]
+    assert [tuple(each.shape) for each in shown] == shapes
+    assert names["losses"][4] < 0.8 * names["losses"][0]
     assert names["evaluator"].tokens == set(da.evaluation_samples("val"))
     assert math.isfinite(names["loss"].item())

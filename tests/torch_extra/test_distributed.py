@@ -10,6 +10,7 @@ import pytest
 import torch
 from ranks import RANKS, counted, everything, run_ranks
 from refusals import assert_refused
+from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
@@ -70,12 +71,9 @@ class TestTwoProcesses:
         ranks = outcome("trained")
         for epoch in range(2):
             data.set_epoch(epoch)
-            drawn = [matrix for rank in ranks for matrix in rank[epoch].values()]
-            assert len({str(matrix) for matrix in drawn}) == len(tokens)
-            together = ranks[0][epoch] | ranks[1][epoch]
-            assert set(together) == set(tokens)
-            for position, token in enumerate(tokens):
-                assert torch.equal(data[position]["augmentation"], torch.tensor(together[token])), token
+            together = {token: torch.tensor(matrix) for rank in ranks for token, matrix in rank[epoch].items()}
+            assert same(together, {item["token"]: item["augmentation"] for item in data})
+            assert len({str(matrix) for matrix in together.values()}) == len(tokens)
         assert ranks[0][0] != ranks[0][1]
 
     def test_they_make_one_index(self, outcome: Outcome) -> None:

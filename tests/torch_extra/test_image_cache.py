@@ -1,6 +1,5 @@
 """Items whose images come out of a cache, and decoding at a smaller scale."""
 
-import multiprocessing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 from numpy.testing import assert_array_equal
 from refusals import assert_refused
 from torch.utils.data import DataLoader
+from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingFileError
@@ -23,19 +23,14 @@ CONFIG = V2XConfig(agents="all", past=2, step=2, points=False, boxes=None, image
 
 
 def cached(dataset: DeepAccident, folder: Path, **fields: Any) -> Path:
-    form = CachedImages(images=IMAGES, where=("length>=1",), **fields)
-    return export_release(dataset, folder, form, workers=1).folder
+    return export_release(
+        dataset, folder, CachedImages(images=IMAGES, where=("length>=1",), **fields), workers=1
+    ).folder
 
 
 @pytest.fixture(scope="module")
 def folder(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return cached(da, tmp_path_factory.mktemp("cache") / "raw")
-
-
-def same(first: Any, second: Any) -> bool:
-    if isinstance(first, torch.Tensor):
-        return torch.equal(first, second)
-    return bool(first == second)
 
 
 def test_images_are_bit_by_bit_those_of_the_plain_recipe(da: DeepAccident, sample: str) -> None:
@@ -46,8 +41,7 @@ def test_images_are_bit_by_bit_those_of_the_plain_recipe(da: DeepAccident, sampl
     for a, name in enumerate(item["agents"]):
         for p, frame in enumerate((2, 4)):
             for c, camera in enumerate(IMAGES.cameras):
-                token = f"{da.scenario[0]['token']}/{name}/{frame:03d}/{camera}"
-                pixels = np.ascontiguousarray(IMAGES.load(da, token)[0].transpose(2, 0, 1))
+                pixels = IMAGES.load(da, f"{da.scenario[0]['token']}/{name}/{frame:03d}/{camera}")[0].transpose(2, 0, 1)
                 expected = (pixels.astype(np.float32) / np.float32(255) - mean) / std
                 assert_array_equal(item["images"][a, p, c].numpy(), expected)
 
@@ -58,10 +52,9 @@ def test_a_cached_item_is_the_same(da: DeepAccident, folder: Path, tokens: list[
     config = replace(CONFIG, images=images)
     plain, quick = (V2XDataset(da, tokens[:3], each) for each in (config, replace(config, images_cache=folder)))
     for expected, found in zip(plain, quick, strict=True):
-        assert expected.keys() == found.keys()
-        assert all(same(expected[key], found[key]) for key in expected)
+        assert same(expected, found)
         found["images"][:] = 0  # an item is its receiver's own
-    assert all(same(plain[0][key], quick[0][key]) for key in plain[0])
+    assert same(plain[0], quick[0])
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -69,15 +62,7 @@ def test_a_cached_item_is_the_same(da: DeepAccident, folder: Path, tokens: list[
 def test_workers_read_the_cache(da: DeepAccident, folder: Path, tokens: list[str], context: str) -> None:
     data = V2XDataset(da, tokens, replace(CONFIG, images_cache=folder))
     here = [data[index] for index in range(len(data))]  # files are open when workers are forked
-    loader = DataLoader(
-        data,
-        batch_size=None,
-        num_workers=2,
-        multiprocessing_context=multiprocessing.get_context(context),
-    )
-    for expected, found in zip(here, loader, strict=True):
-        assert found["token"] == expected["token"]
-        assert torch.equal(found["images"], expected["images"])
+    assert same(list(DataLoader(data, batch_size=None, num_workers=2, multiprocessing_context=context)), here)
 
 
 @pytest.mark.parametrize(
@@ -86,25 +71,21 @@ def test_workers_read_the_cache(da: DeepAccident, folder: Path, tokens: list[str
         ({"images": replace(IMAGES, resize=(36, 60))}, r"has resize=\(18, 30\), wanted is \(36, 60\)"),
         ({"images": replace(IMAGES, decode="scaled")}, "has decode='full', wanted is 'scaled'"),
         ({"images_cache": "nowhere"}, "nowhere holds no cache of images"),
+        ({"images": None}, "images_cache: changes nothing without images"),
     ],
 )
 def test_what_the_cache_cannot_serve_is_refused(
     da: DeepAccident, folder: Path, sample: str, changes: dict[str, Any], words: str
 ) -> None:
-    config = replace(CONFIG, **{"images": IMAGES, "images_cache": folder, **changes})
-    assert_refused((lambda: V2XDataset(da, [sample], config), ConfigError, words))
-
-
-def test_a_cache_without_images_is_refused() -> None:
     assert_refused(
-        (lambda: V2XConfig(images_cache="cache"), ConfigError, "images_cache: changes nothing without images")
+        (lambda: V2XDataset(da, [sample], replace(CONFIG, **{"images_cache": folder} | changes)), ConfigError, words)
     )
 
 
 def test_samples_and_agents_that_are_not_in_it_are_refused(da: DeepAccident, sample: str, tmp_path: Path) -> None:
     alone = cached(da, tmp_path / "out", agents=("ego_vehicle",))
     config = replace(CONFIG, agents="single", images_cache=alone)
-    assert len(V2XDataset(da, [sample], config)) == 1
+    assert V2XDataset(da, [sample], config)
     assert_refused(
         (
             lambda: V2XDataset(da, [sample, sample.replace("ego_vehicle", "other_vehicle")], config),
@@ -125,14 +106,14 @@ def test_images_that_the_release_lacked_are_skipped_or_refused(
     out = cached(da_partial, tmp_path / "out")
     token = sample.replace("ego_vehicle", "other_vehicle")
     config = V2XConfig(agents=("ego_vehicle",), points=False, images=IMAGES, images_cache=out)
-    with pytest.raises(MissingFileError, match=r"has no image .*/004/Camera_Front, which the release lacked"):
-        V2XDataset(da_partial, [token], config)[0]
-    skipping = replace(config, on_missing="skip")
+    lacked = r"has no image .*/004/Camera_Front, which the release lacked"
+    assert_refused((lambda: V2XDataset(da_partial, [token], config)[0], MissingFileError, lacked))
     item, expected = (
-        V2XDataset(da_partial, [token], each)[0] for each in (skipping, replace(skipping, images_cache=None))
+        V2XDataset(da_partial, [token], replace(config, on_missing="skip", images_cache=cache))[0]
+        for cache in (out, None)
     )
     assert item["agent_valid"].tolist() == [[True], [False]]
-    assert all(same(item[key], expected[key]) for key in item)
+    assert same(item, expected)
 
 
 def test_scaled_items_are_about_the_same(da: DeepAccident, sample: str) -> None:

@@ -49,9 +49,9 @@ def seeded(da: DeepAccident, moment: list[str]) -> Callable[..., "V2XFormer"]:
     def made(config: "ModelConfig", seed: int = 0) -> "V2XFormer":
         torch.manual_seed(seed)
         model = V2XFormer(config)
-        norms = [each for each in model.modules() if isinstance(each, torch.nn.modules.batchnorm._BatchNorm)]
-        for norm in norms:
-            norm.momentum = 1.0
+        for module in model.modules():
+            if isinstance(module, torch.nn.modules.batchnorm._BatchNorm):
+                module.momentum = 1.0
         with torch.no_grad():
             model(inputs(config.images, config.temporal.frames, config.handedness))
         return model.eval()

@@ -1,12 +1,14 @@
 """The model's door: its frame, frames that did not arrive, and egomotion."""
 
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
+from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.torch import AllEgosDataset, V2XConfig, V2XDataset, collate, collate_all_egos
@@ -47,22 +49,22 @@ def test_a_left_handed_model_sees_all_in_the_mirror(batch: dict[str, Any]) -> No
     bent = batch | {"agent_from_past": batch["agent_from_past"].clone()}
     bent["agent_from_past"][:, :, 0] = augmented @ bent["agent_from_past"][:, :, 0]
     right, left = model_inputs(bent), model_inputs(bent, "left")
-    flips = {"ego_from_agent": flip_pose, "bev_transform": flip_pose, "egomotion": flip_six_vector}
-    for name, flip in flips.items():
+    for name, flip in {"ego_from_agent": flip_pose, "bev_transform": flip_pose, "egomotion": flip_six_vector}.items():
         mirrored = flip(getattr(right, name).numpy())
         np.testing.assert_allclose(getattr(left, name).numpy(), mirrored, atol=1e-5)
         assert name == "bev_transform" or np.abs(mirrored - getattr(right, name).numpy()).max() > 1e-3
     np.testing.assert_allclose(points(left).numpy(), flip_points(points(right).numpy()), atol=1e-4)
-    for name in ("images", "frame_valid", "ego_rows", "partners", "is_infrastructure", "delay"):
-        assert torch.equal(getattr(left, name), getattr(right, name))
-    assert torch.equal(left.cameras.intrinsics, right.cameras.intrinsics)
+    unchanged = attrgetter(
+        "images", "frame_valid", "ego_rows", "partners", "is_infrastructure", "delay", "cameras.intrinsics"
+    )
+    assert same(unchanged(left), unchanged(right))
 
 
 def test_a_right_handed_model_sees_the_batch_as_it_is(batch: dict[str, Any]) -> None:
     inputs, cameras = model_inputs(batch), batch["ego_from_camera"]
-    found = (inputs.images, inputs.bev_transform, inputs.cameras.rotation, inputs.cameras.translation)
-    expected = (batch["images"], batch["augmentation"], cameras[..., :3, :3], cameras[..., :3, 3])
-    assert_close([*found, inputs.cameras.intrinsics], [*expected, batch["intrinsics"]], rtol=0, atol=0)
+    found = attrgetter("images", "bev_transform", "cameras.rotation", "cameras.translation", "cameras.intrinsics")
+    poses = (cameras[..., :3, :3], cameras[..., :3, 3])
+    assert same(found(inputs), (batch["images"], batch["augmentation"], *poses, batch["intrinsics"]))
     assert_close(inputs.ego_from_agent, batch["ego_from_agent"][:, :, -1])
     assert (inputs.ego_rows.tolist(), inputs.partners.tolist()) == ([[0, 0]], [[True] * 5])
     assert [name == "infrastructure" for name in batch["agents"][0]] == inputs.is_infrastructure[0].tolist()
@@ -84,9 +86,8 @@ def test_egomotion_is_that_of_the_labels_without_the_augmentation(
     rows = model_inputs(batch).egomotion
     assert not rows[:, :, -1].any()
     for column, name in enumerate(batch["agents"][0]):
-        [token] = [each for each in moment if each.split("/")[-2] == name]
-        wanted = V2XDataset(da, [token], replace(given, images=None))[0]["future_egomotion"]
-        assert_close(rows[0, column, :-1], wanted[: PAST - 1], atol=1e-4, rtol=0)
+        [item] = V2XDataset(da, [each for each in moment if f"/{name}/" in each], replace(given, images=None))
+        assert_close(rows[0, column, :-1], item["future_egomotion"][: PAST - 1], atol=1e-4, rtol=0)
     assert rows[:, :, :-1, 0].abs().max() > 0.1  # somebody drives
 
 
@@ -97,41 +98,32 @@ def test_egomotion_is_that_of_the_labels_without_the_augmentation(
         ([True, False, True], [False, False, True]),
         ([False, True, True], [False, True, True]),
         ([False, False, True], [False, False, True]),
+        ([True, True, False], [False, False, False]),
     ],
 )
 def test_a_frame_that_did_not_arrive_is_the_present(
     batch: dict[str, Any], arrived: list[bool], valid: list[bool]
 ) -> None:
-    """What lies before a gap cannot be joined, and so is lost too."""
+    """What lies before a gap cannot be joined, and so is lost too; without a present, the agent is no partner."""
     changed = batch | {"agent_valid": batch["agent_valid"].clone()}
     changed["agent_valid"][0, 2] = torch.tensor(arrived)
     whole, inputs = model_inputs(batch), model_inputs(changed)
-    assert inputs.frame_valid[0, 2].tolist() == valid
-    for frame, there in enumerate(valid):
-        source = frame if there else PAST - 1
-        assert torch.equal(inputs.images[0, 2, frame], batch["images"][0, 2, source])
-        assert torch.equal(inputs.cameras.rotation[0, 2, frame], batch["ego_from_camera"][0, 2, source, :, :3, :3])
-        assert torch.equal(inputs.cameras.intrinsics[0, 2, frame], batch["intrinsics"][0, 2, source])
-        expected = whole.egomotion[0, 2, frame] if there else torch.zeros(6)
-        assert torch.equal(inputs.egomotion[0, 2, frame], expected)
-    others = [0, 1, 3, 4]
-    assert torch.equal(inputs.images[:, others], whole.images[:, others])
-    assert inputs.frame_valid[:, others].all()
-
-
-def test_an_agent_whose_present_did_not_arrive_is_no_partner(batch: dict[str, Any]) -> None:
-    changed = batch | {"agent_valid": batch["agent_valid"].clone()}
-    changed["agent_valid"][0, 3, -1] = False
-    inputs = model_inputs(changed)
-    assert (inputs.partners.tolist(), inputs.frame_valid[0, 3].any()) == ([[True, True, True, False, True]], False)
+    every = [True] * PAST
+    assert inputs.frame_valid.tolist() == [[every, every, valid, every, every]]
+    assert inputs.partners.tolist() == [[True, True, arrived[-1], True, True]]
+    source = torch.arange(PAST).repeat(5, 1)
+    source[2] = torch.tensor([frame if there else PAST - 1 for frame, there in enumerate(valid)])
+    sent = torch.arange(5)[:, None], source
+    found = attrgetter("images", "cameras.rotation", "cameras.intrinsics")
+    assert same(found(inputs), tuple(each[0][sent][None] for each in found(whole)))
+    assert torch.equal(inputs.egomotion, whole.egomotion * inputs.frame_valid[..., None])
 
 
 def test_the_first_frames_of_a_recording_have_no_past(da: DeepAccident, moment: list[str], given: V2XConfig) -> None:
-    first = moment[0].replace("/004", "/002")
-    inputs = model_inputs(collate([V2XDataset(da, [first], given)[0]]))
+    inputs = model_inputs(collate([V2XDataset(da, [moment[0].replace("/004", "/002")], given)[0]]))
     assert inputs.frame_valid[0].tolist() == [[False, True, True]] * 5
-    assert torch.equal(inputs.images[:, :, 0], inputs.images[:, :, 2])
-    assert not torch.equal(inputs.images[:, :, 1], inputs.images[:, :, 2])
+    first, second, present = inputs.images.unbind(2)
+    assert (torch.equal(first, present), torch.equal(second, present)) == (True, False)
 
 
 def test_only_partners_data_are_late(batch: dict[str, Any]) -> None:
@@ -141,26 +133,18 @@ def test_only_partners_data_are_late(batch: dict[str, Any]) -> None:
 
 def test_egos_have_their_own_places(da: DeepAccident, moment: list[str], given: V2XConfig) -> None:
     """Poses of each ego, whichever agent's frame the moment is given in."""
-    data = AllEgosDataset(da, moment[1:4], replace(given, agents="+other"))
-    inputs = model_inputs(collate_all_egos([data[0]]))
-    agents = data[0]["agents"]
-    egos = [agents[column] for column in inputs.ego_rows[:, 1].tolist()]
-    assert egos == [each.split("/")[-2] for each in moment[1:4]]
-    for row, token in enumerate(moment[1:4]):
-        ego_from_world = da.world_from(token, "ego").inverse()
-        for column, name in enumerate(agents):
-            partner = next(each for each in moment if each.split("/")[-2] == name)
-            expected = (ego_from_world @ da.world_from(partner, "ego")).matrix
-            np.testing.assert_allclose(inputs.ego_from_agent[row, column], expected, atol=1e-4)
-        assert inputs.partners[row, inputs.ego_rows[row, 1]]
-    some = inputs.of_egos(torch.tensor([2, 0]))
-    for name in ("ego_rows", "ego_from_agent", "partners"):
-        assert torch.equal(getattr(some, name), getattr(inputs, name)[[2, 0]])
+    [item] = AllEgosDataset(da, moment[1:4], replace(given, agents="+other"))
+    inputs = model_inputs(collate_all_egos([item]))
+    agents = [next(each for each in moment if f"/{name}/" in each) for name in item["agents"]]
+    assert [agents[column] for column in inputs.ego_rows[:, 1].tolist()] == moment[1:4]
+    expected = [[da.transform(ego, agent).matrix for agent in agents] for ego in moment[1:4]]
+    np.testing.assert_allclose(inputs.ego_from_agent, expected, atol=1e-4)
+    assert inputs.partners[torch.arange(3), inputs.ego_rows[:, 1]].all()
+    some, of_egos = inputs.of_egos(torch.tensor([2, 0])), attrgetter("ego_rows", "ego_from_agent", "partners")
+    assert same(of_egos(some), tuple(each[[2, 0]] for each in of_egos(inputs)))
     assert some.images is inputs.images
 
 
 def test_all_tensors_go_to_a_device(batch: dict[str, Any]) -> None:
-    moved = model_inputs(batch).to("meta")
-    tensors = [getattr(moved, each.name) for each in fields(moved) if each.name != "cameras"]
-    tensors += [getattr(moved.cameras, each.name) for each in fields(moved.cameras)]
-    assert {str(each.device) for each in tensors} == {"meta"}
+    moved = asdict(model_inputs(batch).to("meta"))
+    assert {str(each.device) for each in (*moved.pop("cameras").values(), *moved.values())} == {"meta"}

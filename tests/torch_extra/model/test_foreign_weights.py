@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model import load_model
 from deepaccident_devkit.model.checkpoint import read_weights, write_weights
 
 NAME = "img_neck.weight"
+SHORT = r"\A.{,600}\Z"
 
 
 def network() -> torch.nn.Module:
@@ -44,9 +46,11 @@ def mmcv() -> Any:
         "PALETTE": [(1, 2, 3)],
         "hook_msgs": {},
         "iter": 1 << 40,
-    }
-    meta |= {"best": np.float64(0.3), "numbers": numbers, "again": numbers, "size": torch.Size([3, 4]), "flag": True}
-    meta |= {
+        "best": np.float64(0.3),
+        "numbers": numbers,
+        "again": numbers,
+        "size": torch.Size([3, 4]),
+        "flag": True,
         "dtype": torch.float32,
         "device": torch.device("cpu"),
         "path": pathlib.PosixPath("/a/b/c/d/e/f/g/h/i/epoch.pth"),
@@ -88,11 +92,9 @@ def test_the_healthy_file_beside_the_hostile_ones(tmp_path: Path, *, old_form: b
 
 
 def test_items_as_python_2_wrote_them(tmp_path: Path) -> None:
-    content = pt(
-        b"ccollections\nOrderedDict\n]](U\x0fimg_neck.weight" + tensor(b"K\x02\x85", b"K\x01\x85") + b"ea\x85R."
-    )
-    (tmp_path / "old.pth").write_bytes(content)
-    assert list(read_weights(tmp_path / "old.pth").tensors) == [NAME]
+    path, items = tmp_path / "old.pth", b"]](U\x0fimg_neck.weight" + tensor(b"K\x02\x85", b"K\x01\x85") + b"ea"
+    path.write_bytes(pt(b"ccollections\nOrderedDict\n" + items + b"\x85R."))
+    assert list(read_weights(path).tensors) == [NAME]
 
 
 def pt(pickled: bytes, storage: bytes = bytes(16), way: int = zipfile.ZIP_STORED) -> bytes:
@@ -241,17 +243,19 @@ for path in sys.argv[1:]:
 
 def test_bombs_and_nonsense_are_refused_in_little_memory(tmp_path: Path) -> None:
     """In a process with 2 GiB; each takes at most what its file has several times, and some 300 MB."""
-    for number, content in enumerate(HOSTILE.values()):
-        (tmp_path / f"{number}.pth").write_bytes(content)
     paths = [str(tmp_path / f"{number}.pth") for number in range(len(HOSTILE))]
+    for path, content in zip(paths, HOSTILE.values(), strict=True):
+        Path(path).write_bytes(content)
     ended = subprocess.run([sys.executable, "-c", CODE, *paths], capture_output=True, text=True, check=True)
-    told = [json.loads(line) for line in ended.stdout.splitlines()]
-    wrong = []
-    for what, path, (_, said, taken) in zip(HOSTILE, paths, told, strict=True):
-        good = said and re.fullmatch(rf"{re.escape(path)}: (is no|holds no) [^\n]*; give [^\n]*", said)
-        if not good or len(said) > 700 or taken > 300:
-            wrong.append((what, said, taken))
-    assert wrong == []
+    told = dict(zip(HOSTILE, map(json.loads, ended.stdout.splitlines()), strict=True))
+    refusal = re.compile(r"(?P<path>.*\.pth): (is no|holds no) .*; give .*")
+    wrong = {
+        what: (said, taken)
+        for what, (path, said, taken) in told.items()
+        for refused in [refusal.fullmatch(said or "")]
+        if not refused or refused["path"] != path or len(said) > 700 or taken > 300
+    }
+    assert wrong == {}
 
 
 @pytest.mark.parametrize(
@@ -269,6 +273,5 @@ def test_bombs_and_nonsense_are_refused_in_little_memory(tmp_path: Path) -> None
 def test_notes_of_no_model_are_refused(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "weights.safetensors"
     write_weights(path, {NAME: BASE}, {"preset": "tiny", "fusion": None, "horizon": None, **change})
-    with pytest.raises(ConfigError, match=r"does not say which model its weights are of \([^\n]*\); give") as error:
-        load_model(path)
-    assert len(str(error.value)) < 600
+    told = r"does not say which model its weights are of \([^\n]*\); give"
+    assert_refused((lambda: load_model(path), ConfigError, told), (lambda: load_model(path), ConfigError, SHORT))

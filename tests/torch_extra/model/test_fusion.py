@@ -42,11 +42,10 @@ def module(config: FusionConfig) -> Fusion:
 
 def batch(agents: int = 4, height: int = 7, width: int = 9) -> Batch:
     """Sizes that no window divides; slot 2 is at the roadside, one partner is a step late."""
-    generator = torch.Generator().manual_seed(5)
+    generator, slots = torch.Generator().manual_seed(5), torch.arange(agents).expand(2, agents)
     x = torch.randn(2, agents, C, height, width, generator=generator)
     mask = torch.rand(2, agents, height, width, generator=generator) > 0.3
     mask[:, 0] = True
-    slots = torch.arange(agents).expand(2, agents)
     return x, mask, slots == 2, (slots == 1).long()
 
 
@@ -54,18 +53,14 @@ def batch(agents: int = 4, height: int = 7, width: int = 9) -> Batch:
 def test_masked_partners_leave_the_ego_alone(config: FusionConfig) -> None:
     x, mask, infra, delay = batch()
     mask[:, 1:] = False
-    alone = module(config)(x[:, :1], mask[:, :1], infra[:, :1], delay[:, :1])
-    assert alone.shape == (2, C, 7, 9)
+    alone = module(config)(*[each[:, :1] for each in (x, mask, infra, delay)])
     torch.testing.assert_close(module(config)(x, mask, infra, delay), alone, atol=2e-6, rtol=0)
 
 
 @ALL
 def test_partners_count_in_any_order(config: FusionConfig) -> None:
-    x, mask, infra, delay = batch()
-    order = [0, 3, 1, 2]
-    fused = module(config)(x, mask, infra, delay)
-    swapped = module(config)(x[:, order], mask[:, order], infra[:, order], delay[:, order])
-    torch.testing.assert_close(swapped, fused, atol=1e-5, rtol=0)
+    swapped = module(config)(*[each[:, [0, 3, 1, 2]] for each in batch()])
+    torch.testing.assert_close(swapped, module(config)(*batch()), atol=1e-5, rtol=0)
 
 
 @ALL
@@ -73,24 +68,18 @@ def test_partners_count_in_any_order(config: FusionConfig) -> None:
 def test_what_the_mask_hides_has_no_effect(config: FusionConfig, training: bool) -> None:
     x, mask, infra, delay = batch()
     garbage = torch.where(mask[:, :, None], x, torch.nan)
-    results = []
-    for given_x in (x, garbage):
-        model = module(config).train(training)
-        torch.manual_seed(1)
-        results.append(model(given_x, mask, infra, delay))
-    assert torch.equal(results[1], results[0])
+    assert torch.equal(*[module(config).train(training)(each, mask, infra, delay) for each in (x, garbage)])
 
 
 @ALL
 def test_every_partner_counts_where_it_is_seen_and_each_sample_for_itself(config: FusionConfig) -> None:
     x, mask, infra, delay = batch()
-    mask[:] = True
-    model = module(config)
-    fused = model(x, mask, infra, delay)
+    model, whole = module(config), torch.ones_like(mask)
+    fused = model(x, whole, infra, delay)
     for slot in range(4):
         changed = x.clone()
         changed[0, slot] *= 3
-        other = model(changed, mask, infra, delay)
+        other = model(changed, whole, infra, delay)
         assert not torch.allclose(other[0], fused[0], atol=1e-4)
         torch.testing.assert_close(other[1], fused[1])
 
@@ -110,9 +99,8 @@ def test_without_delay_v2xvit_s_weights_of_the_sines_have_no_gradient() -> None:
     x, mask, infra, delay = batch()
     model = module(V2XVIT)
     model(x, mask, infra, torch.zeros_like(delay)).sum().backward()
-    grad = model.delay_encoding.linear.weight.grad
-    assert not grad[:, 0::2].any()
-    assert grad[:, 1::2].any()
+    sines, cosines = model.delay_encoding.linear.weight.grad.unflatten(1, (-1, 2)).unbind(2)
+    assert (sines.any(), cosines.any()) == (False, True)
 
 
 @ALL
@@ -132,26 +120,25 @@ def test_mean_and_maximum_are_over_those_that_are_seen() -> None:
 
 
 def test_released_fusion_fills_near_empty_and_masked_cells_and_keeps_channels_of_the_ego() -> None:
+    """Cell (1, 1) of partner 2 is near empty, (0, 0) of partner 1 masked."""
     x, mask, infra, delay = (each[:1, :3] for each in batch())
-    mask[:] = True
+    mask[:], x[0, 2, :, 1, 1] = True, 1e-4
     mask[0, 1, 0, 0] = False
-    x[0, 2, :, 1, 1] = 1e-4
-    fused = module(RELEASED)(x, mask, infra, delay)
-    expected = x.clone()
-    expected[0, 1, :, 0, 0] = x[0, 0, :, 0, 0]
-    expected[0, 2, :, 1, 1] = x[0, 0, :, 1, 1]
-    expected = expected.mean(1)
+    fused, kept = (module(each)(x, mask, infra, delay) for each in (RELEASED, replace(RELEASED, fill_below=1e-5)))
+    filled = torch.zeros(1, 3, 1, 7, 9, dtype=torch.bool)
+    filled[0, [1, 2], 0, [0, 1], [0, 1]] = True
+    expected = torch.where(filled, x[:, :1], x).mean(1)
     expected[:, [1, 4]] = x[:, 0, [1, 4]]
     torch.testing.assert_close(fused, expected)
-    kept = module(replace(RELEASED, fill_below=1e-5))(x, mask, infra, delay)
-    changed = (kept - fused)[0].abs().amax(0) > 1e-6
-    assert changed.nonzero().tolist() == [[1, 1]]
+    assert ((kept - fused)[0].abs().amax(0) > 1e-6).nonzero().tolist() == [[1, 1]]
 
 
 def test_released_fusion_can_hold_its_unused_layers() -> None:
     plain, holding = (module(replace(RELEASED, agent3d=unused)) for unused in (None, Agent3DConfig(channels=C)))
-    assert not plain.state_dict()
-    assert {key.split(".")[0] for key in holding.state_dict()} == {"model", "compression"}
+    assert [{key.split(".")[0] for key in each.state_dict()} for each in (plain, holding)] == [
+        set(),
+        {"model", "compression"},
+    ]
     assert torch.equal(holding(*batch()), plain(*batch()))
     assert not any(weight.requires_grad for weight in holding.parameters())
 
@@ -159,52 +146,44 @@ def test_released_fusion_can_hold_its_unused_layers() -> None:
 def test_unreached_layers_fuse_all_agents_and_poses() -> None:
     model = Agent3D(Agent3DConfig(channels=C, agents=3, bottlenecks=1)).train()
     x, pose = torch.randn(2, 3, C, 7, 9, requires_grad=True), torch.randn(2, 3, 6, requires_grad=True)
-    fused = model(x, pose)
-    assert fused.shape == (2, C, 7, 9)
-    (fused**2).sum().backward()
+    (model(x, pose) ** 2).sum().backward()
     assert all(weight.grad.ne(0).any() for weight in model.parameters())
     assert x.grad.flatten(2).ne(0).any(2).all()
-    assert not pose.grad[:, 0].any()
-    assert pose.grad[:, 1:].ne(0).any(2).all()
+    assert pose.grad.ne(0).any(2).tolist() == [[False, True, True]] * 2
 
 
 def test_disconet_s_weights_are_shares() -> None:
     x, mask, *_ = batch()
-    for config in (DISCONET, replace(DISCONET, last_relu=True)):
-        weights = module(config).weights(x, mask)
-        torch.testing.assert_close(weights.sum(1), torch.ones(2, 7, 9))
-        assert not weights[~mask].any()
-    assert not torch.allclose(module(DISCONET).weights(x, mask), weights)
+    shares = [module(each).weights(x, mask) for each in (DISCONET, replace(DISCONET, last_relu=True))]
+    torch.testing.assert_close(torch.stack(shares).sum(2), torch.ones(2, 2, 7, 9))
+    assert not torch.stack(shares)[:, ~mask].any()
+    assert not torch.allclose(*shares)
 
 
 def test_cobevt_by_slots_depends_on_the_order_and_has_an_end_of_slots() -> None:
-    x, mask, infra, delay = batch()
     model = module(replace(COBEVT, agent_relation="slots", agents=4))
     for name, table in model.named_parameters():
         if name.endswith("bias_table"):
             torch.nn.init.normal_(table)
-    order = [0, 3, 1, 2]
-    fused = model(x, mask, infra, delay)
-    assert not torch.allclose(model(x[:, order], mask[:, order], infra, delay), fused, atol=1e-4)
-    with pytest.raises(ConfigError, match=r"for 4 slots, found 5; raise CobevtConfig\.agents"):
-        model(*batch(agents=5))
+    swapped = model(*[each[:, [0, 3, 1, 2]] for each in batch()])
+    assert not torch.allclose(swapped, model(*batch()), atol=1e-4)
+    told = r"for 4 slots, found 5; raise CobevtConfig\.agents"
+    assert_refused((lambda: model(*batch(agents=5)), ConfigError, told))
 
 
 def test_v2xvit_knows_kinds_and_delays() -> None:
     x, mask, infra, delay = batch()
-    model = module(V2XVIT)
+    model, other = module(V2XVIT), module(replace(V2XVIT, delay_rate=1))
     fused = model(x, mask, infra, delay)
-    others = (model(x, mask, ~infra, delay), model(x, mask, infra, 3 * delay))
-    for other in (*others, module(replace(V2XVIT, delay_rate=1))(x, mask, infra, delay)):
-        assert not torch.allclose(other, fused, atol=1e-4)
+    for kinds, delays, each in ((~infra, delay, model), (infra, 3 * delay, model), (infra, delay, other)):
+        assert not torch.allclose(each(x, mask, kinds, delays), fused, atol=1e-4)
 
 
 @pytest.mark.parametrize("config", [replace(V2XVIT, masked_cells="windowed"), replace(COBEVT, masked_cells="averaged")])
 def test_transformers_can_see_what_the_mask_hides(config: FusionConfig) -> None:
     x, mask, infra, delay = batch()
     louder = torch.where(mask[:, :, None], x, 3 * x)
-    seen, as_it_is = (module(config)(each, mask, infra, delay) for each in (louder, x))
-    assert not torch.allclose(seen, as_it_is, atol=1e-4)
+    assert not torch.allclose(*[module(config)(each, mask, infra, delay) for each in (louder, x)], atol=1e-4)
 
 
 @settings(max_examples=30)
@@ -212,9 +191,8 @@ def test_transformers_can_see_what_the_mask_hides(config: FusionConfig) -> None:
 def test_windows_are_joined_as_they_were_split(size: int, height: int, width: int, strided: bool) -> None:
     windows = Windows(size=size, strided=strided)
     maps = torch.rand(2, 3, height, width, 2) + 1
-    tokens = windows.split(maps)
+    tokens, known = windows.split(maps), windows.split_mask(torch.ones(2, 3, height, width, dtype=torch.bool))
     assert torch.equal(windows.join(tokens, maps.shape[:4]), maps)
-    known = windows.split_mask(torch.ones(2, 3, height, width, dtype=torch.bool))
     assert torch.equal(known, tokens[..., 0] > 0)
     assert known.any(1).all()
     assert int(known.sum()) == 2 * 3 * height * width

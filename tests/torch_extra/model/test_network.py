@@ -31,15 +31,25 @@ def apart(one: list[torch.Tensor], other: list[torch.Tensor]) -> float:
     return max(float((a - b).abs().max()) for a, b in zip(one, other, strict=True))
 
 
-def of_fusion(name: str, make: Callable[[], ModelConfig] = small) -> ModelConfig:
-    config = make()
-    channels = config.lift.channels
-    own = ReleasedFusionConfig(channels=channels, ego_channels=(1, 5))  # the released numbers are of 64 channels
-    return replace(config, fusion=own if name == "released" else fusion_config(name, channels))
+def of_fusion(name: str) -> ModelConfig:
+    own = ReleasedFusionConfig(channels=8, ego_channels=(1, 5))  # the released numbers are of 64 channels
+    return replace(small(), fusion=own if name == "released" else fusion_config(name, 8))
 
 
 def alone(da: DeepAccident, token: str, config: ModelConfig, agents: Any, **options: Any) -> dict[str, Any]:
     return V2XDataset(da, [token], config.inputs(agents, **options))[0]
+
+
+def egos_by_themselves(
+    model: V2XFormer, predicted: Predicted, da: DeepAccident, tokens: list[str], agents: str, rows: slice = slice(None)
+) -> list[str]:
+    """A moment's egos; what is predicted for some of them at once is what is predicted for each by itself."""
+    [item] = AllEgosDataset(da, tokens, model.config.inputs(agents))
+    together = predicted(model, model_inputs(collate_all_egos([item]), model.config.handedness))
+    for row, token in list(enumerate(item["egos"]))[rows]:
+        inputs = model_inputs(collate([alone(da, token, model.config, agents)]), model.config.handedness)
+        assert_same([each[row : row + 1] for each in together], predicted(model, inputs))
+    return list(item["egos"])
 
 
 @pytest.mark.parametrize("agents", ["all", "single", "+other"])
@@ -53,14 +63,8 @@ def test_all_egos_at_once_are_each_by_itself(
     make: Callable[[], ModelConfig],
 ) -> None:
     """With the devkit's own items of each ego."""
-    config = make()
-    model = seeded(config)
-    [item] = AllEgosDataset(da, moment, config.inputs(agents))
-    together = predicted(model, model_inputs(collate_all_egos([item]), config.handedness))
-    egos = range(5) if make is small else (3,)
-    for row in egos:
-        inputs = model_inputs(collate([alone(da, moment[row], config, agents)]), config.handedness)
-        assert_same([each[row : row + 1] for each in together], predicted(model, inputs))
+    rows = slice(None) if make is small else slice(3, 4)
+    assert egos_by_themselves(seeded(make()), predicted, da, moment, agents, rows) == moment
 
 
 def test_other_moments_of_a_batch_change_nothing(
@@ -74,36 +78,26 @@ def test_other_moments_of_a_batch_change_nothing(
         alone(da, moment[4].replace("/004", "/006"), config, "+other"),
     ]
     together = predicted(model, model_inputs(collate(items)))
-    for row, item in enumerate(items):
-        one = predicted(model, model_inputs(collate([item])))
-        assert_same([each[row : row + 1] for each in together], one)
+    by_itself = [predicted(model, model_inputs(collate([item]))) for item in items]
+    assert_same(together, [torch.cat(each) for each in zip(*by_itself, strict=True)])
     later = [each.replace("/004", "/006") for each in moment[2:]]
-    given = config.inputs("all", augmentation=RandomAugmentation())
-    moments = list(AllEgosDataset(da, [*moment, *later], given))
+    moments = list(AllEgosDataset(da, [*later, *moment], config.inputs("all", augmentation=RandomAugmentation())))
     assert not torch.equal(moments[0]["augmentation"], moments[1]["augmentation"])
-    both = predicted(model, model_inputs(collate_all_egos(moments[::-1])))
-    each_alone = [predicted(model, model_inputs(collate_all_egos([each]))) for each in moments]
-    assert_same(
-        [torch.cat([each[3:], each[:3]]) for each in both],
-        [torch.cat(pair) for pair in zip(*each_alone, strict=True)],
-    )
+    both = predicted(model, model_inputs(collate_all_egos(moments)))
+    by_itself = [predicted(model, model_inputs(collate_all_egos([each]))) for each in moments]
+    assert_same(both, [torch.cat(each) for each in zip(*by_itself, strict=True)])
 
 
 @pytest.mark.parametrize("name", FUSIONS)
 def test_the_order_of_partners_does_not_matter(
     da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, name: str
 ) -> None:
-    config = of_fusion(name)
-    model = seeded(config)
-    item = alone(da, moment[0], config, "all")
-    order = [0, 3, 1, 4, 2]
+    model, order = seeded(of_fusion(name)), [0, 3, 1, 4, 2]
+    item = alone(da, moment[0], model.config, "all")
     tensors = ("agent_valid", "files_missing", "images", "ego_from_agent", "agent_from_past", "intrinsics")
     shuffled = item | {key: item[key][order] for key in (*tensors, "ego_from_camera", "image_from_ego")}
     shuffled["agents"] = tuple(item["agents"][row] for row in order)
-    results = [predicted(model, model_inputs(collate([each]))) for each in (item, shuffled)]
-    assert_same(*results)
-    single = predicted(model, model_inputs(collate([alone(da, moment[0], config, "single")])))
-    assert apart(results[0], single) > 1e-2
+    assert_same(*[predicted(model, model_inputs(collate([each]))) for each in (item, shuffled)])
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -111,16 +105,14 @@ def test_partners_that_are_not_heard_leave_the_ego_alone(
     da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, name: str
 ) -> None:
     """Exactly the single agent's prediction, whether masked or beside another item's partners."""
-    config = of_fusion(name)
-    model = seeded(config)
-    item, single = (alone(da, moment[1], config, agents) for agents in ("all", "single"))
-    inputs = model_inputs(collate([item]))
+    model = seeded(of_fusion(name))
+    item, single = (alone(da, moment[1], model.config, agents) for agents in ("all", "single"))
+    inputs, beside = model_inputs(collate([item])), model_inputs(collate([single, item]))
     masked = replace(inputs, partners=torch.tensor([[True, False, False, False, False]]))
     expected = predicted(model, model_inputs(collate([single])))
     assert_same(predicted(model, masked), expected)
+    assert_same([each[:1] for each in predicted(model, beside)], expected)
     assert apart(predicted(model, inputs), expected) > 1e-2
-    beside = predicted(model, model_inputs(collate([single, item])))
-    assert_same([each[:1] for each in beside], expected)
 
 
 def test_absent_partners_change_nothing_else(
@@ -132,29 +124,19 @@ def test_absent_partners_change_nothing_else(
     predicted: Predicted,
 ) -> None:
     """A partial release, which lacks one vehicle and another one's camera, and those agents chosen by name."""
-    model = seeded(config)
-    ego = moment[2]
-    partial = alone(da_partial, ego, config, "available")
-    assert partial["agents"] == ("other_vehicle", "ego_vehicle", "ego_vehicle_behind", "infrastructure")
-    assert partial["agent_valid"][:, -1].tolist() == [True, False, True, True]
-    chosen = alone(da, ego, config, ["ego_vehicle_behind", "infrastructure"])
-    results = [predicted(model, model_inputs(collate([each]))) for each in (partial, chosen)]
-    assert_same(*results)
-    assert apart(results[0], predicted(model, model_inputs(collate([alone(da, ego, config, "all")])))) > 1e-2
+    partial = alone(da_partial, moment[2], config, "available")
+    there = dict(zip(partial["agents"], partial["agent_valid"][:, -1].tolist(), strict=True))
+    assert there == {"other_vehicle": True, "ego_vehicle": False, "ego_vehicle_behind": True, "infrastructure": True}
+    chosen = alone(da, moment[2], config, ["ego_vehicle_behind", "infrastructure"])
+    assert_same(*[predicted(seeded(config), model_inputs(collate([each]))) for each in (partial, chosen)])
 
 
 def test_all_egos_of_a_partial_release_are_each_by_itself(
     da_partial: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
 ) -> None:
     """The moment's first agent lacks a camera: it is no ego and no partner, and the others' places stay right."""
-    model = seeded(config)
     there = [token for token in moment if "other_vehicle_behind" not in token]
-    [item] = AllEgosDataset(da_partial, there, config.inputs("available"))
-    assert item["egos"] == tuple(there[1:])
-    together = predicted(model, model_inputs(collate_all_egos([item])))
-    for row, token in enumerate(item["egos"]):
-        own = predicted(model, model_inputs(collate([alone(da_partial, token, config, "available")])))
-        assert_same([each[row : row + 1] for each in together], own)
+    assert egos_by_themselves(seeded(config), predicted, da_partial, there, "available") == there[1:]
 
 
 def test_fusions_that_ask_know_kinds_and_delays(
@@ -168,10 +150,7 @@ def test_fusions_that_ask_know_kinds_and_delays(
         model = seeded(of_fusion(name))
         for changed in (late, parked):
             assert (apart(predicted(model, inputs), predicted(model, changed)) > 1e-3) == differs
-    [item] = AllEgosDataset(da, moment, model.config.inputs("all"))
-    together = predicted(model, model_inputs(collate_all_egos([item])))
-    own = predicted(model, model_inputs(collate([alone(da, moment[4], model.config, "all")])))
-    assert_same([each[4:] for each in together], own)
+    egos_by_themselves(model, predicted, da, moment, "all", slice(4, 5))
 
 
 def test_a_left_handed_model_maps_the_mirror_image(

@@ -4,6 +4,7 @@ import importlib
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -26,11 +27,9 @@ def test_they_are_small_halves_with_their_provenance() -> None:
     weights = read_weights("tiny")
     assert (weights.path, {each.dtype for each in weights.tensors.values()}) == (SHIPPED["tiny"], {torch.float16})
     assert weights.path.stat().st_size < 1.3e6
-    made = weights.meta["made"]
-    assert made["seed"] == made["protocol"]["seeds"][0]
-    assert len(made["release"]) > 10
-    summary = Path(__file__).parents[3] / "benchmarks" / "cooperation" / "study.json"
-    assert json.loads(summary.read_text())["weights"]["scores"] == weights.meta["scored"]["scores"]
+    made, study = weights.meta["made"], Path(__file__).parents[3] / "benchmarks" / "cooperation" / "study.json"
+    assert (made["seed"], len(made["release"]) > 10) == (made["protocol"]["seeds"][0], True)
+    assert json.loads(study.read_text())["weights"]["scores"] == weights.meta["scored"]["scores"]
 
 
 @pytest.mark.slow
@@ -38,8 +37,7 @@ def test_they_score_what_their_notes_say(tmp_path: Path) -> None:
     """On a release that is made again from its seed; another machine may round otherwise, a little."""
     told = read_weights("tiny").meta["scored"]
     synth = {name: tuple(each) if isinstance(each, list) else each for name, each in told["synth"].items()}
-    root = make_release(tmp_path / "release", SynthConfig(**synth))
-    release = DeepAccident("v1", root, verbose=False)
+    release = DeepAccident("v1", make_release(tmp_path / "release", SynthConfig(**synth)), verbose=False)
     split = tmp_path / "all.txt"
     write_split_file(split, [record["token"] for record in release.scenario])
     found = validated(load_model("tiny"), release, samples(release, split, "all"), PredictConfig(agents=told["agents"]))
@@ -60,7 +58,7 @@ def test_predict_takes_them_by_their_name(release_root: Path, tmp_path: Path) ->
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     assert (tmp_path / "results" / "accident.json").is_file()
     told = read_weights("tiny").meta["scored"]["scores"]
-    line = result.output.splitlines()[-1]
+    line = result.stdout.splitlines()[-1]
     assert line.startswith("motion, labels clean: IoU ")
     assert f"here; IoU {told['iou']:.1%}, VPQ {told['vpq']:.1%} on 2 synthetic scenarios" in line
 
@@ -70,13 +68,9 @@ def test_the_demo_shows_their_prediction(da: DeepAccident, tmp_path: Path, monke
     assert demo.draw_model(da, tmp_path)
     name = demo.MODEL_PICTURE
     assert (tmp_path / name).stat().st_size > 20_000
-    page = demo.demo_page([["agents"]], [], model=True)
+    page, without = (demo.demo_page([["agents"]], [], model=there) for there in (True, False))
     assert page.index("motion_labels_1s_before.png") < page.index(name)
-    assert name not in demo.demo_page([["agents"]], [], model=False)
-
-    def missing(*_: object) -> None:
-        raise MissingExtraError("no torch")
-
-    monkeypatch.setattr("deepaccident_devkit.model.load_model", missing)
+    assert name not in without
+    monkeypatch.setattr("deepaccident_devkit.model.load_model", Mock(side_effect=MissingExtraError("no torch")))
     assert not demo.draw_model(da, tmp_path)
     assert not (tmp_path / name).exists()

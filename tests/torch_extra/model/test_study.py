@@ -41,23 +41,23 @@ def page(scripts: dict[str, ModuleType]) -> ModuleType:
     return scripts["page"]
 
 
-@pytest.fixture
-def scene(numbers: ModuleType) -> Any:
-    """Three actors on the ego's left: one hidden and two seen, of which one stands beyond the hidden one."""
-    actors = np.array([[10.5, 5.5], [20.5, 5.5], [10.5, 15.5]])
+def cells(*places: list[float]) -> np.ndarray:
+    """A map in which the cells of these places are foreground."""
     foreground = np.zeros(LABELS.grid.shape, dtype=bool)
-    index, _ = LABELS.grid.index_of(actors)
-    foreground[tuple(index.T)] = True
-    hidden = np.array([True, False, False])
-    return numbers.Scene(labels=LABELS, foreground=foreground, actors=actors, hidden=hidden, every=actors)
+    foreground[tuple(LABELS.grid.index_of(np.array(places))[0].T)] = True
+    return foreground
 
 
-def test_hidden_and_seen_actors_are_counted_apart(numbers: ModuleType, scene: Any) -> None:
-    found = np.zeros(LABELS.grid.shape, dtype=bool)
-    index, _ = LABELS.grid.index_of(np.array([[10.5, 5.5], [10.5, 15.5], [-30.0, -30.0]]))
-    found[tuple(index.T)] = True  # the hidden one, one of the seen ones, and nobody
+def test_hidden_and_seen_actors_are_counted_apart(numbers: ModuleType) -> None:
+    """Three actors on the ego's left: one hidden and two seen, of which one stands beyond the hidden one.
+
+    Found are the hidden one, one of the seen ones, and nobody.
+    """
+    hidden, beyond, seen = actors = [[10.5, 5.5], [20.5, 5.5], [10.5, 15.5]]
+    given = {"actors": np.array(actors), "hidden": np.array([True, False, False]), "every": np.array(actors)}
+    scene = numbers.Scene(labels=LABELS, foreground=cells(hidden, beyond, seen), **given)
     boxes = np.array([[20.5, 7.0], [21.5, 5.5], [10.5, 8.0], [-40.0, 0.0], [80.0, 0.0]])
-    assert numbers.found_counts(scene, found, boxes) == {
+    assert numbers.found_counts(scene, cells(hidden, seen, [-30.0, -30.0]), boxes) == {
         "hidden": 1,
         "seen": 2,
         "hidden_foreground": 1,
@@ -89,8 +89,7 @@ def test_hidden_actors_are_those_that_a_partner_alone_sees(numbers: ModuleType, 
 @pytest.fixture
 def summary(page: ModuleType) -> dict[str, Any]:
     """That of the experiment, a copy."""
-    told: dict[str, Any] = json.loads(page.SUMMARY.read_text(encoding="utf-8"))
-    return told
+    return json.loads(page.SUMMARY.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
 
 
 @pytest.mark.parametrize(
@@ -142,8 +141,7 @@ def test_a_tiny_run_of_all_of_it(
     run = study.Study(folder=tmp_path / "run", protocol=study.SMOKE)
     study.run(run)
     summary = json.loads((run.folder / study.SUMMARY).read_text())
-    assert summary["smoke"]
-    assert (summary["samples"], summary["pairs"]) == (4, 2)
+    assert (summary["smoke"], summary["samples"], summary["pairs"]) == (True, 4, 2)
     found = {name: each["numbers"] for name, each in summary["rows"].items()}
     assert found["labels, single"]["hidden_foreground"]["value"] == 0
     assert found["labels, all"]["hidden_foreground"]["value"] == found["labels, all"]["hidden_detected"]["value"] == 1
