@@ -265,7 +265,7 @@ class TestCompare:
         text = evaluate(*words, *(word for path in files for word in ("--out", path))).output
         # one cluster says nothing of others
         error = next(line.split() for line in text.splitlines() if line.startswith("position_error"))
-        assert (error[2:5], error[-2:]) == (["0.283", "2.828", "+2.546"], ["are", "needed"])
+        assert (error[2:5], error[-2:]) == (["0.283", "2.828", "+2.546"], ["too", "few"])
         assert "\n".join(f"written: {path}" for path in files) in text
         stated = json.loads(files[1].read_text())
         assert stated == json.loads(evaluate(*words, "--json").stdout)

@@ -79,5 +79,5 @@ def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, t
     assert f"accident: 20 samples in {path}, which were there already\n" in text
     assert f"detection: 20 samples in {tmp_path / 'detection.json'}\n" in text
     assert run(*words).count("which were there already") == 3
-    told = ("accident.json: is there already; choose another path, or remove it",)
+    told = ("accident.json: is there already (agents: 'single', asked for 'all')", "choose another path")
     assert_refused((lambda: run(*words, "--task", "accident", "--agents", "all"), ResultsError, told))
