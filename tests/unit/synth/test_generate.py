@@ -145,7 +145,7 @@ def test_gathering_goes_on_after_a_break(tmp_path):
 def test_another_configuration_does_not_go_on_with_it(tmp_path, stop_at):
     out, config = tmp_path / "out", SynthConfig(scenarios=2, frames=2, sensors=False)
     stop_at(out, 1, config)
-    told = "another configuration ({}: {} there, {} asked for)"
+    told = "another configuration ({}: {}, asked for {})"
     assert_refused(
         (
             lambda: make_release(out, replace(config, seed=1), workers=1),
@@ -156,7 +156,7 @@ def test_another_configuration_does_not_go_on_with_it(tmp_path, stop_at):
             (
                 lambda sensors=sensors: make_release(out, replace(config, sensors=sensors), workers=1),
                 ConfigError,
-                (f"sensors: 'none' there, '{sensors}' asked for",),
+                (f"sensors: 'none', asked for '{sensors}'",),
             )
             for sensors in ("all", "cameras")
         ),
