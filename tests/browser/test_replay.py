@@ -12,7 +12,7 @@ from processes import wait_for
 from replay_page import data_of
 from selenium.webdriver import ActionChains
 from selenium.webdriver.common.keys import Keys
-from wording import holding
+from wording import holding, lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, box_truth
@@ -66,13 +66,12 @@ def view(browser: Browser) -> list[float]:
 
 
 def scrub(browser: Browser, to: int) -> None:
-    slider = "document.getElementById('scrubber')"
-    browser.script(f"{slider}.value = {to}; {slider}.dispatchEvent(new Event('input'))")
+    choose(browser, "#scrubber", str(to), event="input")
 
 
-def choose(browser: Browser, selector: str, value: str) -> None:
-    select = f"document.querySelector('{selector}')"
-    browser.script(f"{select}.value = '{value}'; {select}.dispatchEvent(new Event('change'))")
+def choose(browser: Browser, selector: str, value: str, event: str = "change") -> None:
+    control = f"document.querySelector('{selector}')"
+    browser.script(f"{control}.value = '{value}'; {control}.dispatchEvent(new Event('{event}'))")
 
 
 def drawn(browser: Browser) -> str:
@@ -81,11 +80,10 @@ def drawn(browser: Browser) -> str:
 
 def pixels_at(browser: Browser, world: Any, origin: Any) -> list[list[int]]:
     """The colours of the canvas at places (N, 2) in world, metres, by the view that it says it has."""
-    x, y, scale = view(browser)
-    width, height = (browser.value(f"document.getElementById('ground').client{side}") for side in ("Width", "Height"))
-    across, down = (np.asarray(world) - origin - [x, y]).T * scale
-    places = np.column_stack([width / 2 + across, height / 2 - down]).tolist()
-    colors: list[list[int]] = browser.driver.execute_script(PIXELS, places)
+    *middle, scale = view(browser)
+    size = [browser.value(f"document.getElementById('ground').client{side}") for side in ("Width", "Height")]
+    places = np.array(size) / 2 + (np.asarray(world) - origin - middle) * [scale, -scale]
+    colors: list[list[int]] = browser.driver.execute_script(PIXELS, places.tolist())
     return colors
 
 
@@ -198,11 +196,11 @@ def test_who_sees_whom_is_listed_and_drawn(opened: Browser, da_motion: DeepAccid
         listed = {row[0].strip().split()[1] for row in rows if row[column].strip() == "●"}
         assert listed == {token.rsplit("/", 1)[1] for token in visible}
     assert [row[1].strip() for row in rows].count("self") == 1
-    pictures = [drawn(opened)]
+    pictures = {drawn(opened)}
     for sight in ("all", "4"):
         choose(opened, "#sight", sight)
-        pictures.append(drawn(opened))
-    assert len(set(pictures)) == 3
+        pictures.add(drawn(opened))
+    assert len(pictures) == 3
 
 
 @pytest.fixture(scope="module")
@@ -257,15 +255,15 @@ def test_one_picture_is_large_and_by_default_it_follows_the_pair(browser: Browse
         assert browser.value("document.querySelector('.agent.large img').src").endswith(camera["pictures"][frame])
         boxes = browser.value("[...document.querySelectorAll('.agent.large g')].map((g) => g.dataset.actor)")
         assert pair & set(boxes)
-    browser.script("document.querySelector('figure[data-agent=other_vehicle] .pictured').click()")
-    large = [browser.script(LARGE)]
-    browser.press("5")
-    large.append(browser.script(LARGE))
-    choose(browser, "#large", "1")
-    large.append(browser.script(LARGE))
-    browser.press("0")
-    large.append(browser.script(LARGE))
-    assert large == ["other_vehicle", "infrastructure", "ego_vehicle_behind", automatic[0]]
+    pick = "document.querySelector('figure[data-agent=other_vehicle] .pictured').click()"
+    for act, large in (
+        (lambda: browser.script(pick), "other_vehicle"),
+        (lambda: browser.press("5"), "infrastructure"),
+        (lambda: choose(browser, "#large", "1"), "ego_vehicle_behind"),
+        (lambda: browser.press("0"), automatic[0]),
+    ):
+        act()
+        assert browser.script(LARGE) == large
     widths = browser.value("[...document.querySelectorAll('.pictured')].map((each) => each.clientWidth)")
     *_, second, first = sorted(widths)
     assert first > 3.5 * second
@@ -312,18 +310,16 @@ def judged(da_motion: DeepAccident, scenario: str, tmp_path_factory: pytest.Temp
 
 def test_the_verdict_stands_beside(browser: Browser, judged: Path) -> None:
     browser.open(judged, 1280)
-    assert text(browser, "foreseen") == "Nothing was evaluated yet."
-    scrub(browser, 19)
-    assert text(browser, "foreseen").startswith("TPego at frame 20: an accident comes in 1.5 s")
+    of_20 = "TPego at frame 20: an accident comes in 1.5 s"
+    for at, told in ((0, "Nothing was evaluated yet."), (28, of_20), (19, of_20)):  # the last one that was evaluated
+        scrub(browser, at)
+        assert text(browser, "foreseen").startswith(told)
     with_it = drawn(browser)
     click(browser, "layer-prediction")
     assert drawn(browser) != with_it
-    scrub(browser, 28)
-    assert text(browser, "foreseen").startswith("TP")  # the last one that was evaluated
     browser.script("document.querySelectorAll('#samples button')[1].click()")
     assert (browser.frame(), browser.complaints()) == (29, [])
-    assert text(browser, "foreseen").startswith("FP + FNego at frame 30")
-    assert "places off by 40.0 m" in text(browser, "foreseen")
+    assert not lacking(text(browser, "foreseen"), "FP + FNego at frame 30", "places off by 40.0 m")
 
 
 CHOSEN_CUT = """

@@ -1,17 +1,14 @@
 """`python -m benchmarks loader`, on a release that is small enough for a test."""
 
-import importlib
-from pathlib import Path
-
 import pytest
+from scripts import of_checkout
 
 from deepaccident_devkit.synth import SynthConfig
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_every_way_to_load_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2])
-    benchmark = importlib.import_module("benchmarks.loader")
+    benchmark = of_checkout("benchmarks.loader")
     monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=2, image_size=(64, 36)))
     monkeypatch.setattr(benchmark, "TEAMS", {"two": benchmark.TEAMS["two"]})
     for name in ("SCENARIOS", "REPEATS"):

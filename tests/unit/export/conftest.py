@@ -25,6 +25,14 @@ def small(small_root: Path) -> DeepAccident:
 
 
 @pytest.fixture
+def unlabelled(own_release: Path) -> DeepAccident:
+    """A release without labels."""
+    for path in own_release.rglob("label/*/*.txt"):
+        path.unlink()
+    return DeepAccident("v1", own_release, verbose=False)
+
+
+@pytest.fixture
 def changing(small_root: Path, tmp_path: Path) -> Path:
     """A copy of it that a test may change."""
     return shutil.copytree(small_root, tmp_path / "changing")

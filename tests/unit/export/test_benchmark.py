@@ -4,23 +4,15 @@ import importlib
 import pkgutil
 from collections.abc import Iterator
 from inspect import isabstract
-from pathlib import Path
-from types import ModuleType
 
 import pytest
+from scripts import of_checkout
 
 import deepaccident_devkit.export
 from deepaccident_devkit.export.bulk import Format
 from deepaccident_devkit.synth import SynthConfig
 
-TOP = Path(__file__).parents[3]
-
-
-@pytest.fixture
-def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The checkout's `benchmarks.export`."""
-    monkeypatch.syspath_prepend(TOP)
-    return importlib.import_module("benchmarks.export")
+benchmark = of_checkout("benchmarks.export")
 
 
 def formats_of(kind: type[Format]) -> Iterator[type[Format]]:
@@ -31,9 +23,7 @@ def formats_of(kind: type[Format]) -> Iterator[type[Format]]:
 
 
 @pytest.mark.slow
-def test_every_format_is_measured_with_links_and_with_copies(
-    benchmark: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_format_is_measured_with_links_and_with_copies(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=6, image_size=(64, 36)))
     for name in ("SCENARIOS", "REPEATS"):
         monkeypatch.setattr(benchmark, name, 1)
@@ -47,7 +37,7 @@ def test_every_format_is_measured_with_links_and_with_copies(
     assert "export_parquet_copies_samples_per_s" not in found  # it links nothing
 
 
-def test_no_format_is_forgotten(benchmark: ModuleType) -> None:
+def test_no_format_is_forgotten() -> None:
     for module in pkgutil.walk_packages(deepaccident_devkit.export.__path__, "deepaccident_devkit.export."):
         if module.name.split(".")[2] not in ("mcap", "torch"):  # extras that need not be installed
             importlib.import_module(module.name)

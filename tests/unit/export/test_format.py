@@ -1,6 +1,7 @@
 """Settings of a format, and the names that scenarios get."""
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -9,8 +10,16 @@ from hypothesis import strategies as st
 from refusals import assert_refused
 from tiny_format import TinyFormat
 
-from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.export.bulk import flat_name
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.export.bulk import Format, flat_name
+from deepaccident_devkit.export.image_cache import CachedImages
+from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.export.nuscenes import NuScenes
+from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.export.parquet import Parquet
+from deepaccident_devkit.export.questions import Questions, WindowRules
+from deepaccident_devkit.export.released_infos import ReleasedInfos
+from deepaccident_devkit.export.webdataset import WebDataset
 
 TYPE = "type1_subtype1_accident"
 TOKENS = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="/\0"), min_size=1, max_size=250)
@@ -25,19 +34,59 @@ def test_choices_get_their_usual_spelling_and_order() -> None:
     assert TinyFormat(agents="ego_vehicle").agents == ("ego_vehicle",)  # type: ignore[arg-type]
 
 
+ONE_SIZE = ImageConfig(resize=(18, 30))
+
+
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("form", "options", "words"),
     [
-        ({"agents": ("ego",)}, "agents: expected one of"),
-        ({"agents": ()}, "agents: expected some of .*found none"),
-        ({"link": "soft"}, "link: expected one of hard, symbolic, copy, found 'soft'"),
-        ({"split": "trian"}, "split: expected one of .*did you mean 'train'"),
-        ({"where": ("town",)}, "expected field=value"),
-        ({"where": (len,)}, "expected a text such as"),
+        (TinyFormat, {"agents": ("ego",)}, "agents: expected one of"),
+        (TinyFormat, {"agents": ()}, "agents: expected some of .*found none"),
+        (TinyFormat, {"link": "soft"}, "link: expected one of hard, symbolic, copy, found 'soft'"),
+        (TinyFormat, {"split": "trian"}, "split: expected one of .*did you mean 'train'"),
+        (TinyFormat, {"where": ("town",)}, "expected field=value"),
+        (TinyFormat, {"where": (len,)}, "expected a text such as"),
+        (NuScenes, {"van": "bus"}, "van: expected one of car, truck"),
+        (NuScenes, {"lidar_axes": "kitti"}, "lidar_axes: expected one of ego, nuscenes"),
+        (OpenCood, {"ego": "infrastructure"}, "ego: expected one of ego_vehicle"),
+        (OpenCood, {"classes": ()}, "classes: expected some of car"),
+        (OpenCood, {"classes": ("bus",)}, "classes: expected one of car"),
+        (ReleasedInfos, {"agents": ("ego_vehicle",)}, "agents: the released classes need all five"),
+        (ReleasedInfos, {"root_prefix": "./data\n/DeepAccident"}, "root_prefix: expected a path"),
+        (WebDataset, {"frames": "2hz"}, "frames: expected one of every, keyframes"),
+        (CachedImages, {"images": ONE_SIZE, "codec": "png"}, "codec: expected one of raw, jpeg"),
+        (Questions, {"observers": "nobody"}, "^observers: expected one of single"),
+        (Questions, {"observers": ("ego_vehicle", "me")}, "^observers: expected one of ego_vehicle"),
+        (Questions, {"seen": "heard"}, "^seen: expected one of released, camera, annotated"),
+        (Questions, {"cameras": ("Camera_Up",)}, "^cameras: expected one of Camera_Front"),
+        (Questions, {"link": "symbolic"}, "^link: a symbolic link shows the name of the scenario"),
     ],
 )
-def test_a_wrong_choice_is_refused_before_a_release_is_opened(options: dict[str, Any], words: str) -> None:
-    assert_refused((lambda: TinyFormat(**options), ChoiceError, words))
+def test_a_wrong_choice_is_refused_before_a_release_is_opened(
+    form: type[Format], options: dict[str, Any], words: str
+) -> None:
+    assert_refused((lambda: form(**options), ChoiceError, words))
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "words"),
+    [
+        (WebDataset, {"shard_size": 0}, "shard_size: expected a number of bytes from 1, found 0"),
+        (Parquet, {"shard_scenarios": 0}, "shard_scenarios: .*from 1.*0"),
+        (CachedImages, {"images": ImageConfig()}, "a cache holds images of one size; give ImageConfig"),
+        (ImageConfig, {"decode": "half"}, "decode: expected one of full, scaled"),
+        (Questions, {"seed": 3}, "^seed: expected a text, found 3"),
+        (Questions, {"window": 5}, "^window: expected WindowRules, found int"),
+        (WindowRules, {"observe": 0.3}, "^observe: expected seconds from 0 in steps of 0.5, found 0.3"),
+        (WindowRules, {"observe": -1}, "^observe: expected seconds from 0"),
+        (WindowRules, {"observe": float("nan")}, "^observe: expected"),
+        (WindowRules, {"stride": 0}, "^stride: expected seconds from 0.5 in steps of 0.5, found 0"),
+        (WindowRules, {"stride": 0.7}, "^stride: expected seconds from 0.5"),
+        (WindowRules, {"ahead": 0}, "^ahead: expected a whole number from 1, found 0"),
+    ],
+)
+def test_impossible_settings_are_refused(kind: Callable[..., object], options: dict[str, Any], words: str) -> None:
+    assert_refused((lambda: kind(**options), ConfigError, words))
 
 
 class TestNames:

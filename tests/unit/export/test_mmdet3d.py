@@ -83,39 +83,31 @@ def test_an_info_is_a_sample_of_the_tables_with_its_files(da: DeepAccident, expo
     rows = json.loads((exported.folder / "v1.0-deepaccident" / "sample.json").read_text())
     data = json.loads((exported.folder / "v1.0-deepaccident" / "sample_data.json").read_text())
     names = {row["token"]: Path(row["filename"]) for row in data}
-    found = {info["token"]: info for split in ("train", "val") for info in infos(exported.folder, split)}
+    splits = [infos(exported.folder, split) for split in ("train", "val")]
+    assert [[info["sample_idx"] for info in each] for each in splits] == [[*range(len(each))] for each in splits]
+    found = {info["token"]: info for each in splits for info in each}
     assert set(found) == {row["token"] for row in rows}
     for row in rows:
         info = found[row["token"]]
-        assert "{scenario}/{agent}/{frame:03d}".format(**info["deepaccident"]) == row["deepaccident_token"]
-        assert info["timestamp"] == row["timestamp"] / 1e6
+        told = "{scenario}/{agent}/{frame:03d}".format(**info["deepaccident"]), info["timestamp"]
+        assert told == (row["deepaccident_token"], row["timestamp"] / 1e6)
         for channel, image in info["images"].items():
-            path = names[image["sample_data_token"]]
-            assert path == Path("samples", channel, image["img_path"])
-            assert (exported.folder / path).is_file()
+            path = Path("samples", channel, image["img_path"])
+            assert (names[image["sample_data_token"]], (exported.folder / path).is_file()) == (path, True)
         for sweep in info["lidar_sweeps"]:
             assert str(names[sweep["sample_data_token"]]) == sweep["lidar_points"]["lidar_path"]
     assert exported.tally.samples == len(rows) == 2 * len(AGENTS) * len(da.scenario)
 
 
-def test_an_info_knows_its_place(exported: Exported) -> None:
-    for split in ("train", "val"):
-        found = infos(exported.folder, split)
-        assert [info["sample_idx"] for info in found] == list(range(len(found)))
-
-
 def test_labels_are_nuscenes_own(da: DeepAccident, exported: Exported, tmp_path: Path) -> None:
-    theirs = {"van": "truck", "cyclist": "bicycle"}
     trucks = exported_to(da, tmp_path / "trucks", agents=("ego_vehicle",), van="truck")
-    seen = set()
     for folder, van in ((exported.folder, "car"), (trucks.folder, "truck")):
-        for instance in (
-            each for split in ("train", "val") for info in infos(folder, split) for each in info["instances"]
-        ):
-            name = {**theirs, "van": van}.get(instance["category"], instance["category"])
-            assert CLASSES[instance["bbox_label_3d"]] == CLASSES[instance["bbox_label"]] == name
-            seen.add((instance["category"], name))
-    assert {("van", "car"), ("van", "truck")} <= seen
+        instances = [each for split in ("train", "val") for info in infos(folder, split) for each in info["instances"]]
+        named = {
+            (each["category"], CLASSES[each[key]]) for each in instances for key in ("bbox_label_3d", "bbox_label")
+        }
+        ours = {category for category, _ in named}
+        assert named == {(each, {"van": van, "cyclist": "bicycle"}.get(each, each)) for each in ours} > {("van", van)}
 
 
 def test_velocities_are_of_the_positions(da: DeepAccident, exported: Exported) -> None:
@@ -155,9 +147,9 @@ def test_a_partial_release_is_written_and_counted(da_partial: DeepAccident, tmp_
     found = infos(made.folder)
     assert {info["deepaccident"]["agent"] for info in found} == set(AGENTS) - {"other_vehicle_behind"}
     for info in found:
-        agent = info["deepaccident"]["agent"]
-        assert ("CAM_FRONT" in info["images"]) == (agent != "ego_vehicle")
-        assert (info["lidar_sweeps"] == []) == (agent == "infrastructure" or info["deepaccident"]["frame"] == 1)
+        agent, first = info["deepaccident"]["agent"], info["deepaccident"]["frame"] == 1
+        there = "CAM_FRONT" in info["images"], info["lidar_sweeps"] == []
+        assert there == (agent != "ego_vehicle", agent == "infrastructure" or first)
 
 
 def test_without_labels_there_are_no_instances_and_without_a_split_another_file(
@@ -171,11 +163,8 @@ def test_without_labels_there_are_no_instances_and_without_a_split_another_file(
     (own_release / "train_kept" / "type1_subtype1_accident").rename(own_release / "type1_subtype1_accident")
     dataset = DeepAccident("v1", own_release, verbose=False)
     made = exported_to(dataset, tmp_path / "out", agents=("ego_vehicle",))
-    assert sorted(path.name for path in made.folder.glob("*.pkl")) == [
-        "deepaccident_infos_test.pkl",
-        "deepaccident_infos_unknown.pkl",
-        "deepaccident_infos_val.pkl",
-    ]
+    names = {path.name for path in made.folder.glob("*.pkl")}
+    assert names == {f"deepaccident_infos_{split}.pkl" for split in ("test", "unknown", "val")}
     assert [info["instances"] for info in infos(made.folder, "test")] == [[]] * 2
 
 

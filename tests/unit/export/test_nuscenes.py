@@ -12,11 +12,9 @@ import pytest
 from click.testing import CliRunner
 from nuscenes_reader import TABLES, Tables, boxes_in, channel_of, count_points, faults_of, points_of, tables_of
 from pyquaternion import Quaternion
-from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.scenes import CHANNEL_NAMES
@@ -88,7 +86,7 @@ def test_the_reader_sees_a_planted_fault(tables: Tables, table: str, field: str,
     assert any(fault in each for each in faults_of(broken))
 
 
-def disagreement(folder: Path, tables: Tables, change: Callable[[dict[str, Any]], None] = lambda _: None) -> float:
+def disagreement(folder: Path, tables: Tables, changed: Callable[..., Any] = lambda *given: given) -> float:
     """The share of boxes that hold another number of points than their rows say, in the ego's scenes."""
     wrong, total = 0, 0
     for data in rows(tables, "sample_data", is_key_frame=True, fileformat="pcd"):
@@ -96,35 +94,28 @@ def disagreement(folder: Path, tables: Tables, change: Callable[[dict[str, Any]]
             continue
         points = points_of(folder / data["filename"])
         for row, center, rotation in boxes_in(tables, data):
-            box = {"size": list(row["size"]), "center": center.copy(), "rotation": rotation, "points": points}
-            change(box)
-            found = count_points(box["points"], box["size"], box["center"], box["rotation"])
+            size, there = changed(row["size"], points)
+            found = count_points(there, size, center, rotation)
             wrong += abs(found - row["num_lidar_pts"]) > 1 + 0.02 * row["num_lidar_pts"]
             total += row["num_lidar_pts"] > 0
     assert total > 50
     return wrong / total
 
 
-def flip_y(box: dict[str, Any]) -> None:
-    box["points"] = box["points"] * np.float32([1, -1, 1, 1, 1])
-
-
-def length_first(box: dict[str, Any]) -> None:
-    box["size"][:2] = box["size"][1::-1]
-
-
-def other_axes(box: dict[str, Any]) -> None:
-    box["points"] = box["points"][:, [1, 0, 2, 3, 4]] * np.float32([-1, 1, 1, 1, 1])
-
-
 def test_boxes_hold_the_points_that_their_rows_count(exported: Exported, tables: Tables) -> None:
     assert disagreement(exported.folder, tables) == 0
 
 
-@pytest.mark.parametrize("planted", [flip_y, length_first, other_axes])
-def test_the_reader_sees_a_wrong_convention(
-    exported: Exported, tables: Tables, planted: Callable[[dict[str, Any]], None]
-) -> None:
+@pytest.mark.parametrize(
+    "planted",
+    [
+        lambda size, points: (size, points * np.float32([1, -1, 1, 1, 1])),
+        lambda size, points: ([*size[1::-1], size[2]], points),
+        lambda size, points: (size, points[:, [1, 0, 2, 3, 4]] * np.float32([-1, 1, 1, 1, 1])),
+    ],
+    ids=["flipped y", "length first", "other axes"],
+)
+def test_the_reader_sees_a_wrong_convention(exported: Exported, tables: Tables, planted: Callable[..., Any]) -> None:
     assert disagreement(exported.folder, tables, planted) > 0.2
 
 
@@ -269,23 +260,25 @@ def test_a_partial_release(da_partial: DeepAccident, tmp_path: Path) -> None:
     made = export_release(da_partial, tmp_path / "out", NuScenes(), workers=1)
     tables = tables_of(made.folder / VERSION)
     assert list(faults_of(tables)) == []
-    left_out, scenarios = made.tally.left_out, len(da_partial.scenario)
-    assert left_out["agents of scenarios that are not in this release"] == scenarios
-    assert left_out["images that are not in this release (the tables name them)"] == scenarios * FRAMES
-    assert left_out["point clouds that are not in this release (the tables name them)"] == scenarios * FRAMES
+    scenarios = len(da_partial.scenario)
+    assert made.tally.left_out.items() >= {
+        ("agents of scenarios that are not in this release", scenarios),
+        ("images that are not in this release (the tables name them)", scenarios * FRAMES),
+        ("point clouds that are not in this release (the tables name them)", scenarios * FRAMES),
+    }
     there = {path.relative_to(made.folder).as_posix() for path in made.folder.glob("s*/*/*")}
     absent = {data["filename"] for data in tables["sample_data"].values()} - there
-    assert all("infrastructure__LIDAR_TOP" in name or "ego_vehicle__CAM_FRONT__" in name for name in absent)
-    assert len(absent) == 2 * scenarios * FRAMES
+    named = [
+        [name for name in absent if part in name] for part in ("infrastructure__LIDAR_TOP", "ego_vehicle__CAM_FRONT__")
+    ]
+    assert [len(absent), *map(len, named)] == [2 * scenarios * FRAMES, scenarios * FRAMES, scenarios * FRAMES]
     for token in tables["sample"]:
         keys = rows(tables, "sample_data", sample_token=token, is_key_frame=True)
         assert {channel_of(tables, row) for row in keys} == set(CHANNEL_NAMES.values())
 
 
-def test_without_labels_there_are_sensors_and_poses(own_release: Path, one: Any) -> None:
-    for path in own_release.rglob("label/*/*.txt"):
-        path.unlink()
-    made, tables = one(DeepAccident("v1", own_release, verbose=False))
+def test_without_labels_there_are_sensors_and_poses(unlabelled: DeepAccident, one: Any) -> None:
+    made, tables = one(unlabelled)
     assert made.tally.left_out["labels that are not in this release"] == 1
     assert [len(tables[name]) for name in ("instance", "sample_annotation", "ego_pose", "sample")] == [0, 0, 4, 1]
     assert list(faults_of(tables)) == []
@@ -312,17 +305,6 @@ def test_smaller_images_have_smaller_intrinsics(own_release: Path, one: Any) -> 
     assert (image["width"], image["height"]) == (small.shape[1], small.shape[0])
     lens = tables["calibrated_sensor"][image["calibrated_sensor_token"]]["camera_intrinsic"]
     assert np.allclose(lens, np.diag([0.5, 0.5, 1]) @ camera.intrinsic)
-
-
-@pytest.mark.parametrize(
-    ("choices", "sentence"),
-    [
-        ({"van": "bus"}, "van: expected one of car, truck"),
-        ({"lidar_axes": "kitti"}, "lidar_axes: expected one of ego, nuscenes"),
-    ],
-)
-def test_impossible_choices(choices: dict[str, Any], sentence: str) -> None:
-    assert_refused((lambda: NuScenes(**choices), ChoiceError, sentence))
 
 
 def test_the_command_has_the_settings(da: DeepAccident, tmp_path: Path) -> None:

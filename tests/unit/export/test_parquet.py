@@ -9,11 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 from click.testing import CliRunner
-from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export import parquet
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.format import SPLIT_NAMES
@@ -105,19 +103,13 @@ def test_a_partial_release_has_the_rows_that_are_there(da_partial: DeepAccident,
     assert made.tally.left_out["agents of scenarios that are not in this release"] == len(da_partial.scenario)
 
 
-def test_a_table_without_rows_has_no_file(own_release: Path, tmp_path: Path) -> None:
-    for path in own_release.rglob("label/*/*.txt"):
-        path.unlink()
-    dataset = DeepAccident("v1", own_release, verbose=False)
-    folder = export(dataset, tmp_path / "out").folder
+def test_a_table_without_rows_has_no_file(unlabelled: DeepAccident, tmp_path: Path) -> None:
+    folder = export(unlabelled, tmp_path / "out").folder
     assert not any((folder / table).exists() for table in ("annotation", "instance", "track"))
-    assert_all_rows(dataset, folder)
+    assert_all_rows(unlabelled, folder)
     _, head, body = (folder / "README.md").read_text().split("---\n", maxsplit=2)
-    assert {config["config_name"] for config in yaml.safe_load(head)["configs"]} == set(table_names()) - {
-        "annotation",
-        "instance",
-        "track",
-    }
+    named = {config["config_name"] for config in yaml.safe_load(head)["configs"]}
+    assert named == set(table_names()) - {"annotation", "instance", "track"}
     assert "Here: no rows." in body
 
 
@@ -147,21 +139,7 @@ def test_readme_names_the_files_of_every_table(da: DeepAccident, tmp_path: Path)
     assert f"{len(told(da, 'sample')['train'])} rows in train" in body
 
 
-def test_the_size_of_a_shard_is_checked() -> None:
-    assert_refused((lambda: Parquet(shard_scenarios=0), ConfigError, ("shard_scenarios", "from 1", "0")))
-
-
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
-    words = [
-        "export",
-        "parquet",
-        str(da.dataroot),
-        "--out",
-        str(tmp_path / "out"),
-        "--split",
-        "train",
-        "--workers",
-        "1",
-    ]
-    CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    words = ["export", "parquet", str(da.dataroot), "--out", str(tmp_path / "out"), "--split", "train"]
+    CliRunner().invoke(deepaccident, [*words, "--workers", "1"], catch_exceptions=False)
     assert list(map(repr, rows_of(tmp_path / "out", "annotation"))) == told(da, "annotation")["train"]

@@ -167,17 +167,6 @@ def test_the_command_of_mmdet3d_has_the_style(da: DeepAccident, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("choices", "sentence"),
-    [
-        ({"agents": ("ego_vehicle",)}, "agents: the released classes need all five"),
-        ({"root_prefix": "./data\n/DeepAccident"}, "root_prefix: expected a path"),
-    ],
-)
-def test_impossible_choices(choices: dict[str, Any], sentence: str) -> None:
-    assert_refused((lambda: ReleasedInfos(**choices), ChoiceError, sentence))
-
-
-@pytest.mark.parametrize(
     ("opened", "prefix", "fitting"), [("da", "data/DeepAccident_data/", FOLDER), ("da_b", FOLDER, "./DeepAccident")]
 )
 def test_a_prefix_of_other_length_is_refused(

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
-from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.format import SPLIT_NAMES
 from deepaccident_devkit.export.webdataset import JSON_FIELDS, WebDataset
@@ -142,18 +140,14 @@ def test_a_partial_release_lacks_and_counts_what_is_missing(da_partial: DeepAcci
     absent = {"ego_vehicle": {"camera_front.jpg"}, "infrastructure": {"lidar.npy"}}
     for token, files in samples_of(made.folder).items():
         assert set(FILES) - set(files) == absent.get(token.split("/")[2], set())
-    left_out, scenarios = made.tally.left_out, len(da_partial.scenario)
-    assert left_out["agents of scenarios that are not in this release"] == scenarios
-    for kind in ("images", "point clouds"):
-        assert left_out[f"{kind} that are not in this release"] == 6 * scenarios
+    scenarios, kinds = len(da_partial.scenario), {"agents of scenarios": 1, "images": 6, "point clouds": 6}
+    expected = {f"{kind} that are not in this release": count * scenarios for kind, count in kinds.items()}
+    assert made.tally.left_out.items() >= expected.items()
 
 
-def test_without_labels_there_are_poses_and_no_boxes(own_release: Path, tmp_path: Path) -> None:
-    for path in own_release.rglob("label/*/*.txt"):
-        path.unlink()
-    dataset = DeepAccident("v1", own_release, verbose=False)
-    found = [json.loads(files["json"]) for files in samples_of(export(dataset, tmp_path / "out").folder).values()]
-    assert len(found) == len(dataset.sample)
+def test_without_labels_there_are_poses_and_no_boxes(unlabelled: DeepAccident, tmp_path: Path) -> None:
+    found = [json.loads(files["json"]) for files in samples_of(export(unlabelled, tmp_path / "out").folder).values()]
+    assert len(found) == len(unlabelled.sample)
     for facts in found:
         boxes = set(map(len, facts["boxes"].values()))
         assert (facts["labelled"], boxes, np.shape(facts["world_from_ego"])) == (False, {0}, (4, 4))
@@ -169,9 +163,8 @@ def test_a_dot_in_a_name_does_not_cut_the_key(own_release: Path, tmp_path: Path)
     dataset = DeepAccident("v1", own_release, verbose=False)
     found = samples_of(export(dataset, tmp_path / "out").folder)
     assert len(found) == len(dataset.sample)
-    renamed = [json.loads(files["json"])["scenario"] for key, files in found.items() if f"{name}%2E5/" in key]
-    assert len(renamed) > 0
-    assert all(scenario.endswith(f"/{name}.5") for scenario in renamed)
+    renamed = {json.loads(files["json"])["scenario"] for key, files in found.items() if f"{name}%2E5/" in key}
+    assert {scenario.partition("/")[2] for scenario in renamed} == {f"{name}.5"}
 
 
 def test_types_in_the_readme_are_those_of_the_samples(exported: Exported, samples: dict[str, dict[str, bytes]]) -> None:
@@ -207,13 +200,6 @@ def test_the_same_bytes_again(da: DeepAccident, exported: Exported, tmp_path: Pa
         assert {(entry.mtime, entry.uid, entry.gid, entry.uname, entry.mode) for entry in archive} == {
             (0, 0, 0, "", 0o644)
         }
-
-
-def test_impossible_choices() -> None:
-    assert_refused(
-        (lambda: WebDataset(shard_size=0), ConfigError, "shard_size: expected a number of bytes from 1, found 0"),
-        (lambda: WebDataset(frames="2hz"), ChoiceError, "frames: expected one of every, keyframes"),
-    )
 
 
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from refusals import assert_refused
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError
@@ -28,8 +29,13 @@ def test_without_torch_the_models_commands_name_the_extra(
     for name in [name for name in sys.modules if name.startswith("deepaccident_devkit.model")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MissingExtraError, match=r"the model needs PyTorch.*pip install '\.\[torch\]'"):
-        CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert_refused(
+        (
+            lambda: CliRunner().invoke(deepaccident, words, catch_exceptions=False),
+            MissingExtraError,
+            r"the model needs PyTorch.*pip install '\.\[torch\]'",
+        )
+    )
     assert CliRunner().invoke(deepaccident, [words[0], "--help"]).exit_code == 0
 
 

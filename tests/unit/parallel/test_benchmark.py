@@ -1,23 +1,13 @@
 """`python -m benchmarks engine`, with settings that are small enough for a test."""
 
-import importlib
-from pathlib import Path
-from types import ModuleType
-
 import pytest
+from scripts import of_checkout
 
-TOP = Path(__file__).parents[3]
-
-
-@pytest.fixture
-def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The checkout's `benchmarks.engine`."""
-    monkeypatch.syspath_prepend(TOP)
-    return importlib.import_module("benchmarks.engine")
+benchmark = of_checkout("benchmarks.engine")
 
 
 @pytest.mark.slow
-def test_every_engine_is_measured(benchmark: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_engine_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"SCENARIOS": 2, "FRAMES": 4, "ITEMS": 20, "BATCHES": 40, "REPEATS": 1}
     engines = {"here": (1,), "own": (2,), "dask": (2,), "mpi": (2,)}
     for name, value in {**small, "ENGINES": engines}.items():
@@ -35,7 +25,7 @@ def test_every_engine_is_measured(benchmark: ModuleType, monkeypatch: pytest.Mon
         assert minutes[0] * times[0] == pytest.approx(minutes[1] * times[1])
 
 
-def test_the_serial_share_is_of_one_core_and_bounds_all_cores(benchmark: ModuleType) -> None:
+def test_the_serial_share_is_of_one_core_and_bounds_all_cores() -> None:
     seen = {"samples": 100, "handed": 20, "item_s": 0.5, "batch_s": 0.5, "growth_mb": 1.0}
     here = benchmark.Seen(**seen, export_s=10.0, outside_s=0.9, batch_busy_s=0.0)
     engine = benchmark.Seen(**seen, export_s=6.0, outside_s=0.3, batch_busy_s=0.01)

@@ -103,14 +103,12 @@ def test_the_pair_its_motion_and_its_contact(made: Made) -> None:
         check = undisturbed(accident)
         poses, sizes = truth.fine[:, -1], truth.sizes[:, :2]
         last = gap(poses[0], sizes[0], poses[1], sizes[1])
-        assert check.usable
-        assert check.margin == pytest.approx(float(last), abs=LEANING)
+        assert (check.usable, contact.disagreements) == (True, ())
+        assert [check.margin, contact.gap] == pytest.approx([float(last)] * 2, abs=LEANING)
         assert accident.duration == pytest.approx((truth.frames - 1) / 10)
         assert accident.duration - 0.01 <= check.time <= accident.duration
-        assert not contact.disagreements
-        assert contact.gap == pytest.approx(float(last), abs=LEANING)
-        yaws = truth.fine[:, -1, 2]
-        turn = np.abs(np.arctan2(np.sin(yaws[1] - yaws[0]), np.cos(yaws[1] - yaws[0])))
+        across = np.subtract(*poses[:, 2])
+        turn = np.abs(np.arctan2(np.sin(across), np.cos(across)))
         assert contact.impact_angle == pytest.approx(turn, abs=0.01)
         assert contact.sides[0] == told.contact_side.removesuffix("_side").replace("back", "rear")
 
@@ -118,14 +116,12 @@ def test_the_pair_its_motion_and_its_contact(made: Made) -> None:
 def test_speeds_and_severity(made: Made) -> None:
     for accident, truth in made:
         check, contact = undisturbed(accident), made.da.collision(truth.scenario)
-        exact = truth.velocities[:, -1]
-        lately = truth.velocities[:, -STEPS_A_FRAME - 1 :]
+        exact, lately = truth.velocities[:, -1], truth.velocities[:, -STEPS_A_FRAME - 1 :]
         mean = (lately[:, 1:] + lately[:, :-1]).mean(axis=1) / 2
         masses = masses_of([CATEGORIES.index(name) for name in truth.meta.collision.classes], truth.sizes)
         for velocities, tolerance in ((mean, 0.02), (exact, LAG + 0.02)):
             speeds, relative = np.hypot(*velocities.T), np.hypot(*(velocities[0] - velocities[1]))
-            np.testing.assert_allclose(check.speeds, speeds, atol=tolerance)
-            np.testing.assert_allclose(contact.speeds, speeds, atol=tolerance)
+            np.testing.assert_allclose([check.speeds, contact.speeds], [speeds] * 2, atol=tolerance)
             np.testing.assert_allclose(check.delta_v, relative * masses[::-1] / masses.sum(), atol=2 * tolerance)
             closing = (velocities[0] - velocities[1]) @ generator.facing(truth)
             assert contact.closing_speed == pytest.approx(closing, abs=2 * tolerance)
@@ -151,13 +147,11 @@ def test_who_was_hidden_and_how_long(made: Made, kind: str) -> None:
     leads = []
     for accident, truth in made:
         observed = observed_by_rays(accident, truth, kind)
-        rule = ObservationRule(kind=kind)
+        rule, expected = ObservationRule(kind=kind), [lead(observed, members) for members in COALITIONS]
         agents, seen = observed_actors(made.da, truth.scenario, accident.actor_ids, rule)
         assert agents == AGENTS
         np.testing.assert_array_equal(seen, observed)
-        found = lead_times(made.da, truth.scenario, rule)
-        expected = [lead(observed, members) for members in COALITIONS]
-        np.testing.assert_allclose(found.leads, expected, atol=1e-9)
+        np.testing.assert_allclose(lead_times(made.da, truth.scenario, rule).leads, expected, atol=1e-9)
         leads.append(expected)
     alone, together = np.array(leads)[:, 0], np.array(leads)[:, -1]
     assert (alone[OPEN_PAIRS:] < 1.5).all()
@@ -183,11 +177,8 @@ def observed_by_rays(accident: Accident, truth: Truth, kind: str) -> np.ndarray:
 
 def lead(observed: np.ndarray, members: Sequence[str]) -> float:
     """Seconds before the last frame at which the members, together, first observe both."""
-    frames = observed.shape[-1]
-    for frame in range(frames):
-        if all(any(observed[AGENTS.index(name), which, frame] for name in members) for which in (0, 1)):
-            return (frames - 1 - frame) / 10
-    return 0.0
+    both = observed[[AGENTS.index(name) for name in members]].any(axis=0).all(axis=0)
+    return (len(both) - 1 - int(np.argmax(both))) / 10 if both.any() else 0.0
 
 
 def test_points_in_a_box_are_on_its_actor(made: Made) -> None:

@@ -27,13 +27,6 @@ from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.v2x.tracks import ScenarioTracks
 
 
-def rear_end_apart(case: Accident) -> Accident:
-    """The leader 2.5 m farther on."""
-    paths = case.paths.copy()
-    paths[1, :, 0] += 2.5
-    return replace(case, paths=paths)
-
-
 def scanned(case: Accident, brakers: tuple[bool, bool], *decelerations: float) -> Any:
     return last_moments(pair_of(case.paths, case.sizes), brakers, decelerations)
 
@@ -72,11 +65,9 @@ def test_what_nothing_avoids_within_the_recording_is_not_extrapolated() -> None:
 
 def test_answers_that_change_three_times() -> None:
     """After 4 s the second crosses the lane at 20 m, where the first is if it stopped there, and meets it later."""
-    frames = 61
     nodes = np.array([[0.0, 20, -40], [4, 20, 0], [4.6, 20, 12], [5.0, 50, 12], [6, 60, 1.9]])
-    x, y = (np.interp(np.arange(frames) / 10, nodes[:, 0], nodes[:, axis]) for axis in (1, 2))
-    second = np.column_stack([x, y, np.full(frames, np.pi / 2)])
-    case = accident(straight((0, 0), 0, 10, frames), second)
+    x, y = (np.interp(np.arange(61) / 10, nodes[:, 0], nodes[:, axis]) for axis in (1, 2))
+    case = accident(straight((0, 0), 0, 10, 61), np.column_stack([x, y, np.full(61, np.pi / 2)]))
     moments = scanned(case, FIRST, 8.0)
     assert (moments.switches.tolist(), moments.time[0] > 4) == ([3], True)
     at = [outcomes_of(case, FIRST, [start]).outcome[0, 2] for start in (0.0, 0.9, 3.0)]  # 0.5 s to react, 8 m/s²
@@ -109,9 +100,10 @@ def test_the_tables_of_an_accident() -> None:
 def test_what_cannot_be_told_is_refused() -> None:
     case = rear_end()
     pair = pair_of(case.paths, case.sizes)
+    farther = replace(case, paths=np.add(case.paths, [[[0.0, 0, 0]], [[2.5, 0, 0]]]))
     apart = ("11 and 12", "2.50 m apart at their last frame")
     assert_refused(
-        (lambda: avoidability_of(rear_end_apart(case)), NotAvailableError, apart),
+        (lambda: avoidability_of(farther), NotAvailableError, apart),
         (lambda: last_moments(pair, FIRST, 4.0), GeometryError, ("decelerations",)),
     )
 
@@ -167,8 +159,7 @@ def tracks_of(others: dict[int, tuple[range, FloatArray]]) -> ScenarioTracks:
     for actor, (frames, path) in others.items():
         rows += [(frame, actor, pose) for frame, pose in zip(frames, path, strict=True)]
     rows.sort(key=lambda row: row[:2])
-    poses = np.array([pose for _, _, pose in rows])
-    count = len(rows)
+    poses, count = np.array([pose for _, _, pose in rows]), len(rows)
     boxes = Boxes(
         frame="world",
         center=np.column_stack([poses[:, :2], np.zeros(count)]),

@@ -110,11 +110,8 @@ observations = st.integers(1, 12).flatmap(lambda frames: arrays(np.bool_, (5, 2,
 
 
 def plain_lead(observed: np.ndarray, agents: list[int]) -> float:
-    frames = observed.shape[-1]
-    for frame in range(frames):
-        if all(any(observed[agent, which, frame] for agent in agents) for which in range(2)):
-            return (frames - 1 - frame) / 10
-    return 0.0
+    both = observed[agents].any(axis=0).all(axis=0)
+    return (len(both) - 1 - np.argmax(both)) / 10 if both.any() else 0.0
 
 
 @given(observations)

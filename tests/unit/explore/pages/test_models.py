@@ -149,17 +149,15 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
 
 
 @pytest.fixture
-def opened(da_motion: DeepAccident) -> Iterator[Callable[..., Site]]:
+def opened(da_motion: DeepAccident, request: pytest.FixtureRequest) -> Callable[..., Site]:
     """Further explorers of bundles and results, which end with the test."""
-    sites: list[Site] = []
 
     def other(dataset: DeepAccident = da_motion, **models: Any) -> Site:
-        sites.append(Site(Explorer(dataset, workers=1, **models)))
-        return sites[-1]
+        explorer = Explorer(dataset, workers=1, **models)
+        request.addfinalizer(explorer.jobs.end)
+        return Site(explorer)
 
-    yield other
-    for each in sites:
-        each.explorer.jobs.end()
+    return other
 
 
 def a_sample(site: Site, name: str = "first") -> str:
@@ -172,9 +170,9 @@ def a_sample(site: Site, name: str = "first") -> str:
 @pytest.mark.parametrize("name", ["first", "second", "part", "motion", "detection"])
 @pytest.mark.parametrize("order", ["worst", "best"])
 def test_the_worst_samples_come_first(site: Site, name: str, order: str) -> None:
-    shown = site.samples(of("model", name, "samples", order=order))
-    assert sorted(shown) == sorted(site.runs[name].evaluator.tokens)
-    values = [main_number(site.runs[name], token) for token in shown]
+    shown, run = site.samples(of("model", name, "samples", order=order)), site.runs[name]
+    assert sorted(shown) == sorted(run.evaluator.tokens)
+    values = [main_number(run, token) for token in shown]
     known = [each for each in values if each is not None]
     assert values == sorted(known, reverse=order == "best") + [None] * (len(values) - len(known))
     assert len(set(known)) > 1 or name not in ("first", "motion")
@@ -196,10 +194,10 @@ def main_number(run: EvaluationRun, token: str) -> float | None:
 def test_each_bar_leads_to_the_samples_of_its_group(site: Site, name: str) -> None:
     run, address = site.runs[name], of("model", name)
     links = [each for each in hrefs(site.page(address)) if each.startswith("samples?by=")]
-    queries = [parse_qs(urlsplit(link).query) for link in links]
+    queries = {link: parse_qs(urlsplit(link).query) for link in links}
     found = {
         (query["by"][0], query["value"][0]): sorted(site.samples(urljoin(address, link)))
-        for query, link in zip(queries, links, strict=True)
+        for link, query in queries.items()
     }
     expected = {
         (broken.by, value or "unknown"): sorted(tokens)
@@ -296,8 +294,8 @@ def test_motion_is_shown_frame_by_frame(site: Site) -> None:
         return [each for each in hrefs(page) if each.endswith("#ahead")]
 
     tokens = site.runs["motion"].evaluator.tokens
-    assert len(ahead(min(tokens))) == 5  # from now to 2 s
-    assert len(ahead(max(tokens))) < 5  # the recording ends
+    first, last = (len(ahead(each(tokens))) for each in (min, max))
+    assert last < first == 5  # from now to 2 s; the recording ends
     pictures = f"{of('model', 'motion', 'sample', sample_path(min(tokens)))}/cameras.png?ahead="
     assert len({site.get(f"{pictures}{number}").body for number in (0, 4)}) == 2
     assert [site.get(f"{pictures}{wrong}").status for wrong in ("5", "-1", "x", "999")] == [404] * 4
@@ -332,32 +330,19 @@ def test_a_sample_that_is_not_evaluated_is_a_sentence(site: Site) -> None:
 # results that are not given, and what is not opened
 
 
-class _Opened:
-    """The paths that are opened while `on`; a hook that Python cannot take away again."""
-
-    def __init__(self) -> None:
-        self.on, self.paths = False, list[str]()
-        sys.addaudithook(self._hook)
-
-    def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if self.on and event == "open":
-            self.paths.append(str(arguments[0]))
-
-
 def test_the_results_that_a_bundle_names_are_not_opened(site: Site, opened: Callable[..., Site]) -> None:
     """They are there, and the release has all samples; yet a bundle may come from anywhere."""
     path = site.explorer.models["second"].bundle.summary["results"]["path"]  # type: ignore[union-attr]
     assert Path(path).is_file()
     address = of("model", "second", "sample", sample_path(a_sample(site, "second")))
-    seen = _Opened()
-    seen.on = True
+    names: set[str] = set()
+    watching = [True]  # a hook cannot be taken away again
+    sys.addaudithook(lambda event, told: watching and event == "open" and names.add(Path(str(told[0])).name))
     other = opened(bundles=[site.folder / "second"])
     page, of_model, _ = (other.page(each) for each in (address, "/model/second/", "/model/second/samples"))
     assert other.get(f"{address}/above.png").status == 404
-    seen.on = False
-    names = {Path(each).name for each in seen.paths}
-    assert "samples.parquet" in names
-    assert Path(path).name not in names
+    watching.clear()
+    assert ("samples.parquet" in names, Path(path).name in names) == (True, False)
     assert not lacking(page, "--results PATH", html.escape(path))
     assert (images(page), "--results PATH" in of_model) == ([], True)
 
@@ -372,10 +357,10 @@ def test_given_results_join_their_bundle(site: Site, opened: Callable[..., Site]
 
 
 def test_results_without_an_evaluation_show_how_to_make_one(site: Site, da_motion: DeepAccident) -> None:
-    shown = re.findall(r'<pre class="wide" id="command">(.*?)</pre>', site.page("/model/alone/"))
+    (shown,) = re.findall(r'<pre class="wide" id="command">(.*?)</pre>', site.page("/model/alone/"))
     words = ["deepaccident", "evaluate", "accident", str(da_motion.dataroot), "--version", "v1"]
     words += ["--results", str(site.folder / "alone.json"), "--protocol", "boxes", "--out", "alone_bundle"]
-    assert shlex.split(html.unescape(shown[0])) == words
+    assert shlex.split(html.unescape(shown)) == words
 
 
 def test_results_of_other_scenarios_are_told(opened: Callable[..., Site], tmp_path: Path) -> None:
@@ -463,12 +448,13 @@ def test_what_is_partial_says_so(site: Site) -> None:
 
 def test_another_release_lacks_the_samples(site: Site, da: DeepAccident, opened: Callable[..., Site]) -> None:
     other = opened(da, bundles=[site.folder / "first"])
-    assert "1 scenario of this evaluation is not in this release" in other.page("/model/first/")
     assert sorted(other.samples("/model/first/samples")) == sorted(site.runs["first"].evaluator.tokens)
-    group = other.page("/model/first/samples?by=agent&value=ego_vehicle")
-    assert "20 samples are not in this release" in group
-    sample = other.page(of("model", "first", "sample", sample_path(a_sample(site))))
-    assert not lacking(sample, "This sample is not in this release.", "5 m: ")
+    for address, *told in (
+        ("/model/first/", "1 scenario of this evaluation is not in this release"),
+        ("/model/first/samples?by=agent&value=ego_vehicle", "20 samples are not in this release"),
+        (of("model", "first", "sample", sample_path(a_sample(site))), "This sample is not in this release.", "5 m: "),
+    ):
+        assert not lacking(other.page(address), *told)
 
 
 def test_without_models_the_page_says_how_to_give_some(opened: Callable[..., Site]) -> None:
@@ -496,11 +482,11 @@ def test_a_comparison_has_the_largest_differences_first(site: Site) -> None:
 
     shown = site.samples("/compare/first/second/")
     assert sorted(shown) == sorted(site.runs["first"].evaluator.tokens)
-    sizes = [abs(difference(token)) for token in shown]
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[0] > sizes[-1]
+    differences = {token: difference(token) for token in shown}
+    sizes = [abs(each) for each in differences.values()]
+    assert (sizes, sizes[0] > sizes[-1]) == (sorted(sizes, reverse=True), True)
     better = site.samples("/compare/first/second/?better=a")
-    assert sorted(better) == sorted(token for token in shown if difference(token) < 0)
+    assert sorted(better) == sorted(token for token, each in differences.items() if each < 0)
     assert site.samples("/compare/second/first/?better=b") == better
     assert not lacking(site.page("/compare/first/second/"), ">apa</th>", "b − a")
 
@@ -528,8 +514,7 @@ def test_what_cannot_be_compared_says_why(site: Site) -> None:
 def test_samples_that_only_one_has_can_be_left_out(site: Site) -> None:
     page = site.page("/compare/second/part/")
     assert "samples only in" in page
-    (link,) = (each for each in hrefs(page) if "common=1" in each)
-    common = site.page(urljoin("/compare/second/part/", link))
+    (common,) = (site.page(urljoin("/compare/second/part/", each)) for each in hrefs(page) if "common=1" in each)
     assert ("cannot be compared" in common, "10 that only one has are left out" in common) == (False, True)
 
 
@@ -542,7 +527,7 @@ def test_two_models_at_the_same_moment(site: Site) -> None:
     pictures = [urlsplit(each).path.rsplit("/", 1)[1] for each in images(page)]
     assert (page.count("<section"), pictures) == (2, ["above.png", "cameras.png"])  # second has none
     assert [site.get(urljoin(address, each)).status for each in images(page)] == [200, 200]
-    (swapped,) = [urljoin(address, each) for each in hrefs(page) if "/second/first/" in each]
-    assert swapped == of("compare", "second", "first", "sample", sample_path(token), better="b")
+    swapped = of("compare", "second", "first", "sample", sample_path(token), better="b")
+    assert [urljoin(address, each) for each in hrefs(page) if "/second/first/" in each] == [swapped]
     assert site.page(swapped)
     assert any("better=a" in each for each in hrefs(page, rel="next") + hrefs(page, rel="prev"))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -125,8 +126,7 @@ REMEDY = r"; give nuScenes detections, .* of the nuScenes export of "
 def test_what_is_no_file_of_this_export(da_motion: DeepAccident, tmp_path: Path, content: str, told: str) -> None:
     path = tmp_path / "nuscenes.json"
     path.write_text(content)
-    with pytest.raises(ResultsError, match=f"nuscenes.json: .*{told}.*{REMEDY}"):
-        results_from_nuscenes(da_motion, path)
+    assert_refused((lambda: results_from_nuscenes(da_motion, path), ResultsError, f"nuscenes.json: .*{told}.*{REMEDY}"))
 
 
 @pytest.mark.parametrize(
@@ -145,8 +145,13 @@ def test_the_first_wrong_box_is_named(
     da_motion: DeepAccident, tmp_path: Path, sample: str, change: dict[str, object], told: str
 ) -> None:
     path = written(tmp_path / "nuscenes.json", {sample: [entry("bus"), entry(), entry(**{"name": "car", **change})]})
-    with pytest.raises(ResultsError, match=f"results of '{token('sample', sample)}': {told}.*{REMEDY}"):
-        results_from_nuscenes(da_motion, path)
+    assert_refused(
+        (
+            lambda: results_from_nuscenes(da_motion, path),
+            ResultsError,
+            f"results of '{token('sample', sample)}': {told}.*{REMEDY}",
+        )
+    )
 
 
 def test_only_keyframes_are_samples_of_the_export(da_motion: DeepAccident, tmp_path: Path, sample: str) -> None:
@@ -154,14 +159,24 @@ def test_only_keyframes_are_samples_of_the_export(da_motion: DeepAccident, tmp_p
     file = written(tmp_path / "a.json", {key: [] for key in keys})
     assert list(results_from_nuscenes(da_motion, file).boxes) == keys
     between = f"{sample[:-3]}{int(sample[-3:]) + 1:03d}"
-    with pytest.raises(ResultsError, match=f"{token('sample', between)}: is no sample of this release's export"):
-        results_from_nuscenes(da_motion, written(tmp_path / "b.json", {between: []}))
+    assert_refused(
+        (
+            lambda: results_from_nuscenes(da_motion, written(tmp_path / "b.json", {between: []})),
+            ResultsError,
+            f"{token('sample', between)}: is no sample of this release's export",
+        )
+    )
 
 
 def test_the_verb_refuses_before_it_indexes(tmp_path: Path) -> None:
     (tmp_path / "there.json").write_text("{}")
     words = ("results",)
-    with pytest.raises(ResultsError, match=r"there\.json: is there already"):
-        verb(*words, tmp_path / "there.json", tmp_path / "no release", "--out", tmp_path / "there.json")
+    assert_refused(
+        (
+            lambda: verb(*words, tmp_path / "there.json", tmp_path / "no release", "--out", tmp_path / "there.json"),
+            ResultsError,
+            r"there\.json: is there already",
+        )
+    )
     missing = verb(*words, tmp_path / "missing.json", tmp_path / "no release", "--out", tmp_path / "new.json")
     assert (missing.exit_code, "missing.json' does not exist" in missing.output) == (2, True)

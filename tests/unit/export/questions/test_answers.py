@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from question_files import Asked, ask
@@ -34,13 +33,7 @@ def asked(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> 
 def perfect(asked: Asked) -> Lines:
     """The answers of one who knows the truth."""
     return [
-        {
-            "id": each["id"],
-            "accident": [bool(second) for second in each["accident"]],
-            "who": each["who"],
-            "where": each["where"],
-            "when": each["when"],
-        }
+        {"accident": [*map(bool, each["accident"])], **{name: each[name] for name in ("id", "who", "where", "when")}}
         for each in asked.truth.values()
     ]
 
@@ -77,21 +70,18 @@ def test_one_who_knows_the_truth_gets_full_marks(da_motion: DeepAccident, asked:
     assert (found.positives, found.negatives) == (12, 12)
     assert (found.apa, found.precision, found.recall, found.average_precision) == (1, 1, 1, 1)
     assert (found.false_alarm_rate, found.id_error) == (0, 0)
-    assert found.position_error < 0.02
-    assert found.time_error == pytest.approx(0, abs=1e-9)
+    assert (found.position_error, found.time_error) == (pytest.approx(0, abs=0.02), pytest.approx(0, abs=1e-9))
     warned = evaluated(da_motion, path, "warning")
     assert warned.partial is None
     at = warned.result.groups["ego_involved"].operating
-    assert (at.recall, at.precision, at.time_in_alarm) == (1, 1, 0)
-    assert at.tta0 == pytest.approx(3.0)
+    assert (at.recall, at.precision, at.time_in_alarm, at.tta0) == (1, 1, 0, pytest.approx(3.0))
 
 
 def test_one_who_always_says_no_gets_none(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
     path = results(asked, tmp_path, denying(asked))
     found = evaluated(da_motion, path, "accident").result
     assert (found.apa, found.recall, found.false_alarm_rate, found.precision) == (0, 0, 0, None)
-    warned = evaluated(da_motion, path, "warning").result
-    figures = warned.groups["ego_involved"]
+    figures = evaluated(da_motion, path, "warning").result.groups["ego_involved"]
     assert (figures.operating.recall, figures.recordings["accident"]) == (0, 1)
 
 
@@ -108,19 +98,23 @@ def test_answers_become_accidents(asked: Asked, tmp_path: Path) -> None:
         assert read.alarms == len(read.accidents[sample])
         return read.accidents[sample]
 
-    (alarm,) = alarms()
-    assert np.array_equal(alarm.positions, [[1, 2], [3.5, -4]])
-    assert (alarm.time, alarm.score, alarm.ids) == (1.5, 0.9, tuple(truth["actor_ids"][::-1]))
-    assert [each.time for each in alarms(when=1.8, why="it does not brake")] == [1.8]
-    assert [each.time for each in alarms(when=2.0)] == [2.0]
-    assert [each.time for each in alarms(when=1.0)] == [1.5]  # of another second
-    assert [(each.time, each.score) for each in alarms(accident=[False, 0.6, True])] == [(2.5, 1.0)]
-    assert [each.positions.tolist() for each in alarms(where=[7, 8])] == [[[7, 8], [7, 8]]]
-    assert [each.ids for each in alarms(who=None)] == [None]
-    assert [each.ids for each in alarms(who=[truth["who"][0], None])] == [None]
+    whole = {"time": 1.5, "score": 0.9, "ids": tuple(truth["actor_ids"][::-1]), "positions": [[1, 2], [3.5, -4]]}
+    for threshold, changes, told in (
+        (0.5, {}, {}),
+        (0.5, {"when": 1.8, "why": "it does not brake"}, {"time": 1.8}),
+        (0.5, {"when": 2.0}, {"time": 2.0}),
+        (0.5, {"when": 1.0}, {}),  # of another second
+        (0.5, {"accident": [False, 0.6, True]}, {"time": 2.5, "score": 1.0}),
+        (0.5, {"where": [7, 8]}, {"positions": [[7, 8], [7, 8]]}),
+        (0.5, {"who": None}, {"ids": None}),
+        (0.5, {"who": [truth["who"][0], None]}, {"ids": None}),
+        (0.9, {}, {}),
+        (0.0, {"accident": [0.01, 0, 0]}, {"time": 0.5, "score": 0.01}),
+    ):
+        (alarm,) = alarms(threshold, **changes)
+        found = {"time": alarm.time, "score": alarm.score, "ids": alarm.ids, "positions": alarm.positions.tolist()}
+        assert found == {**whole, **told}
     assert alarms(0.91) == alarms(accident=[0, 0, 0.4]) == alarms(0, accident=[False] * 3) == []
-    assert len(alarms(0.9)) == 1
-    assert [each.score for each in alarms(0, accident=[0.01, 0, 0])] == [0.01]
 
 
 def test_the_results_file(asked: Asked, tmp_path: Path) -> None:
@@ -179,8 +173,9 @@ def test_malformed_answers(asked: Asked, tmp_path: Path, change: Any, sentence: 
     wrong = change if isinstance(change, str) else json.dumps({**lines[1], **change})
     path = tmp_path / "answers.jsonl"
     path.write_text(f"{json.dumps(lines[0])}\n\n{wrong}\n")
-    with pytest.raises(ResultsError, match=f"^{path}:3: {sentence}"):
-        read_answers(path, asked.done.folder / "truth.jsonl")
+    assert_refused(
+        (lambda: read_answers(path, asked.done.folder / "truth.jsonl"), ResultsError, f"^{path}:3: {sentence}")
+    )
 
 
 @pytest.mark.parametrize("name", ["id", "accident", "who", "where"])
@@ -235,8 +230,13 @@ def test_a_truth_file_that_was_changed(asked: Asked, tmp_path: Path, name: str, 
     lines = [{**each} for each in asked.truth.values()]
     lines[1][name] = value
     truth, answers = written(tmp_path / "truth.jsonl", lines), written(tmp_path / "answers.jsonl", perfect(asked))
-    with pytest.raises(ResultsError, match=f"^{truth}:2: .* - at `{place}`; this is no line of a truth file; give "):
-        read_answers(answers, truth)
+    assert_refused(
+        (
+            lambda: read_answers(answers, truth),
+            ResultsError,
+            f"^{truth}:2: .* - at `{place}`; this is no line of a truth file; give ",
+        )
+    )
 
 
 def test_the_command(asked: Asked, tmp_path: Path) -> None:
