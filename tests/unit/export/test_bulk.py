@@ -749,7 +749,7 @@ def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
     for each in (lost, again):
         each.join()
     found = contents(tmp_path / "out")
-    locks = {name for name in found if name.startswith(".deepaccident-parts/locks/")}  # of the lost one's next units
+    locks = {name for name in found if name.startswith(".deepaccident-parts/locks")}  # of the lost one's next units
     assert {name: found[name] for name in found.keys() - locks} == whole
 
 
