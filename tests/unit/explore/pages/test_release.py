@@ -71,7 +71,7 @@ def of_damaged(damaged: Damaged, request: pytest.FixtureRequest) -> Reader:
 @pytest.fixture
 def mapped(da: DeepAccident, tmp_path: Path, request: pytest.FixtureRequest) -> Reader:
     """Of a release with BEV cameras and without a kept map."""
-    ignored = shutil.ignore_patterns("Camera_*", "town_map-*", "lidar01")
+    ignored = shutil.ignore_patterns("Camera_*", "town_maps", "lidar01")
     shutil.copytree(da.dataroot, tmp_path / "release", ignore=ignored)
     return reading(DeepAccident("v1", tmp_path / "release", verbose=False), request)
 
