@@ -1,6 +1,7 @@
 """Fixtures that all tests share: one synthetic release a session, made and indexed once."""
 
 import fcntl
+import gc
 import importlib
 import os
 import shutil
@@ -49,6 +50,12 @@ def pytest_configure(config: pytest.Config) -> None:
         manager.register(importlib.import_module("deepaccident_devkit.testing.plugin"), "deepaccident")
 
 
+def pytest_collection_finish() -> None:
+    """What the collection made stays until the end: the garbage collector need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Tests of a file run in one process, so that what they share is made once."""
@@ -68,7 +75,7 @@ def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
     root.parent.mkdir(exist_ok=True)
     with root.with_name(f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        return root if root.exists() else make_release(root, SynthConfig(**config), workers=2)
+        return root if root.exists() else make_release(root, SynthConfig(**config), workers=1)
 
 
 @pytest.fixture(scope="session")

@@ -41,6 +41,7 @@ def test_changed_files_are_read_or_refused(healthy: Path) -> None:
     assert {*verdicts[len(HERE) :]} == {"read", "refused"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kinds", "how"),
     [

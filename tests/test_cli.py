@@ -22,6 +22,7 @@ from deepaccident_devkit.splits import official_split
 from deepaccident_devkit.synth import SynthConfig
 
 
+@pytest.mark.slow
 def test_synth_index_info_end_to_end(tmp_path: Path) -> None:
     out = tmp_path / "my release"
     made = ran("synth", out, "--scenarios", 2, "--frames", 3, "--size", "64x36", "--layout", "B", "--seed", 7)

@@ -99,19 +99,23 @@ def truth_heads(golden: GoldenCase, orientation: str) -> MotionHeads:
     return first_frames(MotionHeads.from_labels(label_of(golden, orientation)), golden.entry["S"])
 
 
-def update(evaluator: AccidentEvaluator, golden: GoldenCase, predictions: str, orientation: str) -> None:
+@functools.cache
+def evaluator_of(folder: Path, index: int, predictions: str, orientation: str) -> AccidentEvaluator:
+    """What one sample is counted as."""
+    golden = GoldenCase(folder, "d_accident", "samples", index)
+    evaluator = AccidentEvaluator(protocol="released")
     heads = heads_of(golden, orientation)[PREDICTIONS[predictions]]
     output = MotionOutput(grid=config(orientation).grid, heads=heads)
     evaluator.update(golden.entry["sample_idx"] + f" {golden.index}", output, label_of(golden, orientation))
-
-
-@functools.cache
-def evaluator_of(folder: Path, predictions: str) -> AccidentEvaluator:
-    """All samples of a folder, in order."""
-    evaluator = AccidentEvaluator(protocol="released")
-    for index in range(len(whole(folder)["samples"])):
-        update(evaluator, GoldenCase(folder, "d_accident", "samples", index), predictions, "released")
     return evaluator
+
+
+def evaluator_of_all(folder: Path, predictions: str) -> AccidentEvaluator:
+    """All samples of a folder, in order."""
+    merged = AccidentEvaluator(protocol="released")
+    for index in range(len(whole(folder)["samples"])):
+        merged.merge(evaluator_of(folder, index, predictions, "released"))
+    return merged
 
 
 def whole(folder: Path) -> dict:
@@ -163,9 +167,7 @@ def test_instances_of_the_predictions(golden, orientation: str) -> None:
     [*(("six_stable_sort", orientation) for orientation in ORIENTATIONS), ("one_stable_sort", "released")],
 )
 def test_counts_of_each_sample(golden, predictions: str, orientation: str) -> None:
-    evaluator = AccidentEvaluator(protocol="released")
-    update(evaluator, golden, predictions, orientation)
-    [counts] = evaluator.counts.values()
+    [counts] = evaluator_of(golden.folder, golden.index, predictions, orientation).counts.values()
     expected = golden.entry["out"][predictions]
     assert_array_equal([counts[name] for name in COUNTS[:4]], expected[:4])
     assert_allclose([counts[name] for name in COUNTS[4:]], expected[4:], rtol=0, atol=1e-6)
@@ -175,7 +177,7 @@ def test_counts_of_each_sample(golden, predictions: str, orientation: str) -> No
 def test_counts_and_rates_of_all_samples(request: pytest.FixtureRequest, predictions: str) -> None:
     folder = request.config.getoption("golden")
     expected = whole(folder)["counters"][predictions]
-    result = evaluator_of(folder, predictions).compute()
+    result = evaluator_of_all(folder, predictions).compute()
     assert [f"{distance:g}" for distance in result.within] == [name for name in expected if name != "APA"]
     for distance, each in result.within.items():
         there = expected[f"{distance:g}"]
@@ -191,7 +193,7 @@ def test_samples_foreseen_within_15_metres(request: pytest.FixtureRequest) -> No
     folder = request.config.getoption("golden")
     lines = whole(folder)["tp_list"]
     assert lines[-1] == ""
-    counts = evaluator_of(folder, "six_stable_sort").counts.values()
+    counts = evaluator_of_all(folder, "six_stable_sort").counts.values()
     assert [index for index, each in enumerate(counts) if each["tp"][-1]] == [int(line[:4]) - 1 for line in lines[:-1]]
 
 

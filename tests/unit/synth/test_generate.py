@@ -184,7 +184,7 @@ def test_an_unlabelled_test_split_has_calib_images_and_points_alone(tmp_path):
 def test_exact_releases_differ_in_calib_and_counts_alone(tmp_path):
     def made(exact):
         config = SynthConfig(scenarios=1, frames=4, sensors=False, seed=7, exact=exact)
-        return find_release(make_release(tmp_path / str(exact), config)).scenarios[0]
+        return find_release(make_release(tmp_path / str(exact), config, workers=1)).scenarios[0]
 
     def back_camera(scenario, frame):
         return read_calib(scenario.calib_path("ego_vehicle", frame), raw=True)["lidar_to_Camera_Back"]

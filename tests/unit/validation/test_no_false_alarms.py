@@ -16,7 +16,7 @@ from deepaccident_devkit.validation import validate_release
 def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Labels of one accident, long enough for tracks."""
     root = tmp_path_factory.mktemp("healthy") / "release"
-    return make_release(root, SynthConfig(scenarios=2, frames=12, seed=11, sensors=False))
+    return make_release(root, SynthConfig(scenarios=2, frames=12, seed=11, sensors=False), workers=1)
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def test_one_agent_alone_that_tracks_nobody(own_release: Path) -> None:
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_short_scenarios(tmp_path: Path, frames: int) -> None:
-    root = make_release(tmp_path / "release", SynthConfig(scenarios=1, frames=frames, seed=2, sensors=False))
+    root = make_release(tmp_path / "release", SynthConfig(scenarios=1, frames=frames, seed=2, sensors=False), workers=1)
     assert told(root) == set()
 
 
