@@ -52,7 +52,8 @@ def test_the_next_steps_run_as_they_are_printed(made_demo: tuple[Path, str], mon
     monkeypatch.setattr("deepaccident_devkit.explore.serving.serve", lambda app, **_: served.append(app))
     out, printed = made_demo
     assert printed.rstrip().endswith(str(out / "index.html"))
-    assert re.findall(r"^(\w+): some \d+ s$", printed, re.MULTILINE)[::3] == ["recording", "model", "replay"]
+    steps = re.findall(r"^(\w+), which takes some \d+ s$", printed, re.MULTILINE)
+    assert steps[::3] == ["recording", "model", "replay"]
     commands = re.findall(r"^ +deepaccident (.+)$", printed, re.MULTILINE)
     assert len(commands) == 6
     page = page_of(out / "index.html").text

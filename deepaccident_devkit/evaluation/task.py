@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.support.arrays import ShortRepr, known
-from deepaccident_devkit.support.text import choice, possible_text
+from deepaccident_devkit.support.text import choice, meant_text, possible_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -93,7 +93,7 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
     for name, value in switches.items():
         if name not in names:
             there = f"there are {possible_text(name, names)}" if names else "it has none"
-            raise ChoiceError(f"{type(rules).__name__} has no switch {name!r}; {there}")
+            raise ChoiceError(f"these rules have no switch {name!r}{meant_text(name, names)}; {there}")
         head, _, rest = name.partition(".")
         if rest:
             parts.setdefault(head, {})[rest] = value

@@ -213,8 +213,9 @@ def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path:
     here, told = evaluator.compute().ranges["100x100"], model.notes["scored"]
     expected = "IoU {iou:.1%}, VPQ {vpq:.1%}".format_map(told["scores"])
     return (
-        f"motion, labels {rules.labels}: IoU {here.iou:.1f}%, VPQ {here.pq:.1f}% here; {expected} on "
-        f"{told['synth']['scenarios']} synthetic scenarios that the training had not seen, with agents {told['agents']}"
+        f"motion, labels {rules.labels}: IoU {here.iou:.1f}%, VPQ {here.pq:.1f}% within 100 m x 100 m here; "
+        f"{expected} on {told['synth']['scenarios']} synthetic scenarios that the training had not seen, with agents "
+        f"{told['agents']}"
     )
 
 

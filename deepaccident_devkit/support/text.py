@@ -18,6 +18,8 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentErr
 Word = TypeVar("Word", bound=str | None)
 _LISTED = 20
 """Words that a message lists at most."""
+_DIFFERING = 3
+"""Differing values that a message shows at most."""
 _NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
 
@@ -134,11 +136,16 @@ def spelled(value: Any, words: Iterable[str]) -> Any:
 
 
 def differing_text(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
-    """`training/steps: 2, asked for 3; …`: which values differ from those asked for; empty if none does."""
+    """`training/steps: 2, asked for 3; …`: which values differ from those asked for, the first ones; empty if none."""
     has, wanted = dict(_leaves(there)), dict(_leaves(json.loads(json.dumps(asked))))  # tuples are lists in a file
     changed = sorted(name for name in {*has, *wanted} if has.get(name) != wanted.get(name))
-    return "; ".join(
-        f"{name}: {shortened(repr(has.get(name)))}, asked for {shortened(repr(wanted.get(name)))}" for name in changed
+    more = f"; and {len(changed) - _DIFFERING} more" if len(changed) > _DIFFERING else ""
+    return (
+        "; ".join(
+            f"{name}: {shortened(repr(has.get(name)))}, asked for {shortened(repr(wanted.get(name)))}"
+            for name in changed[:_DIFFERING]
+        )
+        + more
     )
 
 

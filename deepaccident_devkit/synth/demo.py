@@ -234,7 +234,7 @@ def _step(bar: tqdm[Any], name: str) -> Iterator[None]:
     """Name a step on the bar, and move the bar to its end; a log gets a line at its beginning."""
     bar.set_description_str(name)
     if bar.disable or not sys.stdout.isatty():
-        click.echo(f"{name}: some {_STEPS[name]:.0f} s")
+        click.echo(f"{name}, which takes some {_STEPS[name]:.0f} s")
     end = sum(list(_STEPS.values())[: list(_STEPS).index(name) + 1])
     yield
     bar.update(end - bar.n)

@@ -119,6 +119,7 @@ def states(folder: Path) -> dict[str, tuple[int, bytes | None]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dangling", [False, True], ids=["to something", "dangling"])
 @pytest.mark.parametrize("what", WRITERS)
 def test_a_link_in_any_place_leads_nothing_out(small: DeepAccident, tmp_path: Path, what: str, dangling: bool) -> None:

@@ -171,6 +171,9 @@ class ResultsWriter:
             there = read_results(self.path)
         except ResultsError:
             return ""
+        methods = [meta.get("method") for meta in (there.meta, self._header["meta"])]
+        if methods[0] != methods[1]:
+            return " (of {!r}, not of {!r})".format(*methods)
         return f" ({differing_text(there.meta, self._header['meta']) or 'of other samples'})"
 
 

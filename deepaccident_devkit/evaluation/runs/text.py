@@ -132,7 +132,9 @@ def _whole(value: object) -> str:
 
 def _breakdown(summary: Json, name: str) -> str:
     shown = summary["headlines"][:_COLUMNS]
-    rows = [("value", "samples", "scenarios", *(each["name"] for each in shown))]
+    units = ("" if each["unit"] in ("", "share") else f", {each['unit']}" for each in shown)
+    names = (f"{each['name']}{unit}" for each, unit in zip(shown, units, strict=True))
+    rows = [("value", "samples", "scenarios", *names)]
     for group in summary["breakdowns"][name]["groups"]:
         values = (_number(group["headlines"].get(each["path"])) for each in shown)
         value = "unknown" if group["value"] is None else group["value"]
@@ -283,7 +285,7 @@ def _predictions(form: Json) -> Iterator[str]:
 
 
 def _paths(metrics: Json) -> Iterator[str]:
-    found = metrics["path_true_positive"]
-    true = found + metrics["path_false_negative"]
+    found = metrics["paths"]
+    true = metrics["path_true_positive"] + metrics["path_false_negative"]
     if found < _FEW_PATHS * true:
         yield f"{found} of {true} true paths have a match; min_ade, min_fde and miss_rate are of these alone"

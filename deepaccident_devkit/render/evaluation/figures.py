@@ -239,7 +239,8 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
     if run.setup.task == "warning":
         return ()
     ranked = _ranked(run)
-    worst = ranked[: min(_EACH, len(ranked) // 2)]
+    count = min(_EACH, len(ranked) // 2)
+    worst = [each for each in ranked[:count] if each[1] != ranked[-1][1]]  # none where all are alike
     best = ranked[max(len(ranked) - _EACH, len(worst)) :]
     load = SampleLoader(dataset, results, run.setup)
     return tuple(

@@ -94,12 +94,8 @@ def test_choices_may_be_of_a_part_lists_for_tuples_and_null_where_one_takes_it()
 @pytest.mark.parametrize(
     ("rules", "switches", "words"),
     [
-        (
-            PaperAccidents(),
-            {"reading.danger_distnce": 1},
-            ("PaperAccidents", "reading.danger_distnce", "there are read"),
-        ),
-        (PaperAccidents(), {"reading": {}}, ("PaperAccidents", "'reading'")),
+        (PaperAccidents(), {"reading.danger_distnce": 1}, ("did you mean 'reading.danger_distance'", "there are read")),
+        (PaperAccidents(), {"reading": {}}, ("no switch 'reading'",)),
         (PaperAccidents(), {"reading.danger_distance": "2"}, ("danger_distance", "a number, such as 1.0", "'2'")),
         (PaperAccidents(), {"reading.danger_distance": True}, ("danger_distance", "a number, such as 1.0", "True")),
         (PaperAccidents(), {"sample_choice": 3}, ("sample_choice", "a word, such as 'best'", "3")),
@@ -107,7 +103,7 @@ def test_choices_may_be_of_a_part_lists_for_tuples_and_null_where_one_takes_it()
         (DETECTION_PROTOCOLS["paper"], {"min_recall": None}, ("min_recall", "a number, such as 0.1", "None")),
         (DETECTION_PROTOCOLS["paper"], {"own_box": 1}, ("own_box", "true or false, such as False", "1")),
         (DETECTION_PROTOCOLS["paper"], {"thresholds": 1}, ("thresholds", "a list, such as (1.0, 2.0, 4.0)", "found 1")),
-        (TASK_PROTOCOLS["warning"]["field"], {"scores_of": "pair"}, ("FieldWarnings", "'scores_of'", "it has none")),
+        (TASK_PROTOCOLS["warning"]["field"], {"scores_of": "pair"}, ("no switch 'scores_of'", "it has none")),
     ],
 )
 def test_choices_that_are_none(rules: Any, switches: dict[str, Any], words: tuple[str, ...]) -> None:

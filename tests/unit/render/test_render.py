@@ -60,7 +60,8 @@ def accidents(da: DeepAccident) -> list[Any]:
     return [scenario for scenario in da.scenario if scenario["collision"]]
 
 
-@pytest.mark.parametrize("where", [None, pytest.param("paper", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("where", [None, "paper"])
 @pytest.mark.parametrize("view", VIEWS)
 def test_texts_are_in_the_picture_and_apart(da_b: DeepAccident, view: str, where: Any) -> None:
     with style(where) if where else nullcontext():

@@ -297,6 +297,7 @@ def test_an_executor_makes_the_same_bytes(out, whole, digests):
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 def test_several_calls_share_the_parts(out, whole, digests, recorded):
     def make_or_come_late(_: int) -> Path | None:
         try:

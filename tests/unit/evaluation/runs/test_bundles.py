@@ -50,7 +50,7 @@ MISFITS: dict[str, tuple[Callable[[Any], object], str]] = {
         lambda summary: summary.update(horizon=1e9),
         "horizon: expected seconds above 0, at most 100",
     ),
-    "a switch": (lambda summary: summary.update(switches={"x" * 900: 1}), "BoxAccidents has no switch"),
+    "a switch": (lambda summary: summary.update(switches={"x" * 900: 1}), "these rules have no switch"),
 }
 JSON_FILES = sorted(name for name in FILES if name.endswith(".json"))
 

@@ -139,6 +139,7 @@ def test_the_other_way_round_all_turns(generated: Callable[..., Comparison]) -> 
     assert back[MAIN].better == "a"
 
 
+@pytest.mark.slow
 def test_headlines_first_then_every_number(motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
     numbers = compare_bundles(*motion_bundles, FEW).numbers
     assert [each.headline for each in numbers][:2] == ["iou 30x30", "iou 100x100"]

@@ -80,7 +80,7 @@ class TestSetup:
             ),
             ({"task": "motion", "horizon": 0.0}, ConfigError, "above 0, at most 100, found 0.0"),
             ({"task": "motion", "horizon": float("nan")}, ConfigError, "above 0, at most 100, found nan"),
-            ({"task": "motion", "switches": {"gap": 1}}, ChoiceError, r"MotionProtocol has no switch 'gap'"),
+            ({"task": "motion", "switches": {"gap": 1}}, ChoiceError, r"no switch 'gap'"),
         ],
     )
     def test_refused(self, named: dict[str, Any], error: type[Exception], sentence: str) -> None:

@@ -102,7 +102,8 @@ SUMMARY: dict[str, Any] = {
     "counts": {"samples": 6, "scenarios": 2, "left_out": 3},
     "devkit_version": "1",
     "headlines": [
-        {"name": name, "path": f"at/{name}", "text": text} for name, text in zip("abcdef", "123456", strict=True)
+        {"name": name, "path": f"at/{name}", "text": text, "unit": "m"}
+        for name, text in zip("abcdef", "123456", strict=True)
     ],
     "metrics": {
         "n": 1,
@@ -189,9 +190,9 @@ def test_all_that_a_summary_may_have() -> None:
         "  longer  k 5",
         "",
         "by agent   PARTIAL: 6 of 8 samples",
-        "  value    samples  scenarios      a  b  c  d  e",
-        "  near           3          1  0.250  –  –  –  –",
-        "  unknown        3          2  0.250  –  –  –  –",
+        "  value    samples  scenarios   a, m  b, m  c, m  d, m  e, m",
+        "  near           3          1  0.250     –     –     –     –",
+        "  unknown        3          2  0.250     –     –     –     –",
         "",
         "notes   PARTIAL: 6 of 8 samples",
         "  so",
@@ -218,7 +219,7 @@ FORM = {
     "step": 0.5,
     "labels": None,
 }
-PATHS = {"path_true_positive": 9, "path_false_negative": 1, "ranges": {"30x30": {}, "100x100": {}}}
+PATHS = {"paths": 9, "path_true_positive": 9, "path_false_negative": 1, "ranges": {"30x30": {}, "100x100": {}}}
 
 
 def notes(
@@ -259,8 +260,8 @@ def test_published_accidents_are_of_six_heads() -> None:
 
 
 def test_few_paths() -> None:
-    [note] = notes(metrics=PATHS | {"path_true_positive": 31, "path_false_negative": 193})
-    assert note == "31 of 224 true paths have a match; min_ade, min_fde and miss_rate are of these alone"
+    [note] = notes(metrics=PATHS | {"paths": 41, "path_true_positive": 31, "path_false_negative": 193})
+    assert note == "41 of 224 true paths have a match; min_ade, min_fde and miss_rate are of these alone"
 
 
 def test_detection_of_the_released_code() -> None:
@@ -289,7 +290,7 @@ def test_up_to_where_numbers_are_as_published() -> None:
     [note] = notes("accident", predictions=5)
     assert note == "predictions of a sample: 5; published numbers are of 6, five samples and then their mean"
     assert notes("accident", predictions=7) == []
-    [note] = notes(metrics=PATHS | {"path_true_positive": 89, "path_false_negative": 11})
+    [note] = notes(metrics=PATHS | {"paths": 89, "path_true_positive": 89, "path_false_negative": 11})
     assert note.startswith("89 of 100 true paths")
     assert notes("warning", "clean", metrics={}) == []
 
