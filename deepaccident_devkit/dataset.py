@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
@@ -14,6 +14,7 @@ from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.conventions import stored_transforms
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
+from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.support import nuscenes_names
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
@@ -162,6 +163,21 @@ class Dataset(OpenTables):
     def annotation_rows(self, sample: RowArgument) -> slice:
         """Where a sample's boxes are in the annotation table's columns; empty without a label. Raises TokenError."""
         return self._annotation_slice(self._sample_row(sample))
+
+    def recordings(self, scenarios: Iterable[str]) -> dict[str, str]:
+        """Scenario token → a hash of how many boxes ego has at each moment, where it has labels here.
+
+        It tells recordings of one name apart: those of the mini release are others than those of the whole one.
+        """
+        wanted, samples, found = set(scenarios), self.columns("sample"), {}
+        tokens = (each["token"] for each in self.scenario)
+        for row, token in ((row, token) for row, token in enumerate(tokens) if token in wanted):
+            ego = self._tables.resolver.agents_of(row).get(AGENTS[0], -1)
+            first, last = np.searchsorted(samples["agent_row"], (ego, ego + 1))
+            counts = samples["num_annotations"][first:last]
+            if counts.any():
+                found[token] = digest_of(counts.tolist())
+        return found
 
     # sensor data
 

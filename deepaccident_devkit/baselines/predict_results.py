@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -19,6 +19,8 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, read_results
+from deepaccident_devkit.evaluation.results.recordings import release_note
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
@@ -113,9 +115,9 @@ def predict_results(
         SomeFailedError: samples of some scenarios cannot be predicted; the others are done.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    work = _Work(dataset, choice("task", task, get_args(ResultsTask)), baseline or Baseline())
-    path = path_of(out).absolute()
+    task, path = choice("task", task, get_args(ResultsTask)), path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
+    work = _Work(dataset, task, baseline or Baseline(), tuple(scenarios))
     name = work.digest(tokens)
     store = Store(unfinished_folder(path), path, "predicts for it", ResultsError, name)
     if work.is_done(path, tokens):
@@ -124,7 +126,10 @@ def predict_results(
     work.writer(path)  # refuses what stands there
     for own in scenarios.values():
         cooperating_agents(dataset, own[0], work.baseline.agents)  # fails now, and not in every worker
-    jobs = {scenario: _Job(work, own, store, f"{name}/{scenario}") for scenario, own in scenarios.items()}
+    jobs = {
+        scenario: _Job(replace(work, scenarios=(scenario,)), own, store, f"{name}/{scenario}")
+        for scenario, own in scenarios.items()
+    }
     places = Places(reads=dataset.places, writes=(store.folder,))
     with store.shared() as turn:
         if not work.is_done(path, tokens):  # by another process meanwhile
@@ -143,7 +148,8 @@ def is_predicted(
     baseline: Baseline | None = None,
 ) -> bool:
     """Whether `predict_results` has written its results with these arguments before."""
-    return _Work(dataset, task, baseline or Baseline()).is_done(path_of(out).absolute(), tokens)
+    scenarios = tuple(dict.fromkeys(map(scenario_of, tokens)))
+    return _Work(dataset, task, baseline or Baseline(), scenarios).is_done(path_of(out).absolute(), tokens)
 
 
 def samples_by_scenario(path: Path, tokens: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -164,12 +170,12 @@ class _Work:
     dataset: Dataset
     task: ResultsTask
     baseline: Baseline
+    scenarios: tuple[str, ...]
 
     @property
     def meta(self) -> dict[str, Any]:
         """The notes in its results."""
-        release = {"version": self.dataset.version, "index": self.dataset.tables_folder.name}
-        return {**self.baseline.meta(), "release": release, "devkit": __version__}
+        return {**self.baseline.meta(), "release": release_note(self.dataset, self.scenarios), "devkit": __version__}
 
     def digest(self, tokens: Sequence[str]) -> str:
         """Of all that decides the results of these samples."""

@@ -33,6 +33,7 @@ from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, EVERYTHING, attribute_name
 from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
 from deepaccident_devkit.evaluation.results import Results, read_results
+from deepaccident_devkit.evaluation.results.recordings import check_recordings
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
     SampleSelection,
@@ -302,6 +303,7 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
     protocol = "boxes" if opened.task == "accident" else "released"  # the one that takes explicit accidents
     setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
     selection = _selection_of(setup, options)
+    check_recordings(opened, dataset)
     covered = coverage(dataset, opened.tokens, selection)
     click.echo(f"{selection.text()}: {covered.to_text()}")
     shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))

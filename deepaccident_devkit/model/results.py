@@ -28,6 +28,8 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
+from deepaccident_devkit.evaluation.results.recordings import release_note
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.export.torch import V2XDataset, collate
 from deepaccident_devkit.model.detection import decode_detections, detected_boxes
 from deepaccident_devkit.model.inputs import mirrored_boxes, model_inputs
@@ -182,7 +184,7 @@ def predict_results(
     config = config or PredictConfig()
     folder = writable_folder(out)
     paths = {task: folder / name for task, name in RESULTS_NAMES.items()}
-    meta = _meta(model, dataset, config)
+    meta = _meta(model, dataset, tokens, config)
     labels = model.config.labels
     form: dict[str, Any] = {
         "grid": labels.grid,
@@ -219,7 +221,7 @@ def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path:
     )
 
 
-def _meta(model: V2XFormer, dataset: Dataset, config: PredictConfig) -> dict[str, Any]:
+def _meta(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig) -> dict[str, Any]:
     """The notes in the results."""
     agents = config.agents.name if isinstance(config.agents, AgentConfig) else config.agents
     return {
@@ -228,6 +230,6 @@ def _meta(model: V2XFormer, dataset: Dataset, config: PredictConfig) -> dict[str
         "agents": agents if agents is None or isinstance(agents, str) else list(agents),
         "link": None if config.link is None else asdict(config.link),
         "seed": config.seed,
-        "release": {"version": dataset.version, "index": dataset.tables_folder.name},
+        "release": release_note(dataset, map(scenario_of, tokens)),
         "devkit": __version__,
     }

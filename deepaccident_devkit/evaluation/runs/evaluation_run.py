@@ -27,6 +27,7 @@ from deepaccident_devkit.evaluation.breakdowns import (
 from deepaccident_devkit.evaluation.evaluator import Evaluator, evaluate_samples
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.results import Results, read_results
+from deepaccident_devkit.evaluation.results.recordings import check_recordings
 from deepaccident_devkit.evaluation.runs.setups import (
     TASKS,
     Coverage,
@@ -356,6 +357,7 @@ def evaluate_results(
     """
     chosen = selection if isinstance(selection, SampleSelection) else default_selection(setup, selection)
     loader = SampleLoader(dataset, results if isinstance(results, Results) else read_results(results), setup)
+    check_recordings(loader.results, dataset)
     covered = coverage(dataset, loader.results.tokens, chosen)
     tokens = _covered_tokens(dataset, loader.results, chosen, covered, allow_partial=allow_partial)
     if TASKS[setup.task].needs_meta:
