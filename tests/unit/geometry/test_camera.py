@@ -45,6 +45,14 @@ def test_the_intrinsic_is_a_read_only_copy() -> None:
     assert (camera.intrinsic[0, 0], camera.intrinsic.flags.writeable) == (1, False)
 
 
+def test_a_resized_camera_sees_the_same_parts_of_its_picture() -> None:
+    camera, points = PinholeCamera.from_field_of_view(1600, 900, 1.2), np.array([[1.0, -2.0, 9.0], [-3.0, 0.5, 20.0]])
+    smaller = camera.resized(400, 300)
+    assert (smaller.width, smaller.height) == (400, 300)
+    assert_allclose(smaller.project(points)[0] * [4, 3], camera.project(points)[0])
+    assert_allclose(smaller.project(points)[1], camera.project(points)[1])
+
+
 def test_in_image_by_depth_and_margin() -> None:
     camera = PinholeCamera.from_field_of_view(100, 50, 1.2)
     pixels = [[50, 25], [50, 25], [1, 25], [-1, 25], [98, 25], [99, 25]]
