@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 ContactSide = Literal["front", "rear", "left", "right"]
 CONTACT_GAP: Final = 1.5
 """The largest gap at the last frame, metres, with which a pair can collide within the next tenth of a second."""
+_LEEWAY: Final = 0.3
+"""Metres of a gap at the last frame, beside those of a tenth of a second, with which a pair can still collide."""
 _TOUCHING: Final = 0.02
 """Metres; outlines this near touch, and overlap if they reach farther into each other; the direction of the shortest
 line between two outlines is used from there on."""
@@ -77,6 +79,11 @@ class Contact(FrozenArrays):
         last, first = (int(token.rsplit("/", 1)[1]) for token in (self.frame, self.contact_frame))
         return round((last - first) * FRAME_PERIOD, 1)
 
+    @property
+    def apart(self) -> bool:
+        """Whether the gap is wider than the two close in 0.1 s, and 0.3 m: then `frame` shows no collision."""
+        return bool(self.gap > max(np.nan_to_num(self.closing_speed), 0.0) * FRAME_PERIOD + _LEEWAY)
+
     def __repr__(self) -> str:
         """Who, where, how fast: in one line."""
         who = " and ".join(f"{actor} ({side})" for actor, side in zip(self.actor_ids, self.sides, strict=True))
@@ -93,7 +100,8 @@ def contact_words(touching: float | None, gap: float) -> str:
     """When outlines touch, `touching` seconds before the last frame that shows both, or how far apart they are then."""
     if touching is None:
         return f"outlines {gap:.2f} m apart at the last frame"
-    return f"outlines touching from {touching:.1f} s before the last frame (within 0.1 s)"
+    moment = f"from {touching:.1f} s before" if touching else "at"
+    return f"outlines touching {moment} the last frame (within 0.1 s)"
 
 
 def first_accident(dataset: Dataset) -> str:

@@ -131,15 +131,18 @@ def test_what_meta_says_against_the_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("origin")
-@pytest.mark.parametrize(("gap", "agrees"), [(1.4, True), (1.6, False)])
-def test_how_far_apart_a_pair_may_be_that_collides(tmp_path: Path, gap: float, agrees: bool) -> None:
+@pytest.mark.parametrize(("gap", "agrees", "apart"), [(1.2, True, False), (1.4, True, True), (1.6, False, True)])
+def test_how_far_apart_a_pair_may_be_that_collides(tmp_path: Path, gap: float, agrees: bool, apart: bool) -> None:
+    """They close at 10 m/s."""
+
     def lines(frame: int) -> list[str]:
         return [
             f"car {17.0 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1223 9 True",
             f"car {24.0 + gap} 0.0 0.0 4.0 2.0 1.5 {np.pi} 0 0 1212 9 True",
         ]
 
-    assert (not accident(tmp_path, lines).collision(tiny.TOKEN).disagreements) == agrees
+    found = accident(tmp_path, lines).collision(tiny.TOKEN)
+    assert (not found.disagreements, found.apart, found.touching) == (agrees, apart, None)
 
 
 def test_an_agent_that_labels_itself_alone_has_the_speed_of_its_displacement(

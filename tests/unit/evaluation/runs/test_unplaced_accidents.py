@@ -111,7 +111,9 @@ def test_maps_are_compared_with_maps_as_ever(unplaced: SimpleNamespace) -> None:
 def test_nothing_false_is_said(unplaced: SimpleNamespace) -> None:
     story = describe(unplaced.dataset, unplaced.token)
     assert story.facts["collision"] is True
-    assert "two collide in 2.9 s, but the labels do not show how" in story.text
+    assert "collide in 2.9 s, but the labels do not show how" in story.text
+    twice = story.facts["partners"] is None
+    assert ("two collide" in story.text, " that no label shows" in story.text) == (twice, not twice)
     assert default_scenario(unplaced.dataset) != unplaced.token  # the other accident can be shown
     verdict: Any = sample_verdict(unplaced.dataset, f"{unplaced.token}/ego_vehicle/020", [ALARM], protocol="boxes")
     assert difference_words(verdict.compared).startswith(
