@@ -129,9 +129,9 @@ class Accident(FrozenArrays):
 def counted_text(touching: Sequence[float | None]) -> str:
     """What seconds before impacts are counted to; `touching` is each accident's (`Accident.touching`)."""
     early = [seconds for seconds in touching if seconds]
-    text = "seconds count to the last frame, which the impact is within 0.1 s of"
+    text = "seconds count to the last frame; the impact is at most 0.1 s after it"
     if early:
-        text += f"; outlines touch before it in {len(early)} of {len(touching)} accidents, by up to {max(early):.1f} s"
+        text += f", or before it where outlines touch: {len(early)} of {len(touching)} accidents, up to {max(early):.1f} s"
     return text
 
 
