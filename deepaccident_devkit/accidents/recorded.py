@@ -131,7 +131,9 @@ def counted_text(touching: Sequence[float | None]) -> str:
     early = [seconds for seconds in touching if seconds]
     text = "seconds count to the last frame; the impact is at most 0.1 s after it"
     if early:
-        text += f", or before it where outlines touch: {len(early)} of {len(touching)} accidents, up to {max(early):.1f} s"
+        text += (
+            f", or before it where outlines touch: {len(early)} of {len(touching)} accidents, up to {max(early):.1f} s"
+        )
     return text
 
 

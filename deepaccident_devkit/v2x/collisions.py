@@ -232,12 +232,13 @@ def labelled_together(tracks: ScenarioTracks, scenario: str, pair: tuple[int, in
     Raises NotAvailableError if there are none: `counterpart not recorded` if labels show one of the two alone.
     """
     own = [np.flatnonzero(tracks.actor_id == actor) for actor in pair]
-    frames, *places = np.intersect1d(*(tracks.index[each] for each in own), return_indices=True)
+    first, second = (tracks.index[each] for each in own)
+    frames, *places = np.intersect1d(first, second, return_indices=True)
     absent = [actor for actor, each in zip(pair, own, strict=True) if not len(each)]
     if len(absent) == 1:
         raise NotAvailableError(
             f"{scenario}: counterpart not recorded: meta names actor {absent[0]}, which no label shows; the release "
-            "has such accidents"
+            "has such accidents, and render_frame shows their moments"
         )
     if not len(frames):
         raise NotAvailableError(

@@ -3,7 +3,7 @@
 The positions lie beside the real scenario, in `real_accident`, whose README says whose they are. A release of labels,
 calib and meta is made of them: of Town03's both colliders at 10 Hz, of Town05's actors at 1 Hz. Invented are:
 velocities (central differences), points and visibility, the pole's place, roles without an id; of meta the impact,
-weather, words and class; of Town05 the sizes, headings (along the path), and what is between the seconds (straight lines).
+weather, words and class; of Town05 the sizes, headings (along the path), and what is between the seconds (lines).
 """
 
 import csv
