@@ -26,7 +26,6 @@ from deepaccident_devkit.safety.prevention import prevention_evaluator
 from deepaccident_devkit.statistics import dataset_statistics
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x.collisions import default_scenario
-from deepaccident_devkit.validation import validate_release
 
 ALARM = Accident(positions=[[5.0, 0.0], [8.0, 0.0]], time=1.0, score=0.5)
 
@@ -128,14 +127,13 @@ def test_nothing_false_is_said(unplaced: SimpleNamespace) -> None:
 
 @pytest.mark.slow
 def test_it_is_a_collision_everywhere(unplaced: SimpleNamespace, request: pytest.FixtureRequest) -> None:
-    """Found, counted, skipped by name, shown, and no warning where the release itself has such."""
+    """Found, counted, skipped by name, shown."""
     dataset, token = unplaced.dataset, unplaced.token
     assert token in [scenario["token"] for scenario in dataset.find(collision=True)]
     assert dataset_statistics(dataset).histograms["collision_angles"].left_out.counts["total"] == 1
-    change = request.node.callspec.params["unplaced"]
+    twice = request.node.callspec.params["unplaced"] == "one actor twice"
     for report in (lead_time_ledger(dataset, [token], workers=1), avoidability_report(dataset, [token], workers=1)):
-        (skipped,) = report.skipped
-        assert ("counterpart not recorded" in skipped.reason) == (change != "one actor twice")
+        assert ["counterpart not recorded" in each.reason for each in report.skipped] == [not twice]
     explorer = Explorer(dataset)
     app, here = make_app(explorer), f"/scenario/{token}/"
     addresses = ("/", here, *(f"{here}parts/{part}" for part in PARTS), f"{here}moment/ego_vehicle/30")
@@ -143,7 +141,3 @@ def test_it_is_a_collision_everywhere(unplaced: SimpleNamespace, request: pytest
     explorer.jobs.end()
     for render in (dataset.render_frame, dataset.render_sample, dataset.render_bev, dataset.render_visibility):
         assert render(f"{token}/ego_vehicle/030" if render != dataset.render_frame else f"{token}/030")
-    if change.startswith(("id 0", "nobody")):
-        found = validate_release(dataset.dataroot, scenarios=[token], workers=1).findings
-        assert "counterpart-unknown" in {each.code for each in found}
-        assert {each.code for each in found if each.severity != "note"} <= {"meta-pair"}, "agents who are not the pair"
