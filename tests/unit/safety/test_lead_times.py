@@ -65,6 +65,7 @@ def test_gains_and_losses_are_differences_of_sets() -> None:
         colliding_agents=(None, "other_vehicle"),
         missing=(),
         num_frames=80,
+        touching=None,
         first_frames=80 - np.round(leads * 10).astype(int),
         leads=leads,
         shapley=np.ones(4),

@@ -9,7 +9,7 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.statistics import dataset_statistics
-from deepaccident_devkit.v2x.collisions import default_scenario, first_accident, labelled_pair
+from deepaccident_devkit.v2x.collisions import contact_begin, default_scenario, first_accident, labelled_pair
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -131,15 +131,18 @@ def test_what_meta_says_against_the_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("origin")
-@pytest.mark.parametrize(("gap", "agrees"), [(1.4, True), (1.6, False)])
-def test_how_far_apart_a_pair_may_be_that_collides(tmp_path: Path, gap: float, agrees: bool) -> None:
+@pytest.mark.parametrize(("gap", "agrees", "apart"), [(1.2, True, False), (1.4, True, True), (1.6, False, True)])
+def test_how_far_apart_a_pair_may_be_that_collides(tmp_path: Path, gap: float, agrees: bool, apart: bool) -> None:
+    """They close at 10 m/s."""
+
     def lines(frame: int) -> list[str]:
         return [
             f"car {17.0 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1223 9 True",
             f"car {24.0 + gap} 0.0 0.0 4.0 2.0 1.5 {np.pi} 0 0 1212 9 True",
         ]
 
-    assert (not accident(tmp_path, lines).collision(tiny.TOKEN).disagreements) == agrees
+    found = accident(tmp_path, lines).collision(tiny.TOKEN)
+    assert (not found.disagreements, found.apart, found.touching) == (agrees, apart, None)
 
 
 def test_an_agent_that_labels_itself_alone_has_the_speed_of_its_displacement(
@@ -154,18 +157,32 @@ def test_an_agent_that_labels_itself_alone_has_the_speed_of_its_displacement(
     assert_allclose(accident(tmp_path, lines).collision(tiny.TOKEN).speeds, (10, 0), atol=1e-6)
 
 
+def test_where_contact_begins() -> None:
+    """The first frame of the last run in which outlines touch, overlap or not."""
+    assert [
+        contact_begin(np.array(gaps)) for gaps in ([1, 0.5], [1, 0.02, -0.4], [0, 1, -1, 0], [0, 0], [-1, 1, 2])
+    ] == [
+        *(None, 1, 2, 0, 0),
+    ]
+
+
 @pytest.mark.usefixtures("origin")
-def test_overlapping_boxes_have_no_gap_and_still_a_side(tmp_path: Path) -> None:
+def test_the_blow_is_before_the_end(tmp_path: Path) -> None:
+    """Of a car that pushes another from behind, the speeds are those of the last frame before the overlap."""
+
     def lines(frame: int) -> list[str]:
+        place, speed = ((20.0 + frame, 10), (21.9, 0))[frame == 3]
         return [
-            f"car {16.3 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1223 9 True",
-            f"car 23.0 0.0 0.0 4.0 2.0 1.5 {np.pi} 0 0 1212 9 True",
+            f"car {place} 0.0 0.0 4.0 2.0 1.5 0.0 {speed} 0 1223 9 True",
+            f"car {25.5 + frame / 10} 0.0 0.0 4.0 2.0 1.5 0.0 1 0 1212 9 True",
         ]
 
-    found = accident(tmp_path, lines).collision(tiny.TOKEN)
-    assert (found.gap, found.sides, found.impact_angle) == (0, ("front", "front"), pytest.approx(np.pi))
-    assert found.closing_speed == pytest.approx(10)
-    assert_allclose(found.point, [21.15, 0, 0], atol=0.03)
+    found = accident(tmp_path, lines, meta=tiny.META.replace("front_side", "rear_side")).collision(tiny.TOKEN)
+    assert (found.frame, found.contact_frame, found.touching) == (f"{tiny.TOKEN}/003", f"{tiny.TOKEN}/002", 0.1)
+    assert_allclose([*found.speeds, found.closing_speed, found.gap], [10, 1, 9, 0])
+    assert_allclose(found.point, [23.85, 0, 0], atol=0.03)
+    assert (found.sides, found.disagreements) == (("front", "rear"), ())
+    assert "touching from 0.1 s before" in repr(found)
 
 
 def test_collisions_that_cannot_be_told(tmp_path: Path) -> None:
@@ -175,8 +192,10 @@ def test_collisions_that_cannot_be_told(tmp_path: Path) -> None:
         (lambda: first_accident(silent), NotAvailableError, "no scenario ends in an accident that a meta file names"),
     )
     unseen = accident(tmp_path / "unseen", lambda _: [])
+    alone = accident(tmp_path / "alone", lambda frame: side_by_side(frame)[:1])
     assert_refused(
         (lambda: unseen.collision(tiny.TOKEN), NotAvailableError, "no label shows the colliding pair 1223 and 1212"),
+        (lambda: alone.collision(tiny.TOKEN), NotAvailableError, "counterpart not recorded: meta names actor 1212,"),
         (lambda: unseen.collision("nowhere"), TokenError, "table 'scenario' has no token"),
     )
 
@@ -254,7 +273,7 @@ def nearest_line(corners: list[np.ndarray], others: list[np.ndarray]) -> np.ndar
 
 @pytest.mark.usefixtures("origin")
 def test_pairs_in_any_pose_by_plain_steps(tmp_path: Path) -> None:
-    """They face each other along the side's normal with the widest gap, and close along it where they overlap."""
+    """At the first frame of contact they face each other along the side's normal with the widest gap, and close so."""
     source, told = np.random.default_rng(4), {}
     for number in range(8):
         name = tiny.NAME.replace("00024", f"{number:05d}")
@@ -263,27 +282,38 @@ def test_pairs_in_any_pose_by_plain_steps(tmp_path: Path) -> None:
 
         def lines(frame: int, places=places, sizes=sizes, steps=steps) -> list[str]:
             moved = (places[:, :2] + (frame - 3) * steps) * (1, -1)
+            turns = np.exp(-1j * places[:, 2]) * (steps @ (10, -10j))  # as the release writes velocities
+            each = zip(moved, sizes, places[:, 2], turns, (1223, 1212), strict=True)
             return [
-                f"car {x} {y} 0 {length} {width} 1.5 {-yaw} 0 0 {actor} 9 True"
-                for (x, y), (length, width), yaw, actor in zip(moved, sizes, places[:, 2], (1223, 1212), strict=True)
+                f"car {x} {y} 0 {length} {width} 1.5 {-yaw} {velocity.real} {velocity.imag} {actor} 9 True"
+                for (x, y), (length, width), yaw, velocity, actor in each
             ]
 
         accident(tmp_path, lines, name=name, agents=("ego_vehicle",))
-        told[name] = ([outline(*at, *size) for at, size in zip(places, sizes, strict=True)], places[:, 2], steps)
+        told[name] = (places, sizes, steps)
     da, overlaps = DeepAccident(dataroot=tmp_path, verbose=False), 0
-    for name, ((first, second), yaws, steps) in told.items():
-        found, gaps = da.collision(f"{tiny.TYPE}/{name}"), {}
-        for yaw in (*yaws, *(yaws + np.pi / 2)):
-            for normal in (np.array([np.cos(yaw), np.sin(yaw)]), -np.array([np.cos(yaw), np.sin(yaw)])):
-                gaps[tuple(normal)] = min(each @ normal for each in second) - max(each @ normal for each in first)
-        facing, sides = np.array(max(gaps, key=gaps.get)), []
+    for name, (places, sizes, steps) in told.items():
+        found, yaws = da.collision(f"{tiny.TYPE}/{name}"), places[:, 2]
+        normals = [np.array([np.cos(yaw), np.sin(yaw)]) for turn in range(4) for yaw in yaws + turn * np.pi / 2]
+        ways = []
+        for frame in (1, 2, 3):
+            moved = np.column_stack([places[:, :2] + (frame - 3) * steps, yaws])
+            first, second = (outline(*at, *size) for at, size in zip(moved, sizes, strict=True))
+            gaps = [min(each @ way for each in second) - max(each @ way for each in first) for way in normals]
+            ways.append((max(gaps), normals[int(np.argmax(gaps))]))
+        touching = [widest <= 0.02 for widest, _ in ways]
+        met = 2 - touching[::-1].index(True) if any(touching) else 2
+        while any(touching) and met and touching[met - 1]:
+            met -= 1
+        assert found.contact_frame == (f"{tiny.TYPE}/{name}/{met + 1:03d}" if any(touching) else None)
+        facing, sides = ways[met][1], []
         for yaw, way in zip(yaws, (facing, -facing), strict=True):
             turn = (np.arctan2(way[1], way[0]) - yaw + np.pi / 4) % (2 * np.pi) // (np.pi / 2)
             sides.append(("front", "left", "rear", "right")[int(turn)])
         there, back = nearest_line(first, second), -nearest_line(second, first)
-        apart = min(there, back, key=np.linalg.norm) if max(gaps.values()) > 0 else np.zeros(2)
+        apart = min(there, back, key=np.linalg.norm) if ways[-1][0] > 0 else np.zeros(2)
         overlaps += not apart.any()
-        normal = apart / np.linalg.norm(apart) if np.linalg.norm(apart) > 0.02 else facing
+        normal = apart / np.linalg.norm(apart) if np.linalg.norm(apart) > 0.02 and met == 2 else facing
         speeds = np.linalg.norm(10 * steps, axis=1)
         assert (found.sides, found.gap) == (tuple(sides), pytest.approx(np.linalg.norm(apart), abs=1e-6))
         assert_allclose([*found.speeds, found.closing_speed], [*speeds, 10 * (steps[0] - steps[1]) @ normal], atol=1e-4)

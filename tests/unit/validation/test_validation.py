@@ -193,9 +193,54 @@ def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
     known = found("curtain", **curtain, meta="ClearNoon -1 -1 -1 -1 -1 -1 -1 14\n")
     assert {known[code][0] for code in ("sheer-curtain", "no-collision-in-accident", "meta-incomplete")} == {True}
     normal = {"scenario_type": "type1_subtype2_normal"}
-    first, second = (found(n, **normal, name=f"Town07_type001_subtype0002_scenario000{n}") for n in ("28", "27"))
-    assert first["known-collision-in-normal"] == (True, "note")
-    assert second["collision-in-normal"] == (False, "warning")
+    assert found("normal", **normal)["collision-in-normal"] == (True, "note")
+
+
+@pytest.mark.parametrize(
+    ("changes", "codes_told", "said"),
+    [
+        ({"1212 car": "0 car"}, {"counterpart-unknown"}, "nobody annotated actor 0"),
+        ({"1212 car": "7 bus", "ego other": "ego none"}, {"counterpart-unknown"}, "nobody annotated actor 7"),
+        ({"1212 car": "7 car"}, {"counterpart-unknown", "meta-pair"}, "'ego other' are not the pair (1223, 7)"),
+        ({"ego other": "none none"}, {"nobody-named"}, "the colliding agents are 'none none'"),
+        ({"same": "across"}, {"collision-word"}, "spawn relation is 'across', the release is known to have same, opp"),
+        ({"front_side": "left_side"}, {"collision-word"}, "contact side is 'left_side'"),
+        ({"same front_side": "opposite rear"}, set(), ""),
+    ],
+)
+def test_what_meta_says_of_a_collision(
+    tmp_path: Path, changes: dict[str, str], codes_told: set[str], said: str
+) -> None:
+    """The tiny agents stand far apart, which is told in any case."""
+    meta = tiny.META
+    for old, new in changes.items():
+        meta = meta.replace(old, new)
+    report = validate_release(tiny.write_tiny_release(tmp_path, meta=meta))
+    sound = {"no-contact"} if "1223 car 1212" in meta else set()
+    assert codes(report) == codes_told | sound
+    for finding in report.findings:
+        assert finding.severity == ("note" if finding.code not in ("meta-pair", "no-contact") else "warning")
+    assert any(said in finding.what for finding in report.findings) or not said
+    assert [each.where.endswith(".txt:1") for each in report.findings if each.code == "collision-word"] in ([True], [])
+
+
+@pytest.mark.parametrize(
+    ("speed", "gap", "said"),
+    [(0.0, -0.5, ""), (2.0, 0.5, ""), (2.0, -0.2, "actors 1300, 1400 overlap by up to 0.20 m, frame 4")],
+)
+def test_a_mover_that_overlaps_somebody_is_noted(tmp_path: Path, speed: float, gap: float, said: str) -> None:
+    """Parked rows overlap in the release, and in an accident the pair does."""
+
+    def lines(agent: str, frame: int) -> list[str]:
+        x = 20.0 + speed * (frame - 4) / 10
+        rows = [(x, 1300, speed), (24.0 + gap, 1400, 0.0)] if agent == "infrastructure" else []
+        return ["0 0", *(f"car {at} 0 -1.2 4 2 1.5 0 {now} 0 {actor} 9 True" for at, actor, now in rows)]
+
+    where = {"scenario_type": "type1_subtype1_normal", "meta": "ClearNoon -1 -1 -1 -1 -1 -1 -1 14\n"}
+    root = tiny.write_tiny_release(tmp_path, lines_of=lines, agents=("infrastructure",), **where)
+    told = [finding for finding in validate_release(root).findings if finding.code == "overlap-unnamed"]
+    assert [finding.what for finding in told] == ([said] if said else [])
+    assert {finding.severity for finding in told} <= {"note"}
 
 
 def test_what_is_left_aside_is_named(tmp_path: Path) -> None:

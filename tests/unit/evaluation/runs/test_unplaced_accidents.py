@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from asgi import get
 from memory_results import MemoryResults
 
 from deepaccident_devkit import DeepAccident
@@ -15,11 +16,14 @@ from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.explore import Explorer, make_app
+from deepaccident_devkit.explore.pages.scenario import PARTS
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render.outcomes.above import difference_words
 from deepaccident_devkit.render.outcomes.evaluation import sample_verdict
-from deepaccident_devkit.safety import describe
+from deepaccident_devkit.safety import avoidability_report, describe, lead_time_ledger
 from deepaccident_devkit.safety.prevention import prevention_evaluator
+from deepaccident_devkit.statistics import dataset_statistics
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x.collisions import default_scenario
 
@@ -111,9 +115,29 @@ def test_maps_are_compared_with_maps_as_ever(unplaced: SimpleNamespace) -> None:
 def test_nothing_false_is_said(unplaced: SimpleNamespace) -> None:
     story = describe(unplaced.dataset, unplaced.token)
     assert story.facts["collision"] is True
-    assert "two collide in 2.9 s, but the labels do not show how" in story.text
+    assert "collide in 2.9 s, but the labels do not show how" in story.text
+    twice = story.facts["partners"] is None
+    assert ("two collide" in story.text, " that no label shows" in story.text) == (twice, not twice)
     assert default_scenario(unplaced.dataset) != unplaced.token  # the other accident can be shown
     verdict: Any = sample_verdict(unplaced.dataset, f"{unplaced.token}/ego_vehicle/020", [ALARM], protocol="boxes")
     assert difference_words(verdict.compared).startswith(
         "an accident comes in 1.0 s that no label shows both actors of"
     )
+
+
+@pytest.mark.slow
+def test_it_is_a_collision_everywhere(unplaced: SimpleNamespace, request: pytest.FixtureRequest) -> None:
+    """Found, counted, skipped by name, shown."""
+    dataset, token = unplaced.dataset, unplaced.token
+    assert token in [scenario["token"] for scenario in dataset.find(collision=True)]
+    assert dataset_statistics(dataset).histograms["collision_angles"].left_out.counts["total"] == 1
+    twice = request.node.callspec.params["unplaced"] == "one actor twice"
+    for report in (lead_time_ledger(dataset, [token], workers=1), avoidability_report(dataset, [token], workers=1)):
+        assert ["counterpart not recorded" in each.reason for each in report.skipped] == [not twice]
+    explorer = Explorer(dataset)
+    app, here = make_app(explorer), f"/scenario/{token}/"
+    addresses = ("/", here, *(f"{here}parts/{part}" for part in PARTS), f"{here}moment/ego_vehicle/30")
+    assert {address: get(app, address).status for address in addresses} == dict.fromkeys(addresses, 200)
+    explorer.jobs.end()
+    for render in (dataset.render_frame, dataset.render_sample, dataset.render_bev, dataset.render_visibility):
+        assert render(f"{token}/ego_vehicle/030" if render != dataset.render_frame else f"{token}/030")
