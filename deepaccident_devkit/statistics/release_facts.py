@@ -150,9 +150,10 @@ def _measured(fact: Fact, parts: Sequence[FloatArray]) -> tuple[float | None, tu
         return here, (low, high)
     mean = float(values.mean())
     off = np.array([(each - mean).sum() for each in parts]) / len(values)
-    spread = float(np.square(off).sum()) * number / max(number - 1, 1)
+    spread = float(np.square(off).sum())
     if fact.kind == "mean":
-        return mean, (mean - _Z * math.sqrt(spread), mean + _Z * math.sqrt(spread))
+        half = _Z * math.sqrt(spread * number / max(number - 1, 1))
+        return mean, (mean - half, mean + half)
     return mean, _wilson(mean, min(mean * (1 - mean) / spread, len(values)) if spread else number)
 
 
