@@ -2,7 +2,7 @@
 
 from deepaccident_devkit.statistics.compute import dataset_statistics
 from deepaccident_devkit.statistics.real_facts import FACTS, Fact
-from deepaccident_devkit.statistics.release_facts import FactRow, ReleaseFacts, release_facts
+from deepaccident_devkit.statistics.release_facts import ReleaseFacts, release_facts
 from deepaccident_devkit.statistics.report import DatasetStatistics
 from deepaccident_devkit.statistics.results import (
     ENDS,
@@ -26,7 +26,6 @@ __all__ = [
     "CountTable",
     "DatasetStatistics",
     "Fact",
-    "FactRow",
     "Histogram",
     "LeftOut",
     "QuantileRow",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.accidents.recorded import each_scenario, those_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.reports import Report
-from deepaccident_devkit.statistics.real_facts import FACTS, Fact
+from deepaccident_devkit.statistics.real_facts import FACTS, Fact, Verdict
 from deepaccident_devkit.statistics.scenario_facts import ScenarioFacts, scenario_facts
 from deepaccident_devkit.support.arrays import FloatArray
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.parallel import Engine
 
-Verdict = Literal["agree", "differ", "cannot say"]
 FEWEST: Final = 10
 """Scenarios with a case, from which on a share, mean, median, percentile or AUC says something."""
 MANY: Final = 50
@@ -35,33 +34,6 @@ _BROKEN: Final[Mapping[str, str]] = {"fields": "expected 13 fields", "gapless": 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FactRow:
-    """A fact, and what a release has of it; shares are from 0 to 1.
-
-    Attributes:
-        fact: what others measured, or our readers take for granted.
-        here: this release's share, mean, median, most, least or AUC; None where it has none.
-        ends: of its 95 % interval, or the 5th and 95th percentile for few real cases; None where there is none.
-        cases: how many cases there are here.
-        scenarios: how many scenarios they are of.
-        verdict: whether the two agree.
-    """
-
-    fact: Fact
-    here: float | None
-    ends: tuple[float, float] | None
-    cases: int
-    scenarios: int
-    verdict: Verdict
-
-    def texts(self) -> tuple[str, ...]:
-        """The row's cells: fact, confidence, others, here, cases, verdict."""
-        fact, here = self.fact, "–" if self.here is None else _text([self.here], self.fact.unit)
-        within = f" [{_text(self.ends, fact.unit, ' … ')}]" if self.ends else ""
-        return fact.name, fact.confidence, _others_text(fact), here + within, f"{self.cases:,}", self.verdict
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseFacts(Report):
     """All facts of a release. Nothing in it names a path, or whose release it is.
 
@@ -70,7 +42,7 @@ class ReleaseFacts(Report):
         version: `v1` or `v1-mini`.
         scenarios: how many were looked at.
         left_out: how many are broken.
-        facts: a row a fact.
+        facts: `FACTS`, compared.
         counts: what was counted, such as `weather` → word → scenarios (of `label ids`, rows).
     """
 
@@ -78,17 +50,19 @@ class ReleaseFacts(Report):
     version: str
     scenarios: int
     left_out: int
-    facts: tuple[FactRow, ...]
+    facts: tuple[Fact, ...]
     counts: Mapping[str, Mapping[str, int]]
 
     def named_tables(self) -> dict[str, list[tuple[str, ...]]]:
         """The facts; and how many scenarios there are, facts agree, and have which word or kind of id."""
-        looked_at = {"looked at": self.scenarios, "left out as broken": self.left_out}
-        verdicts = Counter(str(row.verdict) for row in self.facts)
-        counts: dict[str, Mapping[str, int]] = {"scenarios": looked_at, "facts": verdicts, **self.counts}
+        counts = {
+            "scenarios": {"looked at": self.scenarios, "left out as broken": self.left_out},
+            "facts": Counter(str(fact.verdict) for fact in self.facts),
+            **self.counts,
+        }
         numbers = [(name, word, f"{number:,}") for name, words in counts.items() for word, number in words.items()]
         return {
-            "facts": [("fact", "conf.", "others", "here", "cases", "verdict"), *(row.texts() for row in self.facts)],
+            "facts": [("fact", "conf.", "others", "here", "cases", "verdict"), *(fact.texts() for fact in self.facts)],
             "counts": [("of", "what", "number"), *numbers],
         }
 
@@ -123,16 +97,16 @@ def release_facts(
         version=dataset.version,
         scenarios=len(found),
         left_out=len(broken),
-        facts=tuple(_row(fact, parts[fact.key]) for fact in FACTS),
+        facts=tuple(_compared(fact, parts[fact.key]) for fact in FACTS),
         counts={name: dict(words.most_common(_SHOWN)) for name, words in counts.items()},
     )
 
 
-def _row(fact: Fact, parts: Sequence[FloatArray]) -> FactRow:
-    """A fact's row, of the values of each scenario."""
+def _compared(fact: Fact, parts: Sequence[FloatArray]) -> Fact:
+    """A fact beside the values of each scenario."""
     here, ends = _measured(fact, parts) if parts else (None, None)
-    cases, verdict = sum(map(len, parts)), _verdict(fact, len(parts), here, ends)
-    return FactRow(fact=fact, here=here, ends=ends, cases=cases, scenarios=len(parts), verdict=verdict)
+    found = replace(fact, here=here, ends=ends, cases=sum(map(len, parts)), scenarios=len(parts))
+    return found if here is None else replace(found, verdict=_verdict(found, here))
 
 
 def _measured(fact: Fact, parts: Sequence[FloatArray]) -> tuple[float | None, tuple[float, float] | None]:
@@ -142,11 +116,10 @@ def _measured(fact: Fact, parts: Sequence[FloatArray]) -> tuple[float | None, tu
         hit = values[:, 1] > 0
         smaller = np.sign(np.subtract.outer(values[~hit, 0], values[hit, 0])) / 2 + 0.5  # ties count half
         return (float(smaller.mean()) if smaller.size else None), None
-    if fact.kind in ("most", "least"):
-        return float(values.max() if fact.kind == "most" else values.min()), None
-    if fact.kind in ("few", "median", "range"):
-        half = 0.45 if fact.kind == "few" else min(_Z / 2 / math.sqrt(number), 0.5)
-        low, here, high = np.quantile(values, (0.5 - half, 0.5, 0.5 + half)).tolist()
+    if fact.kind in ("few", "median", "range", "most", "least"):
+        half = min(_Z / 2 / math.sqrt(number), 0.5)
+        levels = {"few": (0.05, 0.5, 0.95), "most": (1, 1, 1), "least": (0, 0, 0)}
+        low, here, high = np.quantile(values, levels.get(fact.kind, (0.5 - half, 0.5, 0.5 + half))).tolist()
         return here, (low, high)
     mean = float(values.mean())
     off = np.array([(each - mean).sum() for each in parts]) / len(values)
@@ -164,27 +137,14 @@ def _wilson(share: float, number: float) -> tuple[float, float]:
     return max(low, 0.0), min(high, 1.0)
 
 
-def _verdict(fact: Fact, scenarios: int, here: float | None, ends: tuple[float, float] | None) -> Verdict:
-    """Whether a release agrees with a fact; docs/validation.md says when."""
-    if here is None:
-        return "cannot say"
-    low, high = ends or (here, here)
+def _verdict(fact: Fact, here: float) -> Verdict:
+    """Whether a release that has `here` agrees with a fact; docs/validation.md says when."""
+    low, high = fact.ends or (here, here)
     agrees = fact.limits[0] <= here <= fact.limits[1]
     if fact.kind == "few":
         agrees = low <= min(fact.real) and max(fact.real) <= high
     if fact.kind in ("share", "mean", "median"):
-        known = _wilson(fact.real[0], fact.cases) if fact.kind == "share" and fact.cases < MANY else fact.real
+        known = _wilson(fact.real[0], fact.real_cases) if fact.kind == "share" and fact.real_cases < MANY else fact.real
         agrees = 2 * low - here <= known[-1] and known[0] <= 2 * high - here
     certain = fact.kind == "all" or (agrees and fact.kind in ("some", "most", "least"))
-    return "cannot say" if scenarios < FEWEST and not certain else "agree" if agrees else "differ"
-
-
-def _text(values: Sequence[float], unit: str, between: str = ", ") -> str:
-    scale, sign = (100, "%") if unit == "share" else (1, unit)
-    return f"{between.join(f'{scale * each:.3g}' for each in values)} {sign}".rstrip()
-
-
-def _others_text(fact: Fact) -> str:
-    words = {"all": "always", "some": "occurs", "range": _text(fact.limits, fact.unit, " to ")}
-    cases = f", {fact.cases:,}" if fact.cases else ""
-    return words.get(fact.kind, _text(fact.real, fact.unit)) + (f" ({fact.source}{cases})" if fact.source else "")
+    return "cannot say" if fact.scenarios < FEWEST and not certain else "agree" if agrees else "differ"

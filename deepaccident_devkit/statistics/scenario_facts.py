@@ -81,7 +81,6 @@ def scenario_facts(dataset: Dataset, record: ScenarioRecord) -> ScenarioFacts:
         "velocities_released": [frame == RELEASED_VELOCITY_FRAME] if frame else [],
         **_of_agents(seen),
         **_of_labels(seen),
-        **_of_ego_labels(seen),
         **_extrapolated(seen),
         **(_of_meta(seen, record, read_meta(folder.meta_path)) if record["weather"] else {}),
     }
@@ -89,9 +88,8 @@ def scenario_facts(dataset: Dataset, record: ScenarioRecord) -> ScenarioFacts:
         "agents with labels": str(labelled),
         "velocity frame": frame,
         **{name: dict(record)[name] for name in _WORDS},
+        **({"token 7": collision["spawn_relation"], "token 8": collision["contact_side"]} if collision else {}),
     }
-    if collision is not None:
-        words |= {"token 7": collision["spawn_relation"], "token 8": collision["contact_side"]}
     ids = seen.column("annotation", "actor_id")
     arrays = {key: as_floats(each) for key, each in values.items() if np.size(each)}
     known = {key: each[np.isfinite(each.reshape(len(each), -1)).all(axis=1)] for key, each in arrays.items()}
@@ -128,9 +126,9 @@ class _Seen:
             [boxes.center[:, :2], boxes.size[:, :2], boxes.yaw, boxes.velocity[:, :2], tracks.agents & 1]
         )
         self.boxes, self.velocity, self.by_ego = dense[..., :5], dense[..., 5:7], dense[..., 7] == 1
-        self.recent = self.velocity.copy()
-        moved = (dense[:, _HALF:, :2] - dense[:, :-_HALF, :2]) * (_SECOND / _HALF)
-        np.copyto(self.recent[:, _HALF:], moved, where=np.isfinite(moved))
+        before = np.pad(dense[..., :2], ((0, 0), (_HALF, 0), (0, 0)), constant_values=np.nan)[:, :-_HALF]
+        moved = (dense[..., :2] - before) * (_SECOND / _HALF)
+        self.recent = np.where(np.isnan(moved), self.velocity, moved)
         self.vehicle: BoolArray = boxes.category[first] != _PEDESTRIAN
         of_samples = dataset.columns("sample")["scenario_row"]
         self.samples = slice(*of_samples.searchsorted(np.array([row, row + 1], dtype=of_samples.dtype)).tolist())
@@ -163,8 +161,7 @@ def _of_meta(seen: _Seen, record: ScenarioRecord, meta: Meta) -> dict[str, Array
         return values
     names = dict(zip(ids or (), VEHICLE_AGENTS, strict=False))
     pair, unknown = {names.get(each) for each in collision.ids}, 0 in collision.ids
-    ego, ego_behind, other, other_behind = VEHICLE_AGENTS
-    pairs = {"designed": {ego, other}, "behind": {ego_behind, other_behind}, "follower": {ego_behind, other}}
+    pairs = {"designed": VEHICLE_AGENTS[::2], "behind": VEHICLE_AGENTS[1::2], "follower": VEHICLE_AGENTS[1:3]}
     return values | {
         "frames_by_meta": [frames == meta.recorded_frames],
         "short": [frames - 1 < SECONDS[-1] * _SECOND],
@@ -174,7 +171,7 @@ def _of_meta(seen: _Seen, record: ScenarioRecord, meta: Meta) -> dict[str, Array
         "unknown_partner": [unknown],
         "agents_named": [set(collision.agents) == pair] if collision.agents and ids else [],
         "pair_background": [None in pair and not unknown] if ids else [],
-        **{f"pair_{name}": [pair == each] if ids else [] for name, each in pairs.items()},
+        **{f"pair_{name}": [pair == {*each}] if ids else [] for name, each in pairs.items()},
         **_of_contact(seen, collision.ids),
     }
 
@@ -223,19 +220,13 @@ def _of_agents(seen: _Seen) -> dict[str, ArrayLike]:
 
 
 def _of_labels(seen: _Seen) -> dict[str, ArrayLike]:
-    """Ids, own rows, and how many vehicles ego's labels have; untracked ones and ego itself left out."""
+    """Ids and own rows; of the vehicles in ego's labels their number, overlaps, and least gaps in the next two seconds.
+
+    Untracked ones are left out; ego itself counts among those that overlap and come near.
+    """
     ids, sample = seen.column("annotation", "actor_id"), seen.column("annotation", "sample_row") - seen.samples.start
     vehicle = (ids > 0) & (seen.column("annotation", "category") != _PEDESTRIAN)
     own, vehicles = (np.bincount(sample[rows], minlength=len(seen.drives)) for rows in (ids == OWN_ACTOR_ID, vehicle))
-    return {
-        "ids_known": np.isin(ids, (OWN_ACTOR_ID, UNTRACKED_ID)) | (ids > 0),
-        "own_row": (own == seen.drives)[seen.labelled],
-        "vehicles": vehicles[seen.labelled & (seen.column("sample", "agent") == 0)],
-    }
-
-
-def _of_ego_labels(seen: _Seen) -> dict[str, ArrayLike]:
-    """Overlaps of the vehicles in ego's labels, and how near they come to each other in the next two seconds."""
     boxes = np.where(seen.by_ego[..., None], seen.boxes, np.nan)[seen.vehicle]
     pairs = np.stack(np.triu_indices(len(boxes), 1))
     gaps, moves = gaps_of_pairs(*boxes[pairs]), (np.hypot(*seen.velocity[seen.vehicle].T) > MOVING).T[pairs]
@@ -246,6 +237,9 @@ def _of_ego_labels(seen: _Seen) -> dict[str, ArrayLike]:
     ]
     nearest = np.array(least)[np.isfinite(least)]
     return {
+        "ids_known": np.isin(ids, (OWN_ACTOR_ID, UNTRACKED_ID)) | (ids > 0),
+        "own_row": (own == seen.drives)[seen.labelled],
+        "vehicles": vehicles[seen.labelled & (seen.column("sample", "agent") == 0)],
         "overlap_samples": (gaps == 0).any(axis=0)[seen.by_ego.any(axis=0)],
         **{f"overlap_{name}": movers == count for count, name in enumerate(("stand", "mixed", "move"))},
         "next_touch": nearest < 0.01,

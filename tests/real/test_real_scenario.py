@@ -313,6 +313,6 @@ def test_it_can_be_exported_to_mcap(real: DeepAccident, tmp_path: Path) -> None:
 
 
 def test_facts_say_nothing_false(real: DeepAccident) -> None:
-    rows = {row.fact.key: row for row in release_facts(real, workers=1).facts}
+    rows = {row.key: row for row in release_facts(real, workers=1).facts}
     assert {row.verdict for row in rows.values()} == {"agree", "cannot say"}
     assert [rows[key].here for key in ("slow", "fast", "vehicles")] == pytest.approx([0.16, 0.11, 11], abs=0.02)
