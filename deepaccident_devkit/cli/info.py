@@ -68,14 +68,14 @@ def info(
 
     With --where, list the scenarios that match all filters instead; with --json, their records.
     """
-    if not statistics:
-        refuse_unused("without --statistics", *_OF_STATISTICS)
+    if facts or not statistics:
+        why = "with --facts" if facts else "without --statistics"
+        refuse_unused(why, *_OF_STATISTICS, *(["statistics"] if facts else []))
     dataset = DeepAccident(**(release | {"on_error": "skip"} if facts else release))
     chosen = dataset.find(*where) if where else None
     if facts:
         from deepaccident_devkit.statistics import release_facts
 
-        refuse_unused("with --facts", "statistics", *_OF_STATISTICS)
         say_report(release_facts(dataset, chosen, **engine_of(release)), [], None, as_json=as_json)
         return
     if chosen == [] and out is not None:
