@@ -16,7 +16,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.release import read_calib, read_label
-from deepaccident_devkit.statistics import dataset_statistics
+from deepaccident_devkit.statistics import dataset_statistics, release_facts
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CAMERAS,
@@ -314,3 +314,9 @@ def test_it_can_be_exported_to_mcap(real: DeepAccident, tmp_path: Path) -> None:
     assert {camera: len(messages[f"/{INFRASTRUCTURE}/{camera}/image"]) for camera in CAMERAS} == dict.fromkeys(
         CAMERAS, 1
     )
+
+
+def test_facts_say_nothing_false(real: DeepAccident) -> None:
+    rows = {row.key: row for row in release_facts(real, workers=1).facts}
+    assert {row.verdict for row in rows.values()} == {"agree", "cannot say"}
+    assert [rows[key].here for key in ("slow", "fast", "vehicles")] == pytest.approx([0.16, 0.11, 11], abs=0.02)
