@@ -68,7 +68,10 @@ class SynthConfig:
             both all the time. With None the scenario files decide.
         designs: which of the paper's twelve are used by turns, in this order; empty for all (with the view `hidden`,
             for all in which a house can hide the two from each other).
-        unplanned: share of accidents that differ from the design: with a pedestrian or a third vehicle. It is 0
+        designed: whether accidents are clean: those of the designs, between drivers who err in nothing but the design.
+            If not, accidents and traffic are as the real release has them. A `spec` or the view `hidden` asks for one
+            certain accident, and that is always clean.
+        unplanned: share of clean accidents that differ from the design: with a pedestrian or a third vehicle. It is 0
             where `spec` or the view `hidden` asks for one certain accident.
         spec: a scenario file (docs/synth.md) to use instead of the designs; every pair is one draw from it.
         unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
@@ -87,6 +90,7 @@ class SynthConfig:
     sensors: Sensors | bool = "all"
     view: View | None = None
     designs: tuple[int, ...] = ()
+    designed: bool = False
     unplanned: float = 0.1
     spec: Path | None = None
     unlabelled_test: bool = False
@@ -124,6 +128,11 @@ class SynthConfig:
         if self.image_size is not None:
             return self.image_size
         return RELEASED_IMAGE_SIZE if self.for_released_code else IMAGE_SIZE
+
+    @property
+    def lifelike(self) -> bool:
+        """Whether accidents and traffic are as the real release has them."""
+        return not self.designed and self.spec is None and self.view != "hidden"
 
     @property
     def design_round(self) -> tuple[int, ...]:

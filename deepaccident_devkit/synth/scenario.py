@@ -244,8 +244,8 @@ def _collision(stage: Stage, recorded: Recorded, ids: _Ids) -> Collision | None:
         ids=(ids.actor[pair[0]], ids.actor[pair[1]]),
         classes=(first.body.category, second.body.category),
         impact=impact.strength,
-        spawn_relation="same",
-        contact_side=f"{impact.side}_side",
+        spawn_relation=impact.relation,
+        contact_side=impact.side,
         agents=_pair_agents(stage),
     )
 

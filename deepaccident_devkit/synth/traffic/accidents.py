@@ -24,7 +24,10 @@ _LOOK_STEP = 5
 """Which road users are near each other is computed once in so many steps."""
 _NEAR = 2.0
 """How much nearer two can come between these steps, metres."""
-ContactSide = Literal["front", "back", "left", "right"]
+ContactSide = Literal["front", "front_side", "rear", "rear_side"]
+Relation = Literal["same", "opposite"]
+_TOWARDS = -0.5
+"""Cosine of the angle between two headings: below it they drive towards each other."""
 _AREA_MASS = 60.0
 """Impact for each m² of the first box and m/s; so the numbers are about as large as in the real release."""
 _HALVINGS = 40
@@ -97,11 +100,13 @@ class Impact:
 
     Attributes:
         time: seconds, when the boxes first touch.
-        side: the side of the first one's box that is hit.
+        relation: whether the two drive the same way, or towards each other, as the meta file names it.
+        side: the side of the first one's box that is hit, as the meta file names it.
         strength: the impact in the meta file.
     """
 
     time: float
+    relation: Relation
     side: ContactSide
     strength: float
 
@@ -307,6 +312,7 @@ def impact_of(simulation: Simulation, pair: tuple[int, int], size: FloatArray) -
     velocity = simulation.velocities[-1][rows]
     return Impact(
         time=float(simulation.time[-1]) - (1.0 - share) * period,
+        relation="opposite" if np.cos(poses[0, 2] - poses[1, 2]) < _TOWARDS else "same",
         side=contact_side(poses, size),
         strength=float(_AREA_MASS * size[0].prod() * np.hypot(*(velocity[0] - velocity[1]))),
     )
@@ -328,6 +334,8 @@ def _touching_share(before: FloatArray, after: FloatArray, size: FloatArray) -> 
 def contact_side(poses: FloatArray, size: FloatArray) -> ContactSide:
     """The side of the first of two boxes that faces the second across the widest gap along any side's normal.
 
+    Flanks are told by the half, before or behind the first one's middle, in which the middle of the second is.
+
     Poses are (2, 3) x, y (metres), yaw (radians) of the centres, sizes (2, 2) length and width, metres.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -338,8 +346,8 @@ def contact_side(poses: FloatArray, size: FloatArray) -> ContactSide:
     best = int(np.argmax(np.abs(apart) - reach))
     along, across = axes[0] @ (normals[best] * np.sign(apart[best]))
     if abs(along) >= abs(across):
-        return "front" if along > 0 else "back"
-    return "left" if across > 0 else "right"
+        return "front" if along > 0 else "rear"
+    return "front_side" if axes[0, 0] @ (poses[1, :2] - poses[0, :2]) >= 0 else "rear_side"
 
 
 def touching_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[tuple[int, int]]:
