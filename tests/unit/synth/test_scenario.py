@@ -44,7 +44,9 @@ def test_clean_accidents_are_those_of_older_releases(built):
     metas = [scenario.meta for scenario in built if scenario.plan.accident][:4]
     assert [meta.recorded_frames for meta in metas] == [55, 70, 83, 66]
     assert [meta.agent_ids[0] for meta in metas] == [1308, 1155, 1629, 1501]
-    assert [meta.collision.impact for meta in metas] == pytest.approx([9318.248, 9226.524, 3705.879, 2925.796], abs=0.01)
+    assert [meta.collision.impact for meta in metas] == pytest.approx(
+        [9318.248, 9226.524, 3705.879, 2925.796], abs=0.01
+    )
 
 
 def test_the_last_frame_is_the_impact(built):
