@@ -51,6 +51,8 @@ _CYCLIST_OFFSET = 1.1
 _KERB_ROOM = 0.7
 """Metres from the kerb to where a pedestrian waits to step onto the road."""
 WALKER = "pedestrian"
+Stretch = tuple[float, float, float]
+"""Where a part of a path begins and ends, metres along it, and the most speed there, m/s."""
 
 
 @dataclass(slots=True, eq=False)
@@ -119,10 +121,12 @@ class Tracks:
     """Points along each path, and the speed that its bends allow; one row for each road user.
 
     `lateral` is (A,) m/s², the most sideways acceleration that each accepts in a bend. Those with `stops` (A,) stop at
-    the path's end; others go straight on.
+    the path's end; others go straight on. `paces` has each one's own stretches, before which nobody brakes in advance.
     """
 
-    def __init__(self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray) -> None:
+    def __init__(
+        self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray, paces: Sequence[Sequence[Stretch]] = ()
+    ) -> None:
         reach = max(path.length for path in paths) + _BEYOND
         along = np.arange(0.0, reach, SPACING)
         distinct = {id(path): path for path in paths}
@@ -132,6 +136,10 @@ class Tracks:
         self._points, self._distinct = points, rows  # (P, K, 4), (A,)
         ends = np.where(stops, [path.length for path in paths], np.inf)
         self._allowed = _allowed_speed(along, points[rows, :, 3], lateral, ends)
+        for row, pace in enumerate(paces):
+            for begin, end, most in pace:
+                cells = slice(*np.searchsorted(along, (begin, end)))
+                self._allowed[row, cells] = np.minimum(self._allowed[row, cells], most)
         self._flat = np.ascontiguousarray(points.reshape(-1, 4).T)
         self._first = rows * len(along)
         self._row = np.arange(len(paths))
@@ -306,6 +314,15 @@ MANNERS = {
     "pedestrian": Manner(1.5, 2.0, 0.4, 0.5, 9.0, (0.9, 1.7)),
 }
 """By category."""
+BRISK_MANNERS = {
+    category: manner
+    if category == WALKER
+    else replace(
+        manner, acceleration=1.7 * manner.acceleration, braking=2.1 * manner.braking, time_gap=0.6 * manner.time_gap
+    )
+    for category, manner in MANNERS.items()
+}
+"""Of drivers who are late: they speed up and brake harder, and follow more closely."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -325,6 +342,8 @@ class RoadUser:
             stays on the sidewalk.
         ignores: the rules that it breaks.
         alert: seconds before a contact at which it notices the other one of the pair; 0 for never.
+        pace: stretches of its path where it is slow for reasons of its own.
+        brisk: whether it drives as `BRISK_MANNERS` say.
     """
 
     role: Role
@@ -338,6 +357,8 @@ class RoadUser:
     span: tuple[float, float] = (0.0, 0.0)
     ignores: tuple[Rule, ...] = ()
     alert: float = 0.0
+    pace: tuple[Stretch, ...] = ()
+    brisk: bool = False
 
     @property
     def walks(self) -> bool:
@@ -347,7 +368,7 @@ class RoadUser:
     @property
     def manner(self) -> Manner:
         """How it drives."""
-        return MANNERS[self.body.category]
+        return (BRISK_MANNERS if self.brisk else MANNERS)[self.body.category]
 
     @property
     def wheelbase(self) -> float:

@@ -67,7 +67,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 def jobs(root: Path) -> list[RecordingJob]:
     """The accidents, and after every seventh its twin."""
-    short = SynthConfig(scenarios=2 * PAIRS, frames=30, sensors=False, seed=26, unplanned=0.3, exact=True)
+    short = SynthConfig(
+        scenarios=2 * PAIRS, frames=30, sensors=False, seed=26, unplanned=0.3, exact=True, designed=True
+    )
     hidden = replace(short, view="hidden")
     plans = [(short, plan) for plan in plan_scenarios(short)[: 2 * OPEN_PAIRS]]
     plans += [(hidden, plan) for plan in plan_scenarios(hidden)[2 * OPEN_PAIRS :]]

@@ -167,13 +167,14 @@ def test_a_file_in_which_nobody_meets_gives_normal_scenarios(own):
 
 
 @pytest.mark.slow
-def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built():
-    config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3)
+@pytest.mark.parametrize("designed", [True, False])
+def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built(designed):
+    config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3, designed=designed)
     plans = plan_scenarios(config)
     assert {plan.unplanned for plan in plans} == {True, False}
 
     def record(plan):
-        meta = build_scenario(config, plan).meta if plan.accident else None
+        meta = build_scenario(config, plan).meta
         return {
             "token": plan.token,
             "name": plan.name,

@@ -44,7 +44,9 @@ CHANGES: dict[str, tuple[int, str, str | None]] = {
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("unplaced") / "release"
-    make_release(root, SynthConfig(scenarios=4, frames=30, seed=5, sensors="none", unplanned=0), workers=1)
+    make_release(
+        root, SynthConfig(scenarios=4, frames=30, seed=5, sensors="none", unplanned=0, designed=True), workers=1
+    )
     return root
 
 

@@ -65,7 +65,9 @@ class Run:
 def runs(design, kind):
     """An accident and its twin, as a release has them."""
     view = "hidden" if kind == "hidden" else None
-    plan = plan_scenarios(SynthConfig(scenarios=1, designs=(design,), unplanned=0.0, seed=design, view=view))[0]
+    plan = plan_scenarios(
+        SynthConfig(scenarios=1, designs=(design,), unplanned=0.0, seed=design, view=view, designed=True)
+    )[0]
     rng = np.random.default_rng([design, 4])
     for _ in range(5):
         spec = plan.draw(rng)
