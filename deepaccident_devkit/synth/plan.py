@@ -22,7 +22,7 @@ from deepaccident_devkit.synth.spec import (
 )
 from deepaccident_devkit.synth.traffic.lifelike import MISFILED, Kind, as_kind, draw_kind, paths_join
 from deepaccident_devkit.tables.records import ScenarioRecord
-from deepaccident_devkit.taxonomy import ROAD_TYPES, SPLITS, TOWNS, Layout
+from deepaccident_devkit.taxonomy import META_AGENTS, ROAD_TYPES, SPLITS, TOWNS, Layout
 
 Sensors = Literal["all", "cameras", "none"]
 """Which sensors' files a release has: of all, the images alone, or of none."""
@@ -367,9 +367,9 @@ def _mini(plans: Sequence[ScenarioPlan], split: Sequence[str], wanted: Collectio
 
 def _record(plan: ScenarioPlan) -> ScenarioRecord:
     """The fields of a scenario's later record that the split procedure reads."""
-    pair = plan.kind.pair if plan.kind else None if plan.unplanned else tuple(sorted(plan.template.meeting_roles))
-    designed = plan.collides and pair == ("ego", "other")
-    agents = ("ego_vehicle", "other_vehicle") if designed else (None, None)
+    clean = not plan.unplanned and plan.template.meeting_roles == {"ego", "other"}
+    pair = plan.kind.pair if plan.kind else ("ego", "other") if clean else None
+    agents = (None, None) if pair is None else tuple(META_AGENTS[role] for role in pair)
     record = {
         "token": plan.token,
         "name": plan.name,

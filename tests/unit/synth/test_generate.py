@@ -60,7 +60,7 @@ def test_layout_b_has_a_folder_a_split(tmp_path):
 @pytest.mark.slow
 def test_a_release_for_the_released_code_has_its_split_files_twice(tmp_path):
     """Calib files are those of 1600x900 images, whether images are there or not."""
-    config = SynthConfig(scenarios=4, frames=1, sensors=False, for_released_code=True)
+    config = SynthConfig(scenarios=4, frames=1, sensors=False, for_released_code=True, designed=True)
     root = make_release(tmp_path / "released", config, workers=1)
     release = find_release(root)
     assert release.layout == "A"
@@ -224,7 +224,7 @@ def test_a_release_of_images_alone_is_as_a_partial_download(tmp_path):
 
 @pytest.mark.slow
 def test_a_long_recording_waits_before_it_starts():
-    config = SynthConfig(scenarios=1, frames=999)
+    config = SynthConfig(scenarios=1, frames=999, designed=True)
     scenario = build_scenario(config, plan_scenarios(config)[0])
     row = scenario.actors.row_of(scenario.agents["ego_vehicle"])
     start, end = (scenario.actors.at(time).velocities[row] for time in (0.0, 99.8))
