@@ -164,13 +164,10 @@ def test_complete_results_stay_and_others_are_refused(
     assert (predicted, contents(out)) == ([], before)
 
 
-def test_results_say_of_what_they_are(da_b: DeepAccident, wholes: Path) -> None:
-    meta = read_results(wholes / "motion").meta
-    assert meta == {
-        **NOISY.meta(),
-        "release": {"version": "v1", "index": da_b.tables_folder.name},
-        "devkit": __version__,
-    }
+def test_results_say_of_what_they_are(da_b: DeepAccident, tokens: list[str], wholes: Path) -> None:
+    recordings = da_b.recordings({token.rsplit("/", 2)[0] for token in tokens})
+    release = {"version": "v1", "index": da_b.tables_folder.name, "recordings": recordings}
+    assert read_results(wholes / "motion").meta == {**NOISY.meta(), "release": release, "devkit": __version__}
 
 
 def test_a_token_that_comes_twice_is_refused_at_once(

@@ -50,6 +50,7 @@ def test_a_kept_map_takes_the_place_of_a_missing_bev_camera_and_is_not_made_for_
     assert [image.get_zorder() for image in there.images] == [0]  # the camera's own picture alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["ego", "world"])
 def test_the_map_lies_where_the_bev_camera_sees_the_ground(mapped: DeepAccident, frame: str) -> None:
     sample = f"{mapped.scenario[0]['token']}/other_vehicle/003"

@@ -35,6 +35,7 @@ def cover(one: FloatArray, other: FloatArray) -> bool:
     return bool((one[:2] < other[2:]).all() and (other[:2] < one[2:]).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_chips_cover_neither_each_other_nor_cars_nor_the_frame(seed: int) -> None:
     centers = np.random.default_rng(seed).uniform(-40, 40, (40, 2))

@@ -320,6 +320,7 @@ def test_several_calls_share_a_scenario_with_images(tmp_path, release_root, conf
     assert digests(tmp_path / "out") == digests(release_root)
 
 
+@pytest.mark.slow
 def test_what_broke_off_goes_on(out, unfinished, whole, digests, recorded, stop_at):
     """Of a part that was cut off some files are there, some half-written, and no note."""
     stop_at(out, 2)

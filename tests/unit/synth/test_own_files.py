@@ -68,6 +68,7 @@ def test_ego_runs_into_the_rear_of_the_one_who_changed_lanes(made):
     assert (ego_from_behind.translation[1], 10 * ego_from_behind.yaw) == pytest.approx((-3.5, 0), abs=0.3)
 
 
+@pytest.mark.slow
 def test_nothing_happens_where_nobody_is_to_meet(made):
     da = made("quiet")
     assert [(each["accident_type"], each["collision"]) for each in da.scenario] == [(None, None)] * 2
