@@ -338,9 +338,8 @@ def test_in_a_recording_of_one_frame_the_labels_velocities_count(tmp_path: Path)
 
 
 def test_a_pair_is_labelled_if_both_are_and_are_two() -> None:
-    pair = {"ids": [5, 7]}
-    assert (labelled_pair(pair, np.array([7, 5, 5])), labelled_pair(pair, np.array([5, 6]))) == ((5, 7), None)
-    assert (labelled_pair({"ids": [5, 5]}, np.array([5])), labelled_pair(None, np.array([0]))) == (None, None)
+    cases = (({"ids": [5, 7]}, [7, 5, 5]), ({"ids": [5, 7]}, [5, 6]), ({"ids": [5, 5]}, [5]), (None, [0]))
+    assert [labelled_pair(pair, np.array(labelled)) for pair, labelled in cases] == [(5, 7), None, None, None]
 
 
 def test_the_scenario_to_begin_with(tmp_path: Path, da: DeepAccident) -> None:
