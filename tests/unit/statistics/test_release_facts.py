@@ -119,8 +119,7 @@ def test_the_least_gaps_and_errors_are_those_of_plain_loops(da_motion: DeepAccid
         row, before = at[actor, frame], at.get((actor, frame - 5))
         place = np.array(row["translation"][:2])
         velocity = (place - before["translation"][:2]) * 2 if before else np.array(row["velocity"][:2])
-        yaw = quaternions.yaw_of(np.array([row["rotation"]]))
-        return np.array([*(place + velocity * seconds), *row["size"][:2], *yaw])
+        return np.array([*(place + velocity * seconds), *row["size"][:2], quaternions.yaw_of(row["rotation"])])
 
     found = scenario_facts(da_motion, record).values
     for frame, second, hit in ((11, 1, 0), (11, 2, 0), (11, 3, 1), (21, 1, 0), (21, 2, 1), (31, 1, 1)):
@@ -137,17 +136,18 @@ def test_the_least_gaps_and_errors_are_those_of_plain_loops(da_motion: DeepAccid
         and frame > 5
         and (seen := [each for each in range(frame + 10, 36, 10) if (actor, each) in at])
     ]
-    assert np.sort(found["ade"]) == pytest.approx(np.sort([np.mean(each) for each in errors]), abs=1e-9)
-    assert np.sort(found["fde"]) == pytest.approx(np.sort([each[-1] for each in errors]), abs=1e-9)
+    assert np.sort([found["ade"], found["fde"]]) == pytest.approx(
+        np.sort([[np.mean(each) for each in errors], [each[-1] for each in errors]]), abs=1e-9
+    )
 
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twelve accidents and twelve twins; a collision with id 0, another with an odd word; in a folder with a name."""
+    odd = {1: UNKNOWN, 2: META.replace("front_side", "left_side")}
     root = tmp_path_factory.mktemp("facts") / "home of Jane Doe"
     for number in range(12):
-        meta = UNKNOWN if number == 1 else META.replace("front_side", "left_side") if number == 2 else META
-        write_tiny_release(root, name=named(number), meta=meta, agents=("ego_vehicle",))
+        write_tiny_release(root, name=named(number), meta=odd.get(number, META), agents=("ego_vehicle",))
         write_tiny_release(
             root, name=named(number), scenario_type=NORMAL, meta=QUIET, agents=("ego_vehicle",), frames=8
         )
@@ -187,8 +187,10 @@ def test_rows_say_share_interval_and_verdict(many: Path) -> None:
     }
     assert {key: row_of(report, *key).verdict for key in told} == told
     assert (row_of(report, "length").here, row_of(report, "accident_frames", "least").here) == (1, 4)
-    assert report.counts["token 8"] == {"front_side": 11, "left_side": 1}
-    assert report.counts["label ids"] == {"from 1 on": 144, "-100": 144, "-1": 144}
+    assert (report.counts["token 8"], report.counts["label ids"]) == (
+        {"front_side": 11, "left_side": 1},
+        {"from 1 on": 144, "-100": 144, "-1": 144},
+    )
     with ThreadPoolExecutor(2) as pool:
         assert release_facts(da, executor=pool) == report
     few = release_facts(da, [da.scenario[0]["token"]], workers=1)
