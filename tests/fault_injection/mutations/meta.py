@@ -38,8 +38,7 @@ def _cut(place: Place, rng: np.random.Generator) -> None:
 
 
 def _count_other_frames(place: Place, rng: np.random.Generator) -> None:
-    frames = int(place.meta_lines()[0].split()[-1])
-    _set_word(place, NUMBER_OF_FRAMES, frames + int(rng.choice([-3, -2, -1, 1, 2, 3])))
+    _set_word(place, NUMBER_OF_FRAMES, int(place.meta_lines()[0].split()[-1]) + int(rng.choice([-3, -2, -1, 1, 2, 3])))
 
 
 GROUP.add(
@@ -92,8 +91,7 @@ def _other_pair(place: Place, rng: np.random.Generator) -> None:
 
 def _other_class(place: Place, rng: np.random.Generator) -> None:
     number = int(rng.choice(CLASSES))
-    others = {"pedestrian", "motorcycle"} - {place.meta_lines()[0].split()[number]}
-    _set_word(place, number, rng.choice(sorted(others)))
+    _set_word(place, number, rng.choice(sorted({"pedestrian", "motorcycle"} - {place.meta_lines()[0].split()[number]})))
 
 
 def _no_collision(place: Place, rng: np.random.Generator) -> None:
