@@ -19,8 +19,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.results.recordings import release_note
-from deepaccident_devkit.evaluation.runs.setups import scenario_of
+from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of

@@ -27,13 +27,13 @@ from deepaccident_devkit.evaluation.breakdowns import (
 from deepaccident_devkit.evaluation.evaluator import Evaluator, evaluate_samples
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.results import Results, read_results
-from deepaccident_devkit.evaluation.results.recordings import check_recordings
 from deepaccident_devkit.evaluation.runs.setups import (
     TASKS,
     Coverage,
     EvaluationSetup,
     SampleLoader,
     SampleSelection,
+    check_recordings,
     checkpoint_path,
     coverage,
     default_selection,

@@ -7,7 +7,7 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.results.recordings import check_recordings, release_note
+from deepaccident_devkit.evaluation.runs.setups import check_recordings, release_note
 
 
 def results_of(dataset: DeepAccident, path: Path, note: object) -> Results:
