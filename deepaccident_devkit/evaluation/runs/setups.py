@@ -227,8 +227,7 @@ def check_recordings(results: Results, dataset: Dataset) -> None:
     Results without such a note, and scenarios that one of the two does not know, are not compared.
     """
     note = results.meta.get("release")
-    stated = note.get("recordings") if isinstance(note, dict) else None
-    if not isinstance(stated, dict):
+    if not isinstance(note, dict) or not isinstance(stated := note.get("recordings"), dict):
         return
     here = dataset.recordings(stated)
     others = [token for token, hashed in here.items() if hashed != stated[token]]
