@@ -348,7 +348,8 @@ def evaluate_results(
         The run, without breakdowns: `EvaluationRun.broken_down` adds them.
 
     Raises:
-        ResultsError: the results cannot be read, an entry is wrong, or they do not have the samples of the selection.
+        ResultsError: the results cannot be read, an entry is wrong, they are of other recordings (`check_recordings`),
+            or they do not have the samples of the selection.
         EvaluationError: they are of another kind than the task is evaluated from or look less far ahead, scenarios lack
             the meta that the task needs, or samples cannot be evaluated.
         ChoiceError: no such split.
