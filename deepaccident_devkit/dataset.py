@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError
+from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError, TokenError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.conventions import stored_transforms
@@ -169,14 +170,14 @@ class Dataset(OpenTables):
 
         It tells recordings of one name apart: those of the mini release are others than those of the whole one.
         """
-        wanted, samples, found = set(scenarios), self.columns("sample"), {}
-        tokens = (each["token"] for each in self.scenario)
-        for row, token in ((row, token) for row, token in enumerate(tokens) if token in wanted):
-            ego = self._tables.resolver.agents_of(row).get(AGENTS[0], -1)
-            first, last = np.searchsorted(samples["agent_row"], (ego, ego + 1))
-            counts = samples["num_annotations"][first:last]
-            if counts.any():
-                found[token] = digest_of(counts.tolist())
+        samples, found = self.columns("sample"), {}
+        for token in sorted(set(scenarios)):
+            with suppress(TokenError):  # the scenario, or its ego, is not here
+                ego = self.getind("agent", f"{token}/{AGENTS[0]}")
+                first, last = np.searchsorted(samples["agent_row"], (ego, ego + 1))
+                counts = samples["num_annotations"][first:last]
+                if counts.any():
+                    found[token] = digest_of(counts.tolist())
         return found
 
     # sensor data

@@ -300,7 +300,7 @@ class TestCheck:
 @pytest.mark.parametrize(
     ("options", "error", "names"),
     [
-        ("--switch gap=3", ChoiceError, ("no switch 'gap'",)),
+        ("--switch gap=3", ChoiceError, ("these rules have no switch 'gap'",)),
         (
             "--switch reading.danger_distance=high",
             ChoiceError,

@@ -19,8 +19,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.results.recordings import release_note
-from deepaccident_devkit.evaluation.runs.setups import scenario_of
+from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
@@ -156,7 +155,7 @@ def samples_by_scenario(path: Path, tokens: Sequence[str]) -> dict[str, tuple[st
     """The samples of each scenario, in the given order; raises ResultsError, which names `path`, if one comes twice."""
     found: dict[str, dict[str, None]] = {}
     for token in tokens:
-        own = found.setdefault(token.rsplit("/", 2)[0], {})
+        own = found.setdefault(scenario_of(token), {})
         if token in own:
             raise ResultsError(f"{path}: {token}: comes twice; give each sample once")
         own[token] = None
@@ -234,4 +233,4 @@ def _join(whole: ResultsWriter, jobs: Mapping[str, _Job], tokens: Sequence[str])
     kept = {scenario: read_results(job.path) for scenario, job in jobs.items()}
     with whole:
         for token in tokens:
-            whole.add(token, kept[token.rsplit("/", 2)[0]].prediction(token))
+            whole.add(token, kept[scenario_of(token)].prediction(token))

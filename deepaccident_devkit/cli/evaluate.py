@@ -33,7 +33,6 @@ from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, EVERYTHING, attribute_name
 from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
 from deepaccident_devkit.evaluation.results import Results, read_results
-from deepaccident_devkit.evaluation.results.recordings import check_recordings
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
     SampleSelection,
@@ -57,6 +56,7 @@ from deepaccident_devkit.evaluation.runs.setups import (
     SampleList,
     ScopeName,
     TaskName,
+    check_recordings,
     label_rules,
 )
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS

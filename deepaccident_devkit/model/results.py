@@ -28,8 +28,7 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
-from deepaccident_devkit.evaluation.results.recordings import release_note
-from deepaccident_devkit.evaluation.runs.setups import scenario_of
+from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
 from deepaccident_devkit.export.torch import V2XDataset, collate
 from deepaccident_devkit.model.detection import decode_detections, detected_boxes
 from deepaccident_devkit.model.inputs import mirrored_boxes, model_inputs

@@ -139,14 +139,12 @@ def differing_text(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     """`training/steps: 2, asked for 3; …`: which values differ from those asked for, the first ones; empty if none."""
     has, wanted = dict(_leaves(there)), dict(_leaves(json.loads(json.dumps(asked))))  # tuples are lists in a file
     changed = sorted(name for name in {*has, *wanted} if has.get(name) != wanted.get(name))
-    more = f"; and {len(changed) - _DIFFERING} more" if len(changed) > _DIFFERING else ""
-    return (
-        "; ".join(
-            f"{name}: {shortened(repr(has.get(name)))}, asked for {shortened(repr(wanted.get(name)))}"
-            for name in changed[:_DIFFERING]
-        )
-        + more
-    )
+    told = [
+        f"{name}: {shortened(repr(has.get(name)))}, asked for {shortened(repr(wanted.get(name)))}"
+        for name in changed[:_DIFFERING]
+    ]
+    more = [f"and {len(changed) - _DIFFERING} more"] if len(changed) > _DIFFERING else []
+    return "; ".join(told + more)
 
 
 def _leaves(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

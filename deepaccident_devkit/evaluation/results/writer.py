@@ -16,7 +16,7 @@ from typing import Any, Final, get_args
 import msgspec
 import numpy as np
 
-from deepaccident_devkit.errors import EvaluationError, ResultsError
+from deepaccident_devkit.errors import EvaluationError, ResultsError, shortened
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, checked_prediction
 from deepaccident_devkit.evaluation.results.motion import HEADS, MEMBER, MotionForm
@@ -171,10 +171,11 @@ class ResultsWriter:
             there = read_results(self.path)
         except ResultsError:
             return ""
-        methods = [meta.get("method") for meta in (there.meta, self._header["meta"])]
-        if methods[0] != methods[1]:
-            return " (of {!r}, not of {!r})".format(*methods)
-        return f" ({differing_text(there.meta, self._header['meta']) or 'of other samples'})"
+        asked = self._header["meta"]
+        if there.meta.get("method") != asked.get("method"):  # all else differs with it
+            there_is, wanted = (shortened(repr(meta.get("method"))) for meta in (there.meta, asked))
+            return f" (of method {there_is}, not of {wanted})"
+        return f" ({differing_text(there.meta, asked) or 'of other samples'})"
 
 
 @contextmanager

@@ -27,13 +27,13 @@ from deepaccident_devkit.evaluation.breakdowns import (
 from deepaccident_devkit.evaluation.evaluator import Evaluator, evaluate_samples
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.results import Results, read_results
-from deepaccident_devkit.evaluation.results.recordings import check_recordings
 from deepaccident_devkit.evaluation.runs.setups import (
     TASKS,
     Coverage,
     EvaluationSetup,
     SampleLoader,
     SampleSelection,
+    check_recordings,
     checkpoint_path,
     coverage,
     default_selection,
@@ -348,7 +348,8 @@ def evaluate_results(
         The run, without breakdowns: `EvaluationRun.broken_down` adds them.
 
     Raises:
-        ResultsError: the results cannot be read, an entry is wrong, or they do not have the samples of the selection.
+        ResultsError: the results cannot be read, an entry is wrong, they are of other recordings (`check_recordings`),
+            or they do not have the samples of the selection.
         EvaluationError: they are of another kind than the task is evaluated from or look less far ahead, scenarios lack
             the meta that the task needs, or samples cannot be evaluated.
         ChoiceError: no such split.

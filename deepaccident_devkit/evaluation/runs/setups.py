@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -208,6 +208,35 @@ def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelect
         splits=tuple(name for name in SPLITS if name in splits),
         agents=tuple(name for name in AGENTS if name in present),
     )
+
+
+def release_note(dataset: Dataset, scenarios: Iterable[str]) -> dict[str, Any]:
+    """What results note of their release, in `meta` under `release`.
+
+    Args:
+        dataset: the release that was predicted.
+        scenarios: tokens of the scenarios that have a prediction.
+    """
+    recordings = dataset.recordings(scenarios)
+    return {"version": dataset.version, "index": dataset.tables_folder.name, "recordings": recordings}
+
+
+def check_recordings(results: Results, dataset: Dataset) -> None:
+    """Raise ResultsError if results are of other recordings than the release has under these names.
+
+    Results without such a note, and scenarios that one of the two does not know, are not compared.
+    """
+    note = results.meta.get("release")
+    if not isinstance(note, dict) or not isinstance(stated := note.get("recordings"), dict):
+        return
+    here = dataset.recordings(stated)
+    others = [token for token, hashed in here.items() if hashed != stated[token]]
+    if others:
+        raise ResultsError(
+            f"{results.path}: are of other recordings than {dataset.dataroot} has ({dataset.version}; results of "
+            f"{note.get('version')}) for {len(others)} of {len(here)} scenarios, such as {others[0]}, although "
+            "they have the same names; evaluate with the release that was predicted, or predict this one"
+        )
 
 
 def _is_sample(dataset: Dataset, token: str) -> bool:

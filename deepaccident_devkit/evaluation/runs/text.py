@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
+from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.setups import agent_of, scenario_of
@@ -27,6 +28,8 @@ _PUBLISHED_CELLS: Final = [-50.0, 50.0, 0.5]
 _PUBLISHED_PREDICTIONS: Final = 6
 _FEW_PATHS: Final = 0.9
 """Share of true paths with a match below which errors of paths say little of the others."""
+_META: Final = 1000
+"""Letters of the notes in results that are shown; they may hold a hash a scenario."""
 _TOLD: Final = ("best_f1", "quiet")
 """Thresholds that are told for another split."""
 _CLEAN_COLUMNS: Final[Mapping[str, str]] = {
@@ -132,8 +135,7 @@ def _whole(value: object) -> str:
 
 def _breakdown(summary: Json, name: str) -> str:
     shown = summary["headlines"][:_COLUMNS]
-    units = ("" if each["unit"] in ("", "share") else f", {each['unit']}" for each in shown)
-    names = (f"{each['name']}{unit}" for each, unit in zip(shown, units, strict=True))
+    names = (each["name"] + ("" if each["unit"] == "share" else f", {each['unit']}") for each in shown)
     rows = [("value", "samples", "scenarios", *names)]
     for group in summary["breakdowns"][name]["groups"]:
         values = (_number(group["headlines"].get(each["path"])) for each in shown)
@@ -222,7 +224,7 @@ def results_text(results: Results) -> str:
         "fingerprint": results.fingerprint,
         "samples": f"{len(tokens)} of {len({scenario_of(token) for token in tokens})} scenarios",
         "agents": ", ".join(f"{name} {count}" for name, count in sorted(agents.items())),
-        "meta": json.dumps(results.meta, ensure_ascii=False),
+        "meta": shortened(json.dumps(results.meta, ensure_ascii=False), _META),
     }
     form = results.form
     if form is not None:

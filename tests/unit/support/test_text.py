@@ -141,6 +141,7 @@ def test_what_differs_is_told_with_both_values() -> None:
     asked = {"agents": ("ego",), "training": {"steps": 3, "rate": 0.1}}
     assert differing_text(there, asked) == "old: 1, asked for None; training/steps: 2, asked for 3"
     assert differing_text(there, there) == ""
+    assert differing_text({}, dict.fromkeys("abcde", 1)).endswith("c: None, asked for 1; and 2 more")
 
 
 def test_a_word_that_means_something_elsewhere_is_told_so() -> None:

@@ -157,6 +157,11 @@ class TestWriter:
             writer.add(FIRST, PREDICTIONS[task]())
         assert len(read_results(tmp_path / "x")) == 1
 
+    def test_the_method_of_what_is_there_is_told(self, tmp_path: Path, task: Any) -> None:
+        write(tmp_path / "x", task, meta={"method": "m" * 5000})
+        other = partial(ResultsWriter, tmp_path / "x", task, meta={"method": "yours"})
+        assert_refused((other, ResultsError, ("of method 'mmm", "not of 'yours'", "choose another path")))
+
     def test_an_empty_folder_is_free_for_motion_alone(self, tmp_path: Path, task: Any) -> None:
         (tmp_path / "x").mkdir()
         if task == "motion":

@@ -81,6 +81,9 @@ def test_what_a_results_file_holds(
         "agents ego_vehicle 2, infrastructure 2, other_vehicle 2",
         f"meta {json.dumps(results.meta)}",
     ]
+    with ResultsWriter(tmp_path / "long", "accident", meta={"x": "y" * 50_000}) as writer:
+        writer.add(results.tokens[0], [])
+    assert len(results_text(read_results(tmp_path / "long"))) < 2000
     motion = write_motion(tmp_path / "motion", selection.tokens(da_b)[:1])
     assert lines_of(results_text(motion))[-1].startswith(
         "form instances, up to 1 predictions of 5 frames, 0.5 s apart, cells x (-50.0, 50.0, 0.5), y (-50.0, 50.0, 0.5)"

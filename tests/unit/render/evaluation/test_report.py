@@ -20,6 +20,8 @@ from wording import holding, lacking
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, OutputFolderError
 from deepaccident_devkit.evaluation import instances_of
+from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
+from deepaccident_devkit.evaluation.runs import default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.motion import MotionLabelConfig
@@ -156,6 +158,16 @@ def test_outcomes_of_cells_are_coloured(da_motion: DeepAccident, tokens: list[st
             for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
                 assert cells.any()
                 assert np.array_equal((picture(ax) == to_rgb(OUTCOME_COLORS[kind])).all(axis=-1), cells), kind
+
+
+def test_none_is_the_worst_where_all_are_alike(da_motion: DeepAccident, tmp_path: Path) -> None:
+    setup = EvaluationSetup(task="accident", protocol="boxes")
+    with ResultsWriter(tmp_path / "silent", "accident") as writer:
+        for token in default_selection(setup, "train").tokens(da_motion):
+            writer.add(token, [])
+    results = read_results(tmp_path / "silent")
+    run = evaluate_results(da_motion, results, setup, "train", workers=1)
+    assert [each.name for each in sample_figures(run, da_motion, results)] == [f"sample_best_{n}" for n in (1, 2, 3)]
 
 
 @pytest.mark.parametrize("task", ["motion", "accident", "detection", "warning"])
