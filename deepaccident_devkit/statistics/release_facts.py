@@ -60,10 +60,12 @@ class ReleaseFacts(Report):
             "facts": Counter(str(fact.verdict) for fact in self.facts),
             **self.counts,
         }
-        numbers = [(name, word, f"{number:,}") for name, words in counts.items() for word, number in words.items()]
         return {
             "facts": [("fact", "conf.", "others", "here", "cases", "verdict"), *(fact.texts() for fact in self.facts)],
-            "counts": [("of", "what", "number"), *numbers],
+            "counts": [
+                ("of", "what", "number"),
+                *((name, word, f"{number:,}") for name, words in counts.items() for word, number in words.items()),
+            ],
         }
 
 
@@ -90,8 +92,10 @@ def release_facts(
     parts = {fact.key: [each.values[fact.key] for each in found if fact.key in each.values] for fact in FACTS}
     for key, phrase in _BROKEN.items():
         parts[key] = [np.ones(1)] * len(found) + [np.zeros(1) for text in broken if phrase in text]
-    names = dict.fromkeys(name for each in found for name in each.counts)
-    counts = {name: sum((Counter(each.counts.get(name)) for each in found), Counter[str]()) for name in names}
+    counts = {
+        name: sum((Counter(each.counts.get(name)) for each in found), Counter[str]())
+        for name in dict.fromkeys(name for each in found for name in each.counts)
+    }
     return ReleaseFacts(
         devkit=__version__,
         version=dataset.version,

@@ -232,8 +232,8 @@ def _of_labels(seen: _Seen) -> dict[str, ArrayLike]:
     gaps, moves = gaps_of_pairs(*boxes[pairs]), (np.hypot(*seen.velocity[seen.vehicle].T) > MOVING).T[pairs]
     here, movers = np.isfinite(gaps) & moves.any(axis=0), moves.sum(axis=0)[gaps == 0]
     least = [
-        np.fmin.reduce(gaps[here[:, now], now + _HALF : now + 2 * _SECOND + 1 : _HALF], axis=None, initial=np.inf)
-        for now in range(0, seen.frames - _HALF, _SECOND)
+        np.fmin.reduce(gaps[here[:, now], now + 1 : now + 2 * _SECOND + 1], axis=None, initial=np.inf)
+        for now in range(0, seen.frames - 1, _SECOND)
     ]
     nearest = np.array(least)[np.isfinite(least)]
     return {

@@ -303,10 +303,8 @@ def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: b
     traits, kind, misfiled = Traits.of(spec), None, False
     if config.lifelike:
         kind = draw_kind(np.random.default_rng([config.seed, pair, _KIND_STREAM]), spec)
-        unplanned = kind.pair is None
-        misfiled = bool(
-            np.random.default_rng([config.seed, pair, _KIND_STREAM, accident]).random() < MISFILED[accident]
-        )
+        of_folder = np.random.default_rng([config.seed, pair, _KIND_STREAM, accident])
+        unplanned, misfiled = kind.pair is None, bool(of_folder.random() < MISFILED[accident])
     if config.view == "hidden" and traits.spawn_side not in ("left", "right"):
         place = "" if config.spec is None else f"{template.place('actors')}: "
         others = "designs" if config.spec is None else "arms"

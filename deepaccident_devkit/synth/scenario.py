@@ -49,6 +49,7 @@ from deepaccident_devkit.synth.traffic.accidents import (
     usual_duration,
 )
 from deepaccident_devkit.synth.traffic.driving import PERIOD
+from deepaccident_devkit.synth.traffic.lifelike import ON_FOOT
 from deepaccident_devkit.synth.traffic.placement import unplanned
 from deepaccident_devkit.synth.traffic.rights import SignalPlan
 from deepaccident_devkit.synth.world import World, random_world
@@ -127,7 +128,13 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     return Scenario(
         plan=plan,
         spec=spec,
-        world=random_world(of_world, stage.junction, spec.view, between=(ego, other)),
+        world=random_world(
+            of_world,
+            stage.junction,
+            spec.view,
+            between=(ego, other),
+            low_pole=plan.kind is not None,
+        ),
         actors=Actors.of(_actors(stage, recorded, ids)),
         agents=ids.agents,
         meta=_meta(plan, stage, recorded, ids),
@@ -147,7 +154,7 @@ def _first_good_draw(
         spec = plan.draw(rng)
         junction = Junction(spec.road)
         if plan.unplanned:
-            on_foot = None if plan.kind is None or plan.kind.labelled else False
+            on_foot = None if plan.kind is None else plan.kind.labelled and bool(rng.random() < ON_FOOT)
             spec = unplanned(rng, spec, junction, on_foot=on_foot)
         stage = set_stage(rng, spec, junction, usual_duration(rng, config.frames, plan.kind), plan.kind)
         if spec.meet is None:

@@ -17,12 +17,12 @@ from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
 from deepaccident_devkit.synth.traffic.driving import RoadUser, middle_of
 from deepaccident_devkit.synth.traffic.lifelike import (
+    NORMAL_FRAMES,
     Kind,
     accident_frames,
     beyond_contact,
     crowded,
     lively,
-    normal_frames,
 )
 from deepaccident_devkit.synth.traffic.placement import WARM_UP, Cast, cast_actors
 from deepaccident_devkit.synth.traffic.rights import AXIS_OF_ARM, SignalPlan, find_rights, plan_with_green
@@ -228,7 +228,7 @@ def recorded_normal(rng: np.random.Generator, stage: Stage, performance: Perform
     if stage.kind is None:
         natural = _natural_frames(stage, min(_arrival_time(stage, performance), begin + _LATEST_END))
     else:
-        natural = normal_frames(rng)
+        natural = int(rng.integers(*NORMAL_FRAMES))
     if frames is None:
         return Recorded(performance=performance, start=begin, frames=natural, impact=None)
     end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
@@ -330,9 +330,8 @@ def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
 
 
 def _natural_frames(stage: Stage, end: float) -> int:
-    since = end - (stage.cast.begin + WARM_UP)
-    least = _LEAST_FRAMES if stage.kind is None else _SHORTEST
-    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, least, _MOST_FRAMES))
+    frames = int((end - (stage.cast.begin + WARM_UP)) / FRAME_PERIOD + 1e-6) + 1
+    return int(np.clip(frames, _LEAST_FRAMES if stage.kind is None else _SHORTEST, _MOST_FRAMES))
 
 
 def _arrival_time(stage: Stage, performance: Performance) -> float:

@@ -38,8 +38,6 @@ _BEND_BRAKING = 1.8
 """m/s² with which drivers brake before a bend."""
 _STIFFNESS = 2.5
 """1/s: the braking for each m/s above the allowed speed."""
-_SLOWING = 4.0
-"""m/s²: the hardest braking to the speed that a bend allows."""
 _GENTLE_STOP = (3.0, 1.0)
 """The hardest braking near standstill, m/s², and how much harder it can be for each m/s of speed."""
 _NO_GAP = 0.1
@@ -188,6 +186,7 @@ class Temper:
         max_speed: (A,) speed on a free straight road, m/s.
         acceleration: (A,) acceleration from standstill, m/s².
         braking: (A,) comfortable braking, m/s².
+        slowing: (A,) the hardest braking to the speed that a bend allows, m/s².
         time_gap: (A,) seconds to the road user ahead.
         min_gap: (A,) metres, bumper to bumper, when standing.
     """
@@ -195,6 +194,7 @@ class Temper:
     max_speed: FloatArray
     acceleration: FloatArray
     braking: FloatArray
+    slowing: FloatArray
     time_gap: FloatArray
     min_gap: FloatArray
 
@@ -202,7 +202,7 @@ class Temper:
 def free_acceleration(temper: Temper, speed: FloatArray, allowed: FloatArray) -> FloatArray:
     """The acceleration (A,) m/s² at a speed if nobody is in the way and the bends ahead allow so much, (A,) m/s."""
     own = temper.acceleration * (1.0 - (speed / temper.max_speed) ** 4)
-    bend = np.maximum(_STIFFNESS * (allowed - speed), -_SLOWING)
+    bend = np.maximum(_STIFFNESS * (allowed - speed), -temper.slowing)
     return np.asarray(np.clip(np.minimum(own, bend), -HARDEST_BRAKING, None))
 
 
@@ -295,6 +295,7 @@ class Manner:
         min_gap: metres, bumper to bumper, when standing.
         lateral: the most sideways acceleration in a bend, m/s².
         max_speed: least and most speed on a free straight road, m/s.
+        slowing: the hardest braking to the speed that a bend allows, m/s².
     """
 
     acceleration: float
@@ -303,6 +304,7 @@ class Manner:
     min_gap: float
     lateral: float
     max_speed: tuple[float, float]
+    slowing: float = 4.0
 
 
 MANNERS = {
@@ -318,7 +320,12 @@ BRISK_MANNERS = {
     category: manner
     if category == WALKER
     else replace(
-        manner, acceleration=1.7 * manner.acceleration, braking=2.1 * manner.braking, time_gap=0.6 * manner.time_gap
+        manner,
+        acceleration=2.0 * manner.acceleration,
+        braking=2.1 * manner.braking,
+        time_gap=0.6 * manner.time_gap,
+        lateral=1.4 * manner.lateral,
+        slowing=7.0,
     )
     for category, manner in MANNERS.items()
 }
@@ -386,6 +393,7 @@ def temper_of(users: Sequence[RoadUser]) -> Temper:
         max_speed=_gather(users, lambda user: user.max_speed),
         acceleration=_gather(users, lambda user: user.manner.acceleration),
         braking=_gather(users, lambda user: user.manner.braking),
+        slowing=_gather(users, lambda user: user.manner.slowing),
         time_gap=_gather(users, lambda user: user.manner.time_gap),
         min_gap=_gather(users, lambda user: user.manner.min_gap),
     )

@@ -149,11 +149,9 @@ def cast_actors(
     for actor in named:
         if actor.role in LEADERS:
             leader = next(user for user in users if user.role == LEADERS[actor.role])
-            stays = (
-                kind or spec.actor(leader.role).lane_change is not None
-            )  # or it would collide with a vehicle beside it
-            path = leader.route.path if stays and leader.route else leader.path
-            users.append(_follower(rng, actor, leader, path))
+            # a follower does not change lanes with its leader, or it would collide with a vehicle beside it
+            way = leader if kind is None and spec.actor(leader.role).lane_change is None else leader.route or leader
+            users.append(_follower(rng, actor, leader, way.path))
     if pair is not None and spec.meet is not None:
         roles = [user.role for user in users]
         pair = (roles.index(spec.meet.actors[0]), roles.index(spec.meet.actors[1]))

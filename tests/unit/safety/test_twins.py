@@ -117,7 +117,7 @@ def test_twins_that_do_not_begin_together_are_told() -> None:
     poses[1, 0, :, 0] += 0.8
     apart = replace(diff, poses=poses)
     assert (diff.begins_together, apart.begins_together, apart.to_dict()["begins_together"]) == (True, False, False)
-    report = TwinReport(dataroot="", version="v1", diffs=(diff, apart), skipped=(), torn=())
+    report = TwinReport(dataroot="", version="v1", fingerprint="", diffs=(diff, apart), skipped=(), torn=())
     assert "1 of them: the recordings do not begin together" in report.to_text()
     poses[1, 0] = np.nan
     assert replace(diff, poses=poses).begins_together, "no agent is there to tell"

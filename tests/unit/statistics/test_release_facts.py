@@ -95,7 +95,7 @@ def write_crash(root: Path, lead: float, tilt: float) -> Path:
         (24.0, 0, {"overlap_frames": [5], "touch_in_second": [0], "relative_speed": [10]}),
         (28.2, 30, {"heading": [30], "gap_closes": [1]}),
         (26.5, 0, {"overlap_samples": [1], "overlap_stand": [0, 1], "overlap_mixed": [0, 1], "overlap_move": [0]}),
-        (26.5, 0, {"vehicles": [3], "next_gap": [1.5], "next_near": [1], "next_touch": [0], "own_row": [1]}),
+        (26.5, 0, {"vehicles": [3], "next_gap": [0, 1.5], "next_near": [1], "next_touch": [0, 1], "own_row": [1]}),
         (26.5, 0, {"foreseen_1": [[1.5, 0], [0, 1]], "foreseen_2": [[0, 1]], "foreseen_3": [], "lights": [1]}),
         (26.5, 0, {"foreseen_all_1": [[0, 0], [0, 1]], "speed": [0, 10], "start_speed": [0, 10], "pole_height": [0]}),
         (26.5, 0, {"velocities_released": [1], "sensors_stay": [1], "jitter": [0], "pitch": [0], "agents": [1]}),
