@@ -8,7 +8,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.statistics import ReleaseFacts, release_facts
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-RELEASE = SynthConfig(scenarios=400, seed=5, sensors=False)
+RELEASE = SynthConfig(scenarios=400, frames=None, seed=5, sensors=False)
 
 
 def main(release: Path | None) -> None:
