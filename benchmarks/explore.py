@@ -34,7 +34,7 @@ LISTS = (
     "/?sort=accident_visibility&page=12",
 )
 READERS, SECONDS, REPEATS = 20, 30.0, 15
-RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0)
+RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0, designed=True)
 WORKED = 240.0
 """Seconds to wait for the work in the background."""
 

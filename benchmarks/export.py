@@ -33,7 +33,7 @@ FORMATS: tuple[Format, ...] = (
     *(QUESTIONS, CACHE),
 )
 """One of each; a format that lies in another's folder comes after it."""
-RELEASE = SynthConfig(scenarios=1, frames=8, image_size=(800, 450), seed=7)
+RELEASE = SynthConfig(scenarios=1, frames=8, image_size=(800, 450), seed=7, designed=True)
 SCENARIOS = 3
 REPEATS = 3
 

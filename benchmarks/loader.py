@@ -24,7 +24,7 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
-RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0)
+RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0, designed=True)
 SCENARIOS = 4
 IMAGES = ImageConfig(resize=(396, 704), crop=(140, 0, 256, 704), dtype="uint8")
 SCALED = replace(IMAGES, decode="scaled")

@@ -11,7 +11,7 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 
 FRAMES, SIZE = 40, (1280, 720)
 REPEATS = 3
-RELEASE = SynthConfig(scenarios=1, frames=FRAMES, image_size=(480, 270), seed=7)
+RELEASE = SynthConfig(scenarios=1, frames=FRAMES, image_size=(480, 270), seed=7, designed=True)
 PICTURES = ("frame", "sample", "accident", "bev", "visibility")
 
 

@@ -72,7 +72,7 @@ def of_tables() -> list[Figure]:
     """The interactions of a release of synthetic scenarios, made by two workers, and the whole release's by frames."""
     with tempfile.TemporaryDirectory(prefix="deepaccident_safety_") as name:
         folder = Path(name)
-        config = SynthConfig(scenarios=MADE, frames=FRAMES, sensors=False)
+        config = SynthConfig(scenarios=MADE, frames=FRAMES, sensors=False, designed=True)
         root = copied_release(make_release(folder / "made", config, workers=2), folder / "release", scenarios=SCENARIOS)
         dataset = DeepAccident(dataroot=root, verbose=False)
         seconds = best_of(1, lambda: [len(each) for each in interactions_of(dataset, workers=2)])

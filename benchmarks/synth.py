@@ -7,9 +7,9 @@ from benchmarks.measure import Figure, best_of
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-LABELS = SynthConfig(scenarios=12, frames=None, sensors=False)
+LABELS = SynthConfig(scenarios=12, frames=None, sensors=False, designed=True)
 """Of natural length, 40 to 100 frames."""
-SENSORS = SynthConfig(scenarios=1, frames=60, image_size=(800, 450))
+SENSORS = SynthConfig(scenarios=1, frames=60, image_size=(800, 450), designed=True)
 REPEATS = 2
 LABELS_BOUND, SENSORS_BOUND = 200, 60.0
 

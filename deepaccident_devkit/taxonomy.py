@@ -64,6 +64,8 @@ OWN_ACTOR_ID: Final = -100
 """Label id of the recording agent itself."""
 UNTRACKED_ID: Final = -1
 """Label id of an actor that is too far away to be tracked, and meta's word for "nobody"."""
+UNKNOWN_ID: Final = 0
+"""Meta's id of a partner in a collision whom no label names."""
 STATIC_ACTOR_ID: Final = 20000
 """Ids from here on are parked vehicles."""
 
@@ -103,6 +105,8 @@ TOWNS: Final = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town07", "Tow
 ROAD_TYPES: Final = ("four-way junction", "three-way junction")
 SPAWN_SIDES: Final = ("left", "right", "opposite")
 DIRECTIONS: Final = ("straight", "left", "right")
+SPAWN_RELATIONS: Final = ("same", "opposite")
+CONTACT_SIDES: Final = ("front", "front_side", "rear", "rear_side")
 """The words that the whole release is known to use; a release may hold others, so no reader insists on them."""
 
 SCENARIO_ATTRIBUTES: Final = ("scenario_type", "town", "weather", "time_of_day", "road_type", "accident_type")

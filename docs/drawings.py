@@ -151,7 +151,13 @@ def draw_designs() -> Figure:
 def make_design(number: int, folder: Path) -> Path:
     """A release of one accident of a design."""
     config = SynthConfig(
-        scenarios=1, frames=DESIGN_FRAMES, image_size=(640, 360), designs=(number,), seed=SEEDS[number], unplanned=0
+        scenarios=1,
+        frames=DESIGN_FRAMES,
+        image_size=(640, 360),
+        designs=(number,),
+        seed=SEEDS[number],
+        unplanned=0,
+        designed=True,
     )
     return make_release(folder, config, progress=True)
 

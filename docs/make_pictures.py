@@ -49,7 +49,7 @@ if (scrubber) {
   scrubber.dispatchEvent(new Event('input'));
 }
 """
-RELEASE = SynthConfig(scenarios=6, frames=40, image_size=(480, 270), seed=2)
+RELEASE = SynthConfig(scenarios=6, frames=40, image_size=(480, 270), seed=2, designed=True)
 SELECTION = SampleSelection(split="train", scope="all")
 SIZE = (1280, 720)
 QUALITY = 80

@@ -13,6 +13,7 @@ import click
 TOP = Path(__file__).parents[1]
 NAMES = {
     "baselines": "what constant velocity foresees, by who cooperates",
+    "facts": "the real release's facts beside a synthetic one, or beside --release",
     "labels": "cells in which label protocols differ",
     "model": "cooperation of the small model, from benchmarks/cooperation/study.json",
     "real": "the real scenario; needs --release",

@@ -70,7 +70,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
-    """A synthetic release of this name, made now if no other session, and no other process of this one, has."""
+    """A synthetic release of this name with clean accidents, made now unless another session or process has."""
     if MADE is not None:
         return Path(MADE) / name
     from deepaccident_devkit.synth import SynthConfig, make_release
@@ -80,7 +80,7 @@ def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
     root.parent.mkdir(exist_ok=True)
     with root.with_name(f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        return root if root.exists() else make_release(root, SynthConfig(**config), workers=1)
+        return root if root.exists() else make_release(root, SynthConfig(designed=True, **config), workers=1)
 
 
 @pytest.fixture(scope="session")

@@ -146,7 +146,8 @@ def test_an_option_says_what_its_field_says() -> None:
     }  # fmt: skip
     text = " ".join(CliRunner().invoke(made, ["--help"]).output.split())
     assert (
-        "Share of accidents that differ from the design: with a pedestrian or a third vehicle. [default: 0.1]" in text
+        "Share of clean accidents that differ from the design: with a pedestrian or a third vehicle. [default: 0.1]"
+        in text
     )
     assert "Whether calib files are the same at each frame" in text
 

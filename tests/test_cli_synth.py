@@ -62,9 +62,8 @@ def test_every_option_reaches_the_configuration(tmp_path, made, monkeypatch, wor
 
 
 def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
-    result = CliRunner().invoke(synth, [str(tmp_path)])
+    assert f"{tmp_path}: 4 scenarios with five agents, layout A" in CliRunner().invoke(synth, [str(tmp_path)]).output
     assert made == [SynthConfig(frames=None)]
-    assert f"{tmp_path}: 4 scenarios with five agents, layout A" in result.output
 
 
 def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
@@ -95,8 +94,8 @@ def mine(tmp_path, monkeypatch) -> Path:
 
 def test_a_file_that_is_no_scenario_is_refused(mine):
     mine.write_text(MINE.replace("van", "cyclist"), encoding="utf-8")
-    result = CliRunner().invoke(synth, ["out", "--design", "mine.yaml"])
-    assert "mine.yaml:4: actors[1].category: the role other cannot be a cyclist" in str(result.exception)
+    told = "mine.yaml:4: actors[1].category: the role other cannot be a cyclist"
+    assert told in str(CliRunner().invoke(synth, ["out", "--design", "mine.yaml"]).exception)
     assert not Path("out").exists()
 
 

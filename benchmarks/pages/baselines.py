@@ -17,6 +17,7 @@ from deepaccident_devkit.v2x import AGENT_CONFIGS
 
 RELEASES = {
     "ordinary": SynthConfig(scenarios=24, frames=40, seed=12, sensors=False),
+    "designed": SynthConfig(scenarios=24, frames=40, seed=12, sensors=False, designed=True),
     "hidden": SynthConfig(scenarios=24, frames=40, seed=12, sensors=False, view="hidden"),
 }
 SELECTION = SampleSelection(split="train", agents=("ego_vehicle",))
@@ -36,7 +37,7 @@ NUMBERS = {
     "mAP": ("detection", "mean_average_precision"),
 }
 """Name → its evaluation and its path in the result."""
-SHOWN = ("VPQ 100x100", "APA", "APA boxes", "mAP")
+SHOWN = ("VPQ 100x100", "APA", "mAP")
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def size_text(views: Views) -> str:
         f"{group.samples} samples of {group.scenarios} accidents ({group.clusters} clusters) in the {view} view"
         for view, group in groups.items()
     ]
-    return f"The tables are of {' and '.join(parts)}."
+    return f"The tables are of {', '.join(parts[:-1])} and {parts[-1]}."
 
 
 def numbers_table(views: Views, names: Iterable[str], rows: Iterable[str]) -> str:

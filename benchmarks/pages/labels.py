@@ -23,7 +23,7 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import CATEGORIES
 from deepaccident_devkit.v2x import future_egomotion
 
-RELEASE = SynthConfig(scenarios=4, frames=40, seed=11, sensors=False)
+RELEASE = SynthConfig(scenarios=4, frames=40, seed=11, sensors=False, designed=True)
 MAPS = ("segmentation", "instance", "centerness", "offset", "flow")
 SPLIT = "train"
 RELEASED, CLEAN = (MotionLabelConfig(protocol=name) for name in ("released", "clean"))

@@ -71,7 +71,7 @@ _WATCHING = (VEHICLE_AGENTS[1], VEHICLE_AGENTS[3], INFRASTRUCTURE)
 
 def config(pairs: int) -> SynthConfig:
     """The release that is measured: only designed accidents, with all their frames."""
-    return SynthConfig(scenarios=2 * pairs, frames=None, unplanned=0.0, sensors=False)
+    return SynthConfig(scenarios=2 * pairs, frames=None, unplanned=0.0, sensors=False, designed=True)
 
 
 def measure(number: int, *, views: bool = True) -> Pair:

@@ -13,12 +13,13 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.geometry.box_arrays import signed_gaps
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.reports import Row
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr, checked
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, AgentName
 from deepaccident_devkit.v2x.agents import agents_of
-from deepaccident_devkit.v2x.collisions import colliding_pair
+from deepaccident_devkit.v2x.collisions import colliding_pair, contact_begin, labelled_together
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
@@ -80,8 +81,8 @@ def _masses_in_order(class_masses: Mapping[str, float]) -> Sequence[float]:
 class Accident(FrozenArrays):
     """Two actors up to the moment at which they collide; world, right-handed, metres, seconds, radians.
 
-    The pair is in the meta file's order. Time 0 is `first_frame`, the first that shows both; the impact is at the last
-    frame that does. Arrays are read-only.
+    The pair is in the meta file's order. Time 0 is `first_frame`, the first that shows both; the impact counts as at
+    the last frame that does, though the outlines may touch before (`touching`). Arrays are read-only.
 
     Attributes:
         scenario: token.
@@ -116,6 +117,24 @@ class Accident(FrozenArrays):
     def last_frame(self) -> int:
         """Number of the frame of the impact."""
         return int(self.first_frame + self.paths.shape[1] - 1)
+
+    @property
+    def touching(self) -> float | None:
+        """Seconds from the frame at which the outlines begin to touch (as `Contact.contact_frame`) to the last one."""
+        flat = np.broadcast_to(self.sizes[:, None, :2], (*self.paths.shape[:2], 2))
+        begin = contact_begin(signed_gaps(*np.concatenate([self.paths[..., :2], flat, self.paths[..., 2:]], axis=2)))
+        return None if begin is None else round((self.paths.shape[1] - 1 - begin) * FRAME_PERIOD, 1)
+
+
+def counted_text(touching: Sequence[float | None]) -> str:
+    """What seconds before impacts are counted to; `touching` is each accident's (`Accident.touching`)."""
+    early = [seconds for seconds in touching if seconds]
+    text = "seconds count to the last frame; the impact is at most 0.1 s after it"
+    if early:
+        text += (
+            f", or before it where outlines touch: {len(early)} of {len(touching)} accidents, up to {max(early):.1f} s"
+        )
+    return text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,7 +175,7 @@ def accident_of(
     if not len(tracks.index):
         raise NotAvailableError(f"{token} has no labels (the test split ships without), which say where actors are")
     rows = [np.flatnonzero(tracks.actor_id == actor) for actor in (first, second)]
-    common = np.intersect1d(tracks.index[rows[0]], tracks.index[rows[1]])
+    common, _ = labelled_together(tracks, token, named)
     if len(common) < _FEWEST:
         raise NotAvailableError(
             f"{token}: its labels show the colliding pair {first} and {second} together at {len(common)} frames; a "

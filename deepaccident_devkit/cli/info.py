@@ -48,12 +48,19 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     help="With --statistics: folder to write statistics.json, one CSV file per table, and figures into; earlier ones "
     "there are replaced.",
 )
+@click.option(
+    "--facts",
+    is_flag=True,
+    help="Compare the release with what others measured of the real one instead; broken scenarios are left out, and "
+    "counted (docs/validation.md).",
+)
 @json_parameter
 def info(
     where: tuple[str, ...],
     statistics: bool,
     interactions: bool,
     out: str | None,
+    facts: bool,
     as_json: bool,
     **release: Any,
 ) -> None:
@@ -61,10 +68,16 @@ def info(
 
     With --where, list the scenarios that match all filters instead; with --json, their records.
     """
-    if not statistics:
-        refuse_unused("without --statistics", *_OF_STATISTICS)
-    dataset = DeepAccident(**release)
+    if facts or not statistics:
+        why = "with --facts" if facts else "without --statistics"
+        refuse_unused(why, *_OF_STATISTICS, *(["statistics"] if facts else []))
+    dataset = DeepAccident(**(release | {"on_error": "skip"} if facts else release))
     chosen = dataset.find(*where) if where else None
+    if facts:
+        from deepaccident_devkit.statistics import release_facts
+
+        say_report(release_facts(dataset, chosen, **engine_of(release)), [], None, as_json=as_json)
+        return
     if chosen == [] and out is not None:
         raise click.UsageError("no scenario matches --where, so there is nothing to write; change it or omit --out")
     if statistics:

@@ -255,6 +255,13 @@ def side_gaps(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatA
     return normal, gap, half_extents(first, normal) + half_extents(second, normal)
 
 
+def signed_gaps(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The widest gaps (…) between boxes (…, 5) along the normal of a side, metres; negative by how far they overlap."""
+    _, gap, reach = side_gaps(first, second)
+    widest: FloatArray = (np.abs(gap) - reach).max(axis=-1)
+    return widest
+
+
 def side_yaws(boxes: FloatArray) -> FloatArray:
     """The directions (…, 2) of the normals of boxes' (…, 5) front and left sides, radians."""
     yaw: FloatArray = boxes[..., 4, None] + np.array([0.0, np.pi / 2])

@@ -32,7 +32,7 @@ from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, FRAME_PERIOD, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
 from deepaccident_devkit.v2x.agents import agents_of
-from deepaccident_devkit.v2x.collisions import CONTACT_GAP
+from deepaccident_devkit.v2x.collisions import CONTACT_GAP, contact_words
 from deepaccident_devkit.v2x.poses import camera_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
@@ -93,7 +93,7 @@ def render_accident(
     Args:
         dataset: the release.
         scenario: token or record of one with a collision.
-        seconds: before the impact, which is the recording's last frame; moments before the first are left out.
+        seconds: before the recording's last frame, which the impact is near; moments before the first are left out.
         agents: whose images are shown; an empty list for none. None is for all that are there or, where their images
             would be narrower than 1.6 inches, as on a slide, for those that see the pair best; the title says so.
         layers: `image`, `bev` (the road), `boxes`, `trajectories` and `grid` are the default; also
@@ -130,7 +130,7 @@ def render_accident(
             channel = draw_pair_in_camera(pair, agent, index, shown, ax)
             _write_name(channel, ax)
         draw_pair_from_above(pair, index, shown, axes[-1, column])
-        end = "the last frame" if cut else "the impact"
+        end = "the last frame" if cut or contact.touching else "the impact"
         _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
     for agent, ax in zip(names, axes[:, 0], strict=False):
         _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
@@ -167,7 +167,7 @@ def draw_countdown(
 
 
 def accident_words(dataset: Dataset, contact: Contact) -> str:
-    """Two lines: who hits whom, with which sides, how fast and at which angle."""
+    """Two lines: who hits whom, with which sides, how fast and at which angle; and when, if not at the last frame."""
     scenario = contact.frame.rsplit("/", 1)[0]
     owners = {
         dataset.agent.get(f"{scenario}/{agent}")["actor_id"]: short_name(agent)
@@ -179,12 +179,13 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
         names.append(f"{owners[actor]} ({category} {actor})" if actor in owners else f"{category} {actor}")
     order = (1, 0) if contact.sides[1] == "front" and contact.sides[0] != "front" else (0, 1)
     hitting, hit = (names[each] for each in order)
-    verb = "hits" if contact.sides[order[0]] == "front" else "touches"
+    verb = "and" if contact.apart else "hits" if contact.sides[order[0]] == "front" else "touches"
     sides = " to ".join(contact.sides[each] for each in order)
     speeds = " and ".join(number_words(contact.speeds[each]) for each in order)
+    when = "" if contact.touching == 0 else f"\n{contact_words(contact.touching, contact.gap)}"
     return (
         f"{hitting} {verb} {hit}, {sides}\n{speeds} m/s, closing at {number_words(contact.closing_speed)} m/s, "
-        f"{np.degrees(contact.impact_angle):.0f}° between their headings"
+        f"{np.degrees(contact.impact_angle):.0f}° between their headings{when}"
     )
 
 

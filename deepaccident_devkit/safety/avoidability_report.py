@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from deepaccident_devkit.accidents.outcomes import MOST_MARGIN, OUTCOMES, Braking, Outcomes, delta_v_ranges, undisturbed
-from deepaccident_devkit.accidents.recorded import Skipped, accident_of, each_scenario, reasons_text, those_of
+from deepaccident_devkit.accidents.recorded import (
+    Skipped,
+    accident_of,
+    counted_text,
+    each_scenario,
+    reasons_text,
+    those_of,
+)
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability_of, unusable
@@ -180,6 +187,8 @@ class AvoidabilityReport(Report):
         for word, which in left_out.items():
             counts += f"; {len(which)} {word}" if which else ""
         blocks = [f"DeepAccident {self.version} at {self.dataroot}\n{counts}"]
+        if self.accidents:
+            blocks[0] += f"\n{counted_text([each.accident.touching for each in self.accidents])}"
         blocks += [
             self._group_text(group) for group in GROUPS if any(group_of(each) == group for each in self.accidents)
         ]

@@ -16,6 +16,7 @@ import numpy as np
 from deepaccident_devkit.accidents.recorded import (
     Skipped,
     accident_of,
+    counted_text,
     each_scenario,
     reasons_text,
     skipped_rows,
@@ -57,6 +58,7 @@ _OF_ACCIDENT: Final = (
     "ego_collides",
     "missing",
     "num_frames",
+    "touching",
 )
 
 
@@ -82,7 +84,8 @@ class LeadTimes(FrozenArrays):
         categories: their classes.
         colliding_agents: the agents that they are; None for one that records nothing.
         missing: agents without labels in this release.
-        num_frames: of the recording; the last one is the impact.
+        num_frames: of the recording; the last one counts as the impact.
+        touching: seconds from the frame at which the outlines begin to touch to the last one; None if they never do.
         first_frames: (16,) int64 for each of `COALITIONS`, the number (from 1) of the first frame at which it observes
             both; 0 for one that never does, and for one with a missing agent.
         leads: (16,) seconds from that frame to the last one; 0 for one that never does, NaN with a missing agent.
@@ -97,6 +100,7 @@ class LeadTimes(FrozenArrays):
     colliding_agents: tuple[AgentName | None, AgentName | None]
     missing: tuple[AgentName, ...]
     num_frames: int
+    touching: float | None
     first_frames: IntArray
     leads: FloatArray
     shapley: FloatArray
@@ -154,6 +158,7 @@ class LeadTimes(FrozenArrays):
             "ego_collides": self.ego_collides,
             "missing": list(self.missing),
             "num_frames": self.num_frames,
+            "touching": self.touching,
             "lead_seconds": dict(zip(names, known(self.leads), strict=True)),
             "first_frames": dict(zip(names, frames, strict=True)),
             "gain_seconds": dict(zip(PARTNERS, known(self.gains), strict=True)),
@@ -197,6 +202,7 @@ def lead_times(dataset: Dataset, scenario: RowArgument, rule: ObservationRule | 
         colliding_agents=accident.agents,
         missing=tuple(name for name in AGENTS if name not in there),
         num_frames=accident.num_frames,
+        touching=accident.touching,
         first_frames=first,
         leads=leads,
         shapley=shapley,
@@ -340,6 +346,7 @@ class LeadTimeLedger(Report):
         head = f"Lead times: DeepAccident {self.version} at {self.dataroot}\nobserved: {self.rule.text}\n{counts}"
         blocks = [f"{head}\n{CAVEAT}"]
         if self.accidents:
+            blocks[0] += f"\n{counted_text([each.touching for each in self.accidents])}"
             blocks += [self._accidents_text(), self._means_text()]
         if self.skipped:
             blocks.append(reasons_text("skipped", self.skipped))

@@ -234,6 +234,7 @@ class SafetyReport(Report):
         return {
             "dataroot": self.dataroot,
             "version": self.version,
+            "fingerprint": self.twins.fingerprint,
             "scenarios": self.scenarios,
             "accidents": [each.to_dict() for each in self.rows],
             "lead_times": self.ledger.to_dict()["summary"],

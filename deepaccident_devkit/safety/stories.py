@@ -28,9 +28,10 @@ from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability
 from deepaccident_devkit.safety.observation import observed_actors
 from deepaccident_devkit.support.arrays import ShortRepr, known
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD
 from deepaccident_devkit.v2x.agents import agents_of
-from deepaccident_devkit.v2x.collisions import Contact, collision
+from deepaccident_devkit.v2x.collisions import Contact, collision, contact_words
+from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -63,7 +64,8 @@ def story_text(facts: Mapping[str, Any]) -> str:
     """The sentences that facts (`safety.scenario_facts`) come to; None among them leaves its clause out."""
     accident = facts["accident"]
     if accident is not None:
-        sentences = [_collision(facts, accident), _seen_text(accident), _avoidance(accident)]
+        avoidance = None if accident["apart"] else _avoidance(accident)
+        sentences = [_collision(facts, accident), _seen_text(accident), avoidance]
     else:
         sentences = [_no_accident(facts), _nearest_text(facts["nearest"])]
     return " ".join(f"{each[0].upper()}{each[1:]}." for each in sentences if each)
@@ -76,17 +78,28 @@ def actor_words(actor: Mapping[str, Any]) -> str:
 
 
 def _collision(facts: Mapping[str, Any], accident: Mapping[str, Any]) -> str:
-    """Where it is, and who hits whom on which side, how fast."""
+    """Where it is, and who hits whom on which side, how fast, or that the two are apart; and when outlines touch."""
     first, second = accident["pair"]
     if first["side"] == "front" and second["side"] != "front":
         first, second = second, first  # the first is hit, by the front of the second
-    head_on = first["side"] == second["side"] == "front"
-    verb = "collides head-on with" if head_on else "is hit by"
-    if first["side"] and not head_on:
-        verb = f"is hit {_SIDES[first['side']]} by"
-    sentence = f"{_with_motion(first, closes=True)} {verb} {_with_motion(second)}"
-    details = _listed([_number(accident["closing_speed"], "closing at {:.1f} m/s"), _delta_v(first, second)])
-    return ", ".join(part for part in (_place(facts), sentence, details) if part)
+    mine, others = first["side"], second["side"]
+    actors = [_with_motion(first, closes=True), _with_motion(second)]
+    details = [_number(accident["closing_speed"], "closing at {:.1f} m/s"), _delta_v(first, second)]
+    if accident["touching"] != 0 and accident["gap"] is not None:
+        details.append(contact_words(accident["touching"], accident["gap"]))
+    if accident["apart"]:
+        sentence = (
+            f"meta lets {actors[0]} collide with {actors[1]}, but they are {accident['gap']:.1f} m apart at the end"
+        )
+        details = details[2:] if accident["touching"] else []
+    elif mine == others == "front":
+        sentence = f"{actors[0]} collides head-on with {actors[1]}"
+    elif others == "front":
+        sentence = " ".join(part for part in (actors[0], "is hit", _SIDES.get(mine), "by", actors[1]) if part)
+    else:
+        sentence = f"{actors[0]} collides with {actors[1]}"
+        details.insert(0, f"{mine} side to {others} side" if mine and others else None)
+    return ", ".join(part for part in (_place(facts), sentence, *details) if part)
 
 
 def _delta_v(first: Mapping[str, Any], second: Mapping[str, Any]) -> str | None:
@@ -144,27 +157,35 @@ def _avoidance(accident: Mapping[str, Any]) -> str | None:
 
 
 def _no_accident(facts: Mapping[str, Any]) -> str:
+    overlap = (facts["nearest"] or {}).get("min_gap") == 0
     what, more = {
         None: ("it is not known whether anybody collides", ""),
-        False: ("nobody collides", ""),
-        True: ("two collide", ", but the labels do not show how"),
+        False: ("meta names no collision" if overlap else "nobody collides", ""),
+        True: (f"{_partners_text(facts.get('partners')) or 'two'} collide", ", but the labels do not show how"),
     }[facts["collision"]]
     return " ".join(part for part in (_place(facts), what, _number(facts["duration"], "in {:.1f} s")) if part) + more
+
+
+def _partners_text(partners: Iterable[Mapping[str, Any]] | None) -> str | None:
+    """The two that meta names; of one that no label shows, that it is so."""
+    unseen = {True: "", False: " that no label shows"}
+    return _listed([actor_words(each) + unseen[each["labelled"]] for each in partners or ()], " and ")
 
 
 def _nearest_text(nearest: Mapping[str, Any] | None) -> str | None:
     """The most critical pair."""
     if nearest is None:
         return None
+    who = " and ".join(actor_words(each) for each in nearest["pair"])
+    if nearest["min_gap"] == 0:
+        return f"the outlines of {who} overlap"
     details = _listed(
         [
             _number(nearest["min_ttc"], "a least time to collision of {:.1f} s"),
-            _number(nearest["min_gap"] or None, "a least gap of {:.1f} m"),
-            "outlines that touch" if nearest["min_gap"] == 0 else None,
+            _number(nearest["min_gap"], "a least gap of {:.1f} m"),
         ],
         " and ",
     )
-    who = " and ".join(actor_words(each) for each in nearest["pair"])
     return f"{who} come nearest to a collision, with {details}" if details else None
 
 
@@ -250,12 +271,14 @@ def scenario_facts(
     collides = None if record["weather"] is None else record["collision"] is not None
     if collides is None:
         unknown.append(f"{record['token']} has no meta file, which says whether two collide; unpack meta")
+    accident = _accident(dataset, record, unknown, replayed) if collides else None
     return {
         "scenario": record["token"],
         **{name: record[name] for name in ("town", "road_type", "signalized", "weather", "time_of_day")},
         "duration": round((record["num_frames"] - 1) * FRAME_PERIOD, 1),
         "collision": collides,
-        "accident": _accident(dataset, record, unknown, replayed) if collides else None,
+        "accident": accident,
+        "partners": _partners(dataset, record) if accident is None else None,
         "nearest": None if collides else _nearest(dataset, record, unknown),
         "unknown": unknown,
     }
@@ -280,11 +303,30 @@ def _accident(
         "pair": [_collider(record, accident, contact, braked, which) for which in range(2)],
         "time": round((accident.last_frame - 1) * FRAME_PERIOD, 1),
         "gap": round(contact.gap, 2),
+        "touching": contact.touching,
+        "apart": contact.apart,
         "closing_speed": known(contact.closing_speed, 2),
         "impact_angle": round(math.degrees(contact.impact_angle)),
         "seen": _seen(dataset, accident),
         "braking": None if braked is None else _braking(accident, braked),
     }
+
+
+def _partners(dataset: Dataset, record: ScenarioRecord) -> list[dict[str, Any]] | None:
+    """Whom meta names as the pair, and whether labels show them."""
+    told, labelled = record["collision"], scenario_tracks(dataset, record).actor_id
+    if told is None or told["ids"][0] == told["ids"][1]:
+        return None
+    agents = agents_by_actor(dataset, record["token"])
+    return [
+        {
+            "actor_id": actor,
+            "category": word if word in CATEGORIES else None,
+            "agent": agents.get(actor),
+            "labelled": bool(np.isin(actor, labelled)),
+        }
+        for actor, word in zip(told["ids"], told["classes"], strict=True)
+    ]
 
 
 def _collider(
@@ -328,9 +370,10 @@ def _braking(accident: Accident, braked: Avoidability) -> dict[str, Any]:
 
 
 def _nearest(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> dict[str, Any] | None:
-    """The pair of moving actors with the least time to collision."""
+    """The pair with the least time to collision: of those of which one moves into the other, or of moving ones."""
     pairs = interactions(dataset, record).pairs
-    rows = np.flatnonzero(pairs.moving & np.isfinite(pairs.min_ttc))
+    overlap = pairs.min_gap == 0
+    rows = np.flatnonzero(overlap if overlap.any() else pairs.moving & np.isfinite(pairs.min_ttc))
     if not len(rows):
         if not _labelled(dataset, record):
             unknown.append(f"{record['token']} has no labels, which say where actors are")

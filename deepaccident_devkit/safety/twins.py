@@ -22,6 +22,7 @@ from deepaccident_devkit.accidents.twins import TornTwins, torn_twins, twin_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
+from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.safety.twin_matching import MatchedBy, Recording, matched_rows, recording_of, shift_of, shifted
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked_number, known
@@ -347,6 +348,7 @@ class TwinReport(Report):
     Attributes:
         dataroot: the release's folder.
         version: `v1` or `v1-mini`.
+        fingerprint: of the recordings: scenarios of the same names can be other recordings.
         diffs: an accident each, in the order of the release.
         skipped: accidents without a twin in the release, or without labels.
         torn: twins that are in different splits.
@@ -354,6 +356,7 @@ class TwinReport(Report):
 
     dataroot: str
     version: str
+    fingerprint: str
     diffs: tuple[TwinDiff, ...]
     skipped: tuple[Skipped, ...]
     torn: tuple[TornTwins, ...]
@@ -363,6 +366,7 @@ class TwinReport(Report):
         return {
             "dataroot": self.dataroot,
             "version": self.version,
+            "fingerprint": self.fingerprint,
             "twins": [each.to_dict() for each in self.diffs],
             "skipped": [asdict(each) for each in self.skipped],
             "torn": [asdict(each) for each in self.torn],
@@ -384,7 +388,7 @@ class TwinReport(Report):
 
     def to_text(self) -> str:
         """A line for each accident."""
-        blocks = [f"Twins: DeepAccident {self.version} at {self.dataroot}"]
+        blocks = [f"Twins: DeepAccident {self.version} at {self.dataroot} ({self.fingerprint})"]
         if self.diffs:
             heading = ("accident", "parts at", "to impact", "first", "acting differently", "in one alone", "nearest")
             rows = [heading, *map(_line, self.diffs)]
@@ -430,6 +434,7 @@ def twins_of(dataset: Dataset, found: Sequence[TwinDiff | Skipped | None]) -> Tw
     return TwinReport(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
+        fingerprint=digest_of(dataset.recordings(record["token"] for record in dataset.scenario)),
         diffs=those_of(TwinDiff, found),
         skipped=those_of(Skipped, found),
         torn=torn_twins({record["token"]: record["split"] for record in dataset.scenario}),

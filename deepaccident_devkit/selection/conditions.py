@@ -148,7 +148,7 @@ def _spelt(value: str, possible: Iterable[str]) -> str | None:
 
 
 def _bare(word: str) -> str:
-    return re.sub(r"[\s_-]", "", word.casefold()).removesuffix("side")  # meta's front_side is also front
+    return re.sub(r"[\s_-]", "", word.casefold())
 
 
 def _number(field: Field, value: object) -> float:

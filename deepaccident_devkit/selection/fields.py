@@ -253,18 +253,13 @@ _DERIVED = (
     ),
     Field("spawn_relation", "word", "As meta names it.", _of_collision("spawn_relation"), groups=True),
     Field(
-        "contact_side",
-        "word",
-        "As meta names it.",
-        _of_collision("contact_side"),
-        ("front_side", "rear_side", "left_side", "right_side"),
-        groups=True,
+        "contact_side", "word", "As meta names it.", _of_collision("contact_side"), taxonomy.CONTACT_SIDES, groups=True
     ),
     Field("impact", "measure", "As meta has it.", _of_collision("impact")),
     Field(
         "closing_speed",
         "measure",
-        "Speed with which the pair approaches at the last frame (m/s).",
+        "Speed with which the pair approaches before contact (m/s).",
         _closing_speed,
         costly=True,
     ),

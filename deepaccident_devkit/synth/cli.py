@@ -74,6 +74,7 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
     help="Only accidents of this design; you can repeat this option. Or a scenario file of your own; docs/synth.md "
     "describes its fields.  [default: all twelve in turn]",
 )
+@field_option(SynthConfig, "designed")
 @field_option(SynthConfig, "unplanned", option=advanced)
 @engine_parameters
 @click.option(

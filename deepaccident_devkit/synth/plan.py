@@ -20,8 +20,9 @@ from deepaccident_devkit.synth.spec import (
     read_design,
     read_spec,
 )
+from deepaccident_devkit.synth.traffic.lifelike import MISFILED, Kind, as_kind, draw_kind, paths_join
 from deepaccident_devkit.tables.records import ScenarioRecord
-from deepaccident_devkit.taxonomy import ROAD_TYPES, SPLITS, TOWNS, Layout
+from deepaccident_devkit.taxonomy import META_AGENTS, ROAD_TYPES, SPLITS, TOWNS, Layout
 
 Sensors = Literal["all", "cameras", "none"]
 """Which sensors' files a release has: of all, the images alone, or of none."""
@@ -42,6 +43,7 @@ _GOLDEN_RATIO: Final = 0.6180339887498949
 _MINI_SHARE: Final = Fraction(1, 5)
 """The largest share of its split that a mini split may hold."""
 _PLAN_STREAM: Final = 1
+_KIND_STREAM: Final = 2
 """Makes the plan's random numbers independent of those of the pair's scene."""
 _HIDDEN_SPEEDS: Final = (12.0, 14.0)
 """m/s: with a house on the kerb between them, slower cars would see each other earlier."""
@@ -68,7 +70,10 @@ class SynthConfig:
             both all the time. With None the scenario files decide.
         designs: which of the paper's twelve are used by turns, in this order; empty for all (with the view `hidden`,
             for all in which a house can hide the two from each other).
-        unplanned: share of accidents that differ from the design: with a pedestrian or a third vehicle. It is 0
+        designed: whether accidents are clean: those of the designs, between drivers who err in nothing but the design.
+            If not, accidents and traffic are as the real release has them. A `spec` or the view `hidden` asks for one
+            certain accident, and that is always clean.
+        unplanned: share of clean accidents that differ from the design: with a pedestrian or a third vehicle. It is 0
             where `spec` or the view `hidden` asks for one certain accident.
         spec: a scenario file (docs/synth.md) to use instead of the designs; every pair is one draw from it.
         unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
@@ -87,6 +92,7 @@ class SynthConfig:
     sensors: Sensors | bool = "all"
     view: View | None = None
     designs: tuple[int, ...] = ()
+    designed: bool = False
     unplanned: float = 0.1
     spec: Path | None = None
     unlabelled_test: bool = False
@@ -124,6 +130,11 @@ class SynthConfig:
         if self.image_size is not None:
             return self.image_size
         return RELEASED_IMAGE_SIZE if self.for_released_code else IMAGE_SIZE
+
+    @property
+    def lifelike(self) -> bool:
+        """Whether accidents and traffic are as the real release has them."""
+        return not self.designed and self.spec is None and self.view != "hidden"
 
     @property
     def design_round(self) -> tuple[int, ...]:
@@ -164,6 +175,8 @@ class ScenarioPlan:
         traits: what all its draws have in common.
         template: from which its scene is drawn.
         view: as the release asks for it; None for what the template says.
+        kind: the kind of accident where all is as in the real release; None where it is as designed.
+        misfiled: whether folder and meta disagree: an accident without a collision, or the reverse.
     """
 
     pair: int
@@ -174,11 +187,18 @@ class ScenarioPlan:
     traits: "Traits"
     template: SpecTemplate
     view: View | None
+    kind: Kind | None = None
+    misfiled: bool = False
 
     @property
     def design(self) -> int | None:
         """Which of the paper's twelve it is, if it is one."""
         return self.template.design
+
+    @property
+    def collides(self) -> bool:
+        """Whether there is a collision in it."""
+        return self.accident != self.misfiled
 
     @property
     def scenario_type(self) -> str:
@@ -193,9 +213,11 @@ class ScenarioPlan:
     def draw(self, rng: np.random.Generator) -> ScenarioSpec:
         """A draw from its template that has the plan's traits; the same random numbers give the same draw."""
         spec = draw(self.template, rng)
-        while Traits.of(spec) != self.traits:
+        while Traits.of(spec) != self.traits or (self.kind and self.kind.joins and not paths_join(spec)):
             spec = draw(self.template, rng)
-        return spec if self.view is None else _seen(spec, self.view, rng)
+        if self.view is not None:
+            spec = _seen(spec, self.view, rng)
+        return spec if self.kind is None else as_kind(rng, spec, self.kind)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -277,7 +299,12 @@ def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: b
     rng = np.random.default_rng([config.seed, pair, _PLAN_STREAM])
     town = TOWNS[int(rng.integers(len(TOWNS)))]
     unplanned = bool(rng.random() < config.unplanned) and config.spec is None and config.view != "hidden"
-    traits = Traits.of(draw(template, rng))
+    spec = draw(template, rng)
+    traits, kind, misfiled = Traits.of(spec), None, False
+    if config.lifelike:
+        kind = draw_kind(np.random.default_rng([config.seed, pair, _KIND_STREAM]), spec)
+        of_folder = np.random.default_rng([config.seed, pair, _KIND_STREAM, accident])
+        unplanned, misfiled = kind.pair is None, bool(of_folder.random() < MISFILED[accident])
     if config.view == "hidden" and traits.spawn_side not in ("left", "right"):
         place = "" if config.spec is None else f"{template.place('actors')}: "
         others = "designs" if config.spec is None else "arms"
@@ -294,6 +321,8 @@ def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: b
         traits=traits,
         template=template,
         view=config.view,
+        kind=kind,
+        misfiled=misfiled,
     )
 
 
@@ -336,15 +365,16 @@ def _mini(plans: Sequence[ScenarioPlan], split: Sequence[str], wanted: Collectio
 
 def _record(plan: ScenarioPlan) -> ScenarioRecord:
     """The fields of a scenario's later record that the split procedure reads."""
-    designed = plan.accident and not plan.unplanned and plan.template.meeting_roles == {"ego", "other"}
-    agents = ("ego_vehicle", "other_vehicle") if designed else (None, None)
+    clean = not plan.unplanned and plan.template.meeting_roles == {"ego", "other"}
+    pair = plan.kind.pair if plan.kind else ("ego", "other") if clean else None
+    agents = (None, None) if pair is None else tuple(META_AGENTS[role] for role in pair)
     record = {
         "token": plan.token,
         "name": plan.name,
         "scenario_type": plan.scenario_type,
         "designed_accident": plan.accident,
         "weather": "",
-        "collision": {"agents": agents} if plan.accident else None,
+        "collision": {"agents": agents} if plan.collides else None,
         "road_type": plan.traits.road_type,
         "spawn_side": plan.traits.spawn_side,
     }

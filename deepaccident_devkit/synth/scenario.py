@@ -39,6 +39,7 @@ from deepaccident_devkit.synth.traffic.accidents import (
     Performance,
     Recorded,
     Stage,
+    lasts,
     latest_end,
     perform_twin,
     recorded_accident,
@@ -48,6 +49,7 @@ from deepaccident_devkit.synth.traffic.accidents import (
     usual_duration,
 )
 from deepaccident_devkit.synth.traffic.driving import PERIOD
+from deepaccident_devkit.synth.traffic.lifelike import ON_FOOT
 from deepaccident_devkit.synth.traffic.placement import unplanned
 from deepaccident_devkit.synth.traffic.rights import SignalPlan
 from deepaccident_devkit.synth.world import World, random_world
@@ -108,20 +110,31 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     `MAX_DRAWS` draws; the message says how near they came, and what to change.
     """
     # a stream for each part of the scene, so that a change to one part leaves the others
-    streams = np.random.SeedSequence([config.seed, plan.pair]).spawn(3)
-    of_world, of_traffic, of_ids = map(np.random.default_rng, streams)
-    stage, accident, draws = _first_good_draw(of_traffic, config, plan)
-    if plan.accident and accident is not None:
-        recorded = recorded_accident(stage, accident, config.frames)
-    else:
-        recorded = _twin(stage, config, plan)
+    seeds = [config.seed, plan.pair, *([1] if plan.misfiled else [])]  # it shows other scenes than its twin
+    of_world, of_traffic, of_ids, of_end = map(np.random.default_rng, np.random.SeedSequence(seeds).spawn(4))
+    while True:
+        stage, accident, draws = _first_good_draw(of_traffic, config, plan)
+        collides = accident if plan.collides else None
+        recorded = (
+            _twin(of_end, stage, config, plan)
+            if collides is None
+            else recorded_accident(of_end, stage, collides, config.frames)
+        )
+        if recorded is not None:
+            break
     spec = stage.spec
     ego, other = (spec.actor(role).from_arm or "west" for role in ("ego", "other"))
     ids = _Ids.of(of_ids, stage)
     return Scenario(
         plan=plan,
         spec=spec,
-        world=random_world(of_world, stage.junction, spec.view, between=(ego, other)),
+        world=random_world(
+            of_world,
+            stage.junction,
+            spec.view,
+            between=(ego, other),
+            low_pole=plan.kind is not None,
+        ),
         actors=Actors.of(_actors(stage, recorded, ids)),
         agents=ids.agents,
         meta=_meta(plan, stage, recorded, ids),
@@ -136,36 +149,41 @@ def _first_good_draw(
 ) -> tuple[Stage, Performance | None, int]:
     """The first draw in which the pair touches, what happens in it, and how many draws were needed."""
     least = np.inf
-    for draws in range(1, MAX_DRAWS + 1):
+    most = MAX_DRAWS if plan.kind is None else 10 * MAX_DRAWS
+    for draws in range(1, most + 1):
         spec = plan.draw(rng)
         junction = Junction(spec.road)
         if plan.unplanned:
-            spec = unplanned(rng, spec, junction)
-        stage = set_stage(rng, spec, junction, usual_duration(rng, config.frames))
+            on_foot = None if plan.kind is None else plan.kind.labelled and bool(rng.random() < ON_FOOT)
+            spec = unplanned(rng, spec, junction, on_foot=on_foot)
+        stage = set_stage(rng, spec, junction, usual_duration(rng, config.frames, plan.kind), plan.kind)
         if spec.meet is None:
             return stage, None, draws
         tried = try_accident(stage)
-        if isinstance(tried, Performance):
+        if isinstance(tried, Performance) and lasts(stage, tried, config.frames):
             return stage, tried, draws
-        least = min(least, tried)
+        least = min(least, np.inf if isinstance(tried, Performance) else tried)
     came = f"the least distance was {least:.1f} m; choose a meet.offset nearer to 0, or another max_speed"
     if least == np.inf:
         came = "their paths do not cross, or others touch before; change from or turn, or the others' gap or lane"
     raise ConfigError(
-        f"{plan.template.place('meet')}: the two did not collide in {MAX_DRAWS} draws; {came}, or choose fewer "
+        f"{plan.template.place('meet')}: the two did not collide in {most} draws; {came}, or choose fewer "
         "background.vehicles"
     )
 
 
-def _twin(stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded:
+def _twin(rng: np.random.Generator, stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded | None:
+    """The recording of a normal scenario; None where all is as in the real release and another draw is needed."""
     normal = perform_twin(stage, latest_end(stage, config.frames))
+    if normal is None and plan.kind is not None:
+        return None
     if normal is None:
         where = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
         raise ConfigError(
             f"{plan.template.place('actors')}: the road users collide {where}, even if one of them comes later; let "
             "them start farther from each other"
         )
-    return recorded_normal(stage, normal, config.frames)
+    return recorded_normal(rng, stage, normal, config.frames)
 
 
 class _Ids(NamedTuple):
@@ -193,6 +211,8 @@ def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
     start = float(simulation.time[0]) - recorded.start
     actors = []
     for column, row in enumerate(recorded.performance.present):
+        if row == stage.unlabelled:
+            continue
         motion = Motion(
             start=start,
             period=PERIOD,
@@ -231,7 +251,7 @@ def _meta(plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids) -> Me
         spawn_side=plan.traits.spawn_side,
         ego_direction=spec.actor("ego").turn,
         other_direction=spec.actor("other").turn,
-        planned_agents=None if collision or planned == (None, None) else planned,
+        planned_agents=None if collision or planned == (None, None) or (stage.kind and ego % 2) else planned,
     )
 
 
@@ -241,11 +261,11 @@ def _collision(stage: Stage, recorded: Recorded, ids: _Ids) -> Collision | None:
         return None
     first, second = (stage.users[row] for row in pair)
     return Collision(
-        ids=(ids.actor[pair[0]], ids.actor[pair[1]]),
+        ids=(ids.actor[pair[0]], 0 if pair[1] == stage.unlabelled else ids.actor[pair[1]]),
         classes=(first.body.category, second.body.category),
         impact=impact.strength,
-        spawn_relation="same",
-        contact_side=f"{impact.side}_side",
+        spawn_relation=impact.relation,
+        contact_side=impact.side,
         agents=_pair_agents(stage),
     )
 

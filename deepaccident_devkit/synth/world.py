@@ -56,7 +56,7 @@ _CODES = 240
 Corner = tuple[int, int]
 """A corner, given by its signs of x and y."""
 _MAX_SLOPE = np.deg2rad(3.0)
-_POLE_HEIGHTS = (4.1, 4.6)
+_POLE_HEIGHTS, _LOW_POLE_HEIGHTS = (4.1, 4.6), (3.35, 3.75)
 """The least and the greatest height of the infrastructure's sensors above the ground, metres: its cameras, some of
 them above the road, are higher than any truck."""
 _POLE_INSET = 0.15
@@ -107,6 +107,7 @@ def random_world(
     view: View = "open",
     *,
     between: tuple[Arm, Arm] = ("west", "north"),
+    low_pole: bool = False,
 ) -> World:
     """A town around a junction; raises ConfigError if a hidden view's arms have no corner in common.
 
@@ -125,7 +126,7 @@ def random_world(
         buildings = [hiding, *(each for each in buildings if not overlap(each, hiding))]
         plants = [each for each in plants if not overlap(each, hiding)]
         corner = (-hiding_corner[0], -hiding_corner[1])
-    height = float(pole.uniform(*_POLE_HEIGHTS))
+    height = float(pole.uniform(*(_LOW_POLE_HEIGHTS if low_pole else _POLE_HEIGHTS)))
     x, y = (sign * (spec.sidewalk_edge - _POLE_INSET) for sign in corner)
     signs = [yield_sign(spec, arm) for arm in spec.yielding_arms]
     stands: list[Prop] = [*lights, *signs, mast(x, y, height - _POLE_UNDER_SENSOR), *buildings, *plants]

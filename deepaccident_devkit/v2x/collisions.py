@@ -12,9 +12,10 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import Boxes, quaternions
+from deepaccident_devkit.geometry.box_arrays import signed_gaps
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.tables.tokens import frame_token, instance_token
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
@@ -24,8 +25,11 @@ if TYPE_CHECKING:
 ContactSide = Literal["front", "rear", "left", "right"]
 CONTACT_GAP: Final = 1.5
 """The largest gap at the last frame, metres, with which a pair can collide within the next tenth of a second."""
+_LEEWAY: Final = 0.3
+"""Metres of a gap at the last frame, beside those of a tenth of a second, with which a pair can still collide."""
 _TOUCHING: Final = 0.02
-"""Metres; if the gap is this large or larger, the direction of the shortest line between two outlines is used."""
+"""Metres; outlines this near touch, and overlap if they reach farther into each other; the direction of the shortest
+line between two outlines is used from there on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,16 +39,21 @@ class Contact(FrozenArrays):
     Attributes:
         instances: tokens of the pair.
         actor_ids: their CARLA ids.
-        frame: token of the last moment at which both are annotated: in a complete recording the last frame, which is
-            at most 0.1 s before the impact.
-        point: (3,) where they touch, seen from above: the middle between their outlines where these are nearest; if
-            they overlap already, the middle of the overlap; at the mean height of their centres. Read-only.
-        gap: metres between the outlines seen from above, 0 if they overlap.
-        speeds: m/s over the ground, from the displacements of the last 0.1 s; NaN if unknown.
+        frame: token of the last moment at which both are annotated: in a complete recording the last frame. The
+            impact is at most 0.1 s later, or up to some tenths of a second before it.
+        contact_frame: token of the first frame of the last run of frames in which the labelled outlines touch (seen
+            from above, within 0.02 m). Contact began at most 0.1 s before it. None if they never touch.
+        point: (3,) where they touch at `frame`, seen from above: the middle between their outlines where these are
+            nearest; if they overlap, the middle of the overlap; at the mean height of their centres. Read-only.
+        gap: metres between the outlines at `frame` seen from above, 0 if they overlap.
+        speeds: m/s over the ground at the last frame before the outlines overlap, since later ones may be those after
+            the blow: what the labels say there or, if that is `frame`, the displacements of 0.1 s. NaN if unknown.
         closing_speed: m/s with which they approach each other along the shortest line between their outlines (if they
             touch or overlap, along the normal of the sides that meet); negative if they part; NaN if unknown.
-        impact_angle: angle between their headings, in [0, π]: 0 the same direction, π head-on.
-        sides: the side of each that faces the other across the widest gap along any side's normal (the least overlap).
+        impact_angle: angle between their headings at `contact_frame` (without one at `frame`), in [0, π]: 0 the same
+            direction, π head-on.
+        sides: the side of each that faces the other across the widest gap along any side's normal (the least overlap),
+            at the same moment.
         disagreements: each contradiction of the meta file and the recording in words: a gap of more than 1.5 m, other
             classes or other agents than in the meta file, an end before the last frame, or a contact side in the meta
             file that is neither of the two sides.
@@ -53,6 +62,7 @@ class Contact(FrozenArrays):
     instances: tuple[str, str]
     actor_ids: tuple[int, int]
     frame: str
+    contact_frame: str | None
     point: FloatArray
     gap: float
     speeds: tuple[float, float]
@@ -61,15 +71,37 @@ class Contact(FrozenArrays):
     sides: tuple[ContactSide, ContactSide]
     disagreements: tuple[str, ...]
 
+    @property
+    def touching(self) -> float | None:
+        """Seconds from `contact_frame` to `frame`; None if the outlines never touch."""
+        if self.contact_frame is None:
+            return None
+        last, first = (int(token.rsplit("/", 1)[1]) for token in (self.frame, self.contact_frame))
+        return round((last - first) * FRAME_PERIOD, 1)
+
+    @property
+    def apart(self) -> bool:
+        """Whether the gap is wider than the two close in 0.1 s, and 0.3 m: then `frame` shows no collision."""
+        return bool(self.gap > max(np.nan_to_num(self.closing_speed), 0.0) * FRAME_PERIOD + _LEEWAY)
+
     def __repr__(self) -> str:
         """Who, where, how fast: in one line."""
         who = " and ".join(f"{actor} ({side})" for actor, side in zip(self.actor_ids, self.sides, strict=True))
         speeds = " and ".join(f"{speed:.1f}" for speed in self.speeds)
         x, y = self.point[:2].tolist()
+        when = "" if self.touching is None else f" touching from {self.touching:.1f} s before the end,"
         return (
-            f"Contact(actors {who} at x {x:.1f}, y {y:.1f} m in world: gap {self.gap:.2f} m, {speeds} m/s, closing at "
-            f"{self.closing_speed:.1f} m/s, {math.degrees(self.impact_angle):.0f}° between their headings)"
+            f"Contact(actors {who} at x {x:.1f}, y {y:.1f} m in world:{when} gap {self.gap:.2f} m, {speeds} m/s, "
+            f"closing at {self.closing_speed:.1f} m/s, {math.degrees(self.impact_angle):.0f}° between their headings)"
         )
+
+
+def contact_words(touching: float | None, gap: float) -> str:
+    """When outlines touch, `touching` seconds before the last frame that shows both, or how far apart they are then."""
+    if touching is None:
+        return f"outlines {gap:.2f} m apart at the last frame"
+    moment = f"from {touching:.1f} s before" if touching else "at"
+    return f"outlines touching {moment} the last frame (within 0.1 s)"
 
 
 def first_accident(dataset: Dataset) -> str:
@@ -120,26 +152,34 @@ def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
         return None
     first, second = named
     tracks = scenario_tracks(dataset, record["token"])
-    index = _last_moment(tracks, record["token"], first, second)
-    there = tracks.at(index)
-    pair = there.select(there.actor_id.searchsorted((first, second)))
-    facing, sides = _facing(pair)
-    point, gap, normal = _contact(pair, facing)
-    velocity = _velocities_into(dataset, frame_token(record["token"], index), pair)
-    closing = float((velocity[0] - velocity[1])[:2] @ normal)
-    turn = pair.yaw[0] - pair.yaw[1]
+    frames, rows = labelled_together(tracks, record["token"], named)
+    outlines = (tracks.boxes.select(each) for each in rows)
+    gaps = signed_gaps(*(np.column_stack([each.center[:, :2], each.size[:, :2], each.yaw]) for each in outlines))
+    begin, last = contact_begin(gaps), len(frames) - 1
+    moment = last if begin is None else begin
+    pair, met = (tracks.boxes.select(rows[:, at]) for at in (last, moment))
+    point, gap, normal = _contact(pair, _facing(pair)[0])
+    facing, sides = _facing(met)
+    before = max(moment - 1, 0) if gaps[moment] < -_TOUCHING else moment
+    if before == last:
+        velocity = _velocities_into(dataset, frame_token(record["token"], int(frames[last])), pair)
+    else:
+        velocity = tracks.boxes.velocity[rows[:, before]]
+    closing = float((velocity[0] - velocity[1])[:2] @ (normal if moment == last else facing))
+    turn = met.yaw[0] - met.yaw[1]
     speeds = np.linalg.norm(velocity, axis=1)
     return Contact(
         instances=(instance_token(record["token"], first), instance_token(record["token"], second)),
         actor_ids=(first, second),
-        frame=frame_token(record["token"], index),
+        frame=frame_token(record["token"], int(frames[last])),
+        contact_frame=None if begin is None else frame_token(record["token"], int(frames[begin])),
         point=point,
         gap=gap,
         speeds=(float(speeds[0]), float(speeds[1])),
         closing_speed=closing,
         impact_angle=float(abs(np.arctan2(np.sin(turn), np.cos(turn)))),
         sides=sides,
-        disagreements=tuple(_disagreements(dataset, record, pair, index, gap, sides)),
+        disagreements=tuple(_disagreements(dataset, record, pair, int(frames[last]), gap, sides)),
     )
 
 
@@ -186,11 +226,34 @@ def _velocities_into(dataset: Dataset, frame: str, pair: Boxes) -> FloatArray:
     return np.where(np.isnan(velocity), pair.velocity, velocity)
 
 
-def _last_moment(tracks: ScenarioTracks, scenario: str, first: int, second: int) -> int:
-    common = np.intersect1d(tracks.index[tracks.actor_id == first], tracks.index[tracks.actor_id == second])
-    if not len(common):
-        raise NotAvailableError(f"{scenario}: no label shows the colliding pair {first} and {second} at one moment")
-    return int(common[-1])
+def labelled_together(tracks: ScenarioTracks, scenario: str, pair: tuple[int, int]) -> tuple[IntArray, IntArray]:
+    """The frame numbers (F,), ascending, at which labels show both of a pair, and the rows (2, F) of tracks there.
+
+    Raises NotAvailableError if there are none: `counterpart not recorded` if labels show one of the two alone.
+    """
+    own = [np.flatnonzero(tracks.actor_id == actor) for actor in pair]
+    first, second = (tracks.index[each] for each in own)
+    frames, *places = np.intersect1d(first, second, return_indices=True)
+    absent = [actor for actor, each in zip(pair, own, strict=True) if not len(each)]
+    if len(absent) == 1:
+        raise NotAvailableError(
+            f"{scenario}: counterpart not recorded: meta names actor {absent[0]}, which no label shows; the release "
+            "has such accidents, and render_frame shows their moments"
+        )
+    if not len(frames):
+        raise NotAvailableError(
+            f"{scenario}: no label shows the colliding pair {pair[0]} and {pair[1]} at one moment; leave it out"
+        )
+    return frames, np.stack([each[place] for each, place in zip(own, places, strict=True)])
+
+
+def contact_begin(gaps: FloatArray) -> int | None:
+    """Where, in the signed gaps (F,) of a pair, the last run of touching frames begins; None if they never touch."""
+    apart = gaps > _TOUCHING
+    if apart.all():
+        return None
+    end = int(np.flatnonzero(~apart)[-1])
+    return int(np.flatnonzero(apart[:end])[-1]) + 1 if apart[:end].any() else 0
 
 
 def _contact(pair: Boxes, facing: FloatArray) -> tuple[FloatArray, float, FloatArray]:
@@ -257,8 +320,9 @@ def _disagreements(
     if pair.category_names != told["classes"]:
         found.append(f"the classes are {pair.category_names}, meta says {told['classes']}")
     found += _other_agents(_agent_ids(dataset, record["token"]), pair.actor_id.tolist(), told["agents"])
-    side = told["contact_side"].removesuffix("_side").replace("back", "rear")
-    if side in ("front", "rear", "left", "right") and side not in sides:
+    word, _, aside = told["contact_side"].partition("_")
+    fitting = {word, "left", "right"} if aside else {word}
+    if word in ("front", "rear", "left", "right") and not fitting & {*sides}:
         found.append(f"the sides are {list(sides)}, meta says {told['contact_side']}")
     return found
 

@@ -8,16 +8,19 @@ from itertools import combinations
 import numpy as np
 
 from deepaccident_devkit.errors import shortened
-from deepaccident_devkit.geometry.box_arrays import gaps
+from deepaccident_devkit.geometry.box_arrays import gaps, signed_gaps
 from deepaccident_devkit.release import Collision, Meta
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import (
     CATEGORIES,
+    CONTACT_SIDES,
     DIRECTIONS,
     META_AGENTS,
     ROAD_TYPES,
+    SPAWN_RELATIONS,
     SPAWN_SIDES,
+    UNKNOWN_ID,
     UNTRACKED_ID,
     VEHICLE_AGENTS,
     WEATHERS,
@@ -37,8 +40,10 @@ _ITSELF = 3.0
 """Metres around an agent's origin in which others see the agent itself."""
 SAME_PLACE = 0.1
 """Metres within which boxes of two agents are the same thing; different ids then contradict."""
-COLLIDING_NORMAL = ("Town07_type001_subtype0002_scenario00028",)
-"""Scenarios of the release's _normal folders whose meta names a collision."""
+_NEAR = 10.0
+"""Metres between the centres of two whose boxes can overlap."""
+_STEP = 0.05
+"""Metres that a mover goes in a frame, at least."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +75,7 @@ def check_agreement(subject: Subject) -> Iterator[Finding]:
     yield from _own_rows(subject, views)
     yield from _missing_actors(subject, views)
     yield from _ids(subject)
+    yield from _overlaps(subject, views)
 
 
 def _views(subject: Subject) -> Views:
@@ -186,6 +192,25 @@ def _ids(subject: Subject) -> Iterator[Finding]:
         yield subject.finding("ids-differ", where, what)
 
 
+def _overlaps(subject: Subject, views: Views) -> Iterator[Finding]:
+    """A mover's box in another's, as others see the two, where meta names no collision; parked rows overlap anyway."""
+    if subject.files.meta is None or subject.files.meta.collision is not None:
+        return
+    seen = (np.arange(len(views.actor)), np.isfinite(views.center[..., 0]).argmax(axis=1))
+    center, size = views.center[seen], views.size[seen]
+    moves = np.zeros(len(center), dtype=bool)
+    moves[1:] = (np.diff(views.actor) == 0) & (np.linalg.norm(np.diff(center, axis=0), axis=1) > _STEP)
+    pairs, _ = near_pairs(center, views.frame, _NEAR)
+    pairs = pairs[moves[pairs].any(axis=1)]
+    first, second = np.column_stack([center[:, :2], size[:, :2], views.yaw[seen]])[pairs.T]
+    depth = -signed_gaps(first, second)
+    over = (depth > POSITION) & (np.abs(np.diff(center[pairs, 2])[:, 0]) < size[pairs, 2].mean(axis=1))
+    if over.any():
+        who, when = actors_text(views.actor[pairs[over]].ravel()), frames_text(views.frame[pairs[over, 0]])
+        what = f"{who} overlap by up to {depth[over].max():.2f} m, {when}"
+        yield subject.finding("overlap-unnamed", subject.token, what)
+
+
 def _wrapped(angle: FloatArray) -> FloatArray:
     """Angles in (−π, π]."""
     return np.arctan2(np.sin(angle), np.cos(angle))
@@ -224,6 +249,18 @@ def _words(subject: Subject, meta: Meta) -> Iterator[Finding]:
     for name, (word, known) in said.items():
         if word is not None and word not in known:
             yield _at_meta(subject, "meta-word", f"{name} is {shortened(word)!r}, expected one of {', '.join(known)}")
+    told = (
+        {}
+        if meta.collision is None
+        else {
+            "spawn relation": (meta.collision.spawn_relation, SPAWN_RELATIONS),
+            "contact side": (meta.collision.contact_side, CONTACT_SIDES),
+        }
+    )
+    for name, (word, known) in told.items():
+        if word not in known:
+            what = f"{name} is {shortened(word)!r}, the release is known to have {', '.join(known)}"
+            yield subject.finding("collision-word", f"{subject.files.scenario.meta_path}:1", what)
     if meta.time_of_day is None:
         yield _at_meta(subject, "meta-word", f"{shortened(meta.weather)!r} does not end in a time of day")
     absent = [name for name, (word, _) in said.items() if word is None]
@@ -244,28 +281,34 @@ def _counts(subject: Subject, meta: Meta) -> Iterator[Finding]:
 def _folder(subject: Subject, meta: Meta) -> Iterator[Finding]:
     accident = subject.files.scenario.scenario_type.endswith("_accident")
     if meta.collision and not accident:
-        known = "known-" if subject.files.scenario.name in COLLIDING_NORMAL else ""
-        yield _at_meta(subject, f"{known}collision-in-normal", f"names a collision of {meta.collision.ids}")
+        yield _at_meta(subject, "collision-in-normal", f"names a collision of {meta.collision.ids}")
     if accident and not meta.collision:
         yield _at_meta(subject, "no-collision-in-accident", "names no collision")
 
 
+def _agents(subject: Subject, meta: Meta) -> Iterator[Finding]:
+    """The agents that `colliding agents` names against the ids of the pair."""
+    collision = meta.collision
+    if collision is None or collision.agents is None or meta.agent_ids is None:
+        return
+    if set(collision.agents) == {None}:
+        yield _at_meta(subject, "nobody-named", f"the colliding agents are 'none none', the pair {collision.ids}")
+        return
+    id_of = dict(zip(VEHICLE_AGENTS, meta.agent_ids, strict=True))
+    short = {name: word for word, name in META_AGENTS.items()}
+    expected = {id_of[agent] for agent in collision.agents if agent is not None}
+    if not expected <= set(collision.ids) and UNKNOWN_ID not in collision.ids:
+        names = " ".join(short[agent] for agent in collision.agents)
+        yield _at_meta(subject, "meta-pair", f"the colliding agents '{names}' are not the pair {collision.ids}")
+    named = {agent for agent, actor in id_of.items() if actor in collision.ids}
+    if not named <= set(collision.agents):
+        what = f"the pair {collision.ids} has an agent that 'colliding agents' does not name"
+        yield _at_meta(subject, "meta-pair", what)
+
+
 def _pair(subject: Subject, meta: Meta) -> Iterator[Finding]:
     collision = meta.collision
-    if collision is None:
-        return
-    if collision.agents is not None and meta.agent_ids is not None:
-        id_of = dict(zip(VEHICLE_AGENTS, meta.agent_ids, strict=True))
-        short = {name: word for word, name in META_AGENTS.items()}
-        expected = {id_of[agent] for agent in collision.agents if agent is not None}
-        if not expected <= set(collision.ids):
-            names = " ".join(short[agent] for agent in collision.agents)
-            yield _at_meta(subject, "meta-pair", f"the colliding agents '{names}' are not the pair {collision.ids}")
-        named = {agent for agent, actor in id_of.items() if actor in collision.ids}
-        if not named <= set(collision.agents):
-            what = f"the pair {collision.ids} has an agent that 'colliding agents' does not name"
-            yield _at_meta(subject, "meta-pair", what)
-    if not subject.files.scan.labelled:
+    if collision is None or not subject.files.scan.labelled:
         return
     agent_of = dict(zip(meta.agent_ids or (), VEHICLE_AGENTS, strict=False))
     told_by = [agent_of[actor] for actor in collision.ids if actor in agent_of]
@@ -275,7 +318,8 @@ def _pair(subject: Subject, meta: Meta) -> Iterator[Finding]:
         rows = np.flatnonzero(subject.boxes.actor == actor)
         found = sorted({CATEGORIES[code] for code in subject.boxes.labels.category[rows].tolist()})
         if not len(rows):
-            yield _at_meta(subject, "pair-not-seen", f"nobody annotated actor {actor}")
+            code = "pair-not-seen" if actor in agent_of else "counterpart-unknown"
+            yield _at_meta(subject, code, f"nobody annotated actor {actor}")
         elif found != [name]:
             what = f"actor {actor} is a {shortened(name)}, the labels say {', '.join(found)}"
             yield _at_meta(subject, "meta-pair", what)
@@ -313,4 +357,4 @@ def _at_meta(subject: Subject, code: str, what: str) -> Finding:
     return subject.finding(code, str(subject.files.scenario.meta_path), what)
 
 
-_CHECKS: tuple[Callable[[Subject, Meta], Iterator[Finding]], ...] = (_words, _counts, _folder, _pair, _impact)
+_CHECKS: tuple[Callable[[Subject, Meta], Iterator[Finding]], ...] = (_words, _counts, _folder, _agents, _pair, _impact)

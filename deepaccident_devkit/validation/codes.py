@@ -172,12 +172,32 @@ CODES: dict[str, Code] = {
     "meta-pair": Code("warning", "Meta's pair, their classes and the colliding agents contradict.", _RESTORE_ONE),
     "pair-not-seen": Code("warning", "Nobody annotated an actor of meta's pair.", _KEEP_OUT),
     "no-contact": Code("warning", "Meta's pair do not touch at the last frame.", _KEEP_OUT),
-    "collision-in-normal": Code("warning", "A scenario of a _normal folder has a collision.", _RESTORE_ONE),
-    "known-collision-in-normal": Code(
+    "counterpart-unknown": Code(
         "note",
-        "A scenario of a _normal folder has a collision in the release, too.",
+        "Meta names a partner that is no agent and that no label shows.",
+        "nothing to do; what needs both skips the accident by name",
+        known="one of mini's eight collisions has the id 0",
+    ),
+    "nobody-named": Code(
+        "note",
+        "Meta has a colliding pair, and `colliding agents` is `none none`.",
+        _NOTHING,
+        known="release files say so",
+    ),
+    "collision-word": Code(
+        "note", "Meta's first line has a word for the collision that nobody has found in the release.", _NOTHING
+    ),
+    "collision-in-normal": Code(
+        "note",
+        "A scenario of a _normal folder has a collision.",
         _NOTHING,
         known="one of val's 52 normal scenarios has one",
+    ),
+    "overlap-unnamed": Code(
+        "note",
+        "A moving actor's box overlaps another's, and meta names no collision.",
+        _NOTHING,
+        known="a car drives over a pedestrian's box in a real scenario",
     ),
     "no-collision-in-accident": Code(
         "note", "A scenario of an _accident folder has no collision.", _NOTHING, known="the release has such scenarios"

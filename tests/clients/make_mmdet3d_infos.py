@@ -30,7 +30,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "exports.md"
 
 
 def main(folder: Path) -> None:
-    config = SynthConfig(scenarios=2, frames=17, image_size=(320, 180), seed=3, unplanned=0, exact=True)
+    config = SynthConfig(scenarios=2, frames=17, image_size=(320, 180), seed=3, unplanned=0, exact=True, designed=True)
     turn_the_ego(make_release(folder / "release", config))
     dataset = DeepAccident("v1", folder / "release", verbose=False)
     expected = {}

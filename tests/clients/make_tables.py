@@ -30,7 +30,9 @@ def main(folder: Path) -> None:
 
 
 def release(root: Path) -> DeepAccident:
-    config = SynthConfig(scenarios=8, frames=4, image_size=(64, 36), unlabelled_test=True, unplanned=0, seed=3)
+    config = SynthConfig(
+        scenarios=8, frames=4, image_size=(64, 36), unlabelled_test=True, unplanned=0, seed=3, designed=True
+    )
     make_release(root, config)
     dataset = DeepAccident("v1", root, verbose=False)
     first, *_, last = (record for record in dataset.scenario if record["split"] != "test")

@@ -15,7 +15,7 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 @pytest.fixture(scope="session")
 def local(tmp_path_factory: pytest.TempPathFactory) -> Local:
     folder = tmp_path_factory.mktemp("engines")
-    config = SynthConfig(scenarios=6, frames=24, sensors=False, seed=12)
+    config = SynthConfig(scenarios=6, frames=24, sensors=False, seed=12, designed=True)
     release = make_release(folder / "release", config, workers=2)
     done(command(["predict", "constant_velocity", str(release), "--split", "train", "--out", str(folder / "results")]))
     places = {"release": release, "results": folder / "results", "out": folder / "local"}

@@ -74,8 +74,7 @@ def in_calib(
 
     def apply(place: Place, rng: np.random.Generator) -> None:
         agent, frames = place.any_agent(rng), place.frames if always else [place.any_frame(rng)]
-        matrix = key.format(rng.choice(CAMERAS)) if "{}" in key else key
-        place.edit_calib(agent, frames, matrix, edit or drawn(rng))
+        place.edit_calib(agent, frames, key.format(rng.choice(CAMERAS)) if "{}" in key else key, edit or drawn(rng))
 
     return apply
 

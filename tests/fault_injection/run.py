@@ -15,7 +15,7 @@ from fault_injection.mutations import BEYOND, MUTATIONS, seeded
 from fault_injection.mutations.calib import marker
 from fault_injection.place import NoVictimError, Place
 
-RELEASE = SynthConfig(scenarios=2, frames=7, image_size=(96, 54), seed=8, unplanned=0)
+RELEASE = SynthConfig(scenarios=2, frames=7, image_size=(96, 54), seed=8, unplanned=0, designed=True)
 NUM_MUTATIONS = 200
 SEEDS_BEYOND = 2
 WORKERS = 2

@@ -16,7 +16,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.release import read_calib, read_label
-from deepaccident_devkit.statistics import dataset_statistics
+from deepaccident_devkit.statistics import dataset_statistics, release_facts
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CAMERAS,
@@ -64,13 +64,17 @@ def test_few_pairs_interact_and_one_of_them_touches(real: DeepAccident) -> None:
     assert found.pairs.min_ttc[touching] == found.pairs.pet[touching] == 0
     pedestrian = real.get("instance", f"{TOKEN}/actor/{found.pairs.actor_ids[touching][0, 1]}")
     assert pedestrian["category"] == "pedestrian"
+    text = real.describe(TOKEN).text
+    assert "meta names no collision in 9.9 s. The outlines of the other vehicle and a pedestrian overlap." in text
 
 
 @pytest.mark.parametrize("deep", [False, True])
 def test_validate_tells_what_is_missing_and_nothing_else(real_root: Path, deep: bool) -> None:
     report = validate_release(real_root, deep=deep, workers=1)
     told = [finding for finding in report.findings if finding.code != "sensor-frames-missing"]
-    assert [str(finding) for finding in told if (finding.code, finding.severity) != ("box-points-differ", "note")] == []
+    said = [finding.what for finding in told if (finding.code, finding.severity) != ("box-points-differ", "note")]
+    assert said == ["actors 7242, 7247 overlap by up to 0.56 m, frames 24–28"]
+    assert {finding.severity for finding in told} == {"note"}
     assert report.velocity_frames == {TOKEN: "released"}
 
 
@@ -310,3 +314,9 @@ def test_it_can_be_exported_to_mcap(real: DeepAccident, tmp_path: Path) -> None:
     assert {camera: len(messages[f"/{INFRASTRUCTURE}/{camera}/image"]) for camera in CAMERAS} == dict.fromkeys(
         CAMERAS, 1
     )
+
+
+def test_facts_say_nothing_false(real: DeepAccident) -> None:
+    rows = {row.key: row for row in release_facts(real, workers=1).facts}
+    assert {row.verdict for row in rows.values()} == {"agree", "cannot say"}
+    assert [rows[key].here for key in ("slow", "fast", "vehicles")] == pytest.approx([0.16, 0.11, 11], abs=0.02)

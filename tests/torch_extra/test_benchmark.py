@@ -9,7 +9,7 @@ from deepaccident_devkit.synth import SynthConfig
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_every_way_to_load_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     benchmark = of_checkout("benchmarks.loader")
-    monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=2, image_size=(64, 36)))
+    monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=2, image_size=(64, 36), designed=True))
     monkeypatch.setattr(benchmark, "TEAMS", {"two": benchmark.TEAMS["two"]})
     for name in ("SCENARIOS", "REPEATS"):
         monkeypatch.setattr(benchmark, name, 1)

@@ -76,6 +76,7 @@ def contact() -> Contact:
         instances=("a", "b"),
         actor_ids=(20001, 20002),
         frame="f",
+        contact_frame=None,
         point=np.full(3, -1234.56),
         gap=0.123456789,
         speeds=(12.3, 12.3),

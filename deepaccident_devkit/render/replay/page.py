@@ -47,6 +47,7 @@ from deepaccident_devkit.support.pages import document, part, source_hash
 from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
 from deepaccident_devkit.v2x import Agents
+from deepaccident_devkit.v2x.collisions import contact_words
 
 SIZE_LIMIT: Final = 15_000_000
 """The most bytes of a page, so that it can be sent by mail."""
@@ -274,6 +275,7 @@ def _ending(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "Ends", f"{who[0]} and {who[1]} collide"
     yield "Accident type", "" if kind is None else f"{kind} of the paper's 12"
     if contact is not None:
+        yield "Contact", contact_words(contact.touching, contact.gap)
         yield "Speeds", ", ".join(f"{name} {_speed(speed)}" for name, speed in zip(names, contact.speeds, strict=True))
         yield "Closing speed", _speed(contact.closing_speed)
         yield "Angle between", f"{math.degrees(contact.impact_angle):.0f}°"

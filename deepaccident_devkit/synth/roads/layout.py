@@ -18,7 +18,7 @@ OUTWARD: dict[Arm, tuple[int, int]] = {"west": (-1, 0), "south": (0, -1), "east"
 
 EXTENT = 150.0
 """The ground covers −`EXTENT` to `EXTENT` in x and y, metres."""
-MAX_GRADE = 0.14
+MAX_GRADE = 0.21
 _CURVED = 0.25
 """Share of each half of a hump that is curved at its crest, and as much at its foot; the grade between is constant."""
 _SHOULDERS = (22.0, 45.0)

@@ -12,9 +12,18 @@ import numpy as np
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import ScenarioSpec
+from deepaccident_devkit.synth.spec.checks import LEADERS
 from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
 from deepaccident_devkit.synth.traffic.driving import RoadUser, middle_of
+from deepaccident_devkit.synth.traffic.lifelike import (
+    NORMAL_FRAMES,
+    Kind,
+    accident_frames,
+    beyond_contact,
+    crowded,
+    lively,
+)
 from deepaccident_devkit.synth.traffic.placement import WARM_UP, Cast, cast_actors
 from deepaccident_devkit.synth.traffic.rights import AXIS_OF_ARM, SignalPlan, find_rights, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import Simulation, gap, separation, simulate
@@ -24,7 +33,10 @@ _LOOK_STEP = 5
 """Which road users are near each other is computed once in so many steps."""
 _NEAR = 2.0
 """How much nearer two can come between these steps, metres."""
-ContactSide = Literal["front", "back", "left", "right"]
+ContactSide = Literal["front", "front_side", "rear", "rear_side"]
+Relation = Literal["same", "opposite"]
+_TOWARDS = -0.5
+"""Cosine of the angle between two headings: below it they drive towards each other."""
 _AREA_MASS = 60.0
 """Impact for each m² of the first box and m/s; so the numbers are about as large as in the real release."""
 _HALVINGS = 40
@@ -45,6 +57,8 @@ _DELAYS = (0.0, 1.5, 3.0, 5.0, 8.0, 1000.0)
 """Seconds by which one of the pair comes later if rules alone do not prevent a collision; tried in this order."""
 _LEAST_FRAMES, _MOST_FRAMES = 40, 100
 """The fewest and the most frames of a recording if no number is given, as in the release."""
+_SHORTEST = 36
+"""The fewest frames of a recording with a kind of accident."""
 _EARLIEST, _LATEST_END = 5.5, 10.0
 """The least time from the beginning until the pair meets, and the latest end of a normal scenario, seconds."""
 _ARRIVAL = 25.0
@@ -62,6 +76,7 @@ class Stage:
         background: the others that move.
         parked: the parked vehicles.
         signals: the traffic lights, None if there are none.
+        kind: the kind of accident where all is as in the real release; None where it is as designed.
     """
 
     spec: ScenarioSpec
@@ -70,6 +85,12 @@ class Stage:
     background: tuple[RoadUser, ...]
     parked: tuple[ParkedVehicle, ...]
     signals: SignalPlan | None
+    kind: Kind | None = None
+
+    @property
+    def unlabelled(self) -> int | None:
+        """The row of the road user that labels and sensors leave out, None if there is none."""
+        return None if self.cast.pair is None or self.kind is None or self.kind.labelled else self.cast.pair[1]
 
     @property
     def users(self) -> tuple[RoadUser, ...]:
@@ -97,11 +118,13 @@ class Impact:
 
     Attributes:
         time: seconds, when the boxes first touch.
-        side: the side of the first one's box that is hit.
+        relation: whether the two drive the same way, or towards each other, as the meta file names it.
+        side: the side of the first one's box that is hit, as the meta file names it.
         strength: the impact in the meta file.
     """
 
     time: float
+    relation: Relation
     side: ContactSide
     strength: float
 
@@ -123,19 +146,25 @@ class Recorded:
     impact: Impact | None
 
 
-def set_stage(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float) -> Stage:
+def set_stage(
+    rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float, kind: Kind | None = None
+) -> Stage:
     """Everyone's place at the beginning; the pair meets `duration` seconds after the first recorded frame."""
-    cast = cast_actors(rng, spec, junction, duration)
+    cast = cast_actors(rng, spec, junction, duration, kind)
     signals = _signal_plan(rng, cast) if spec.road.signalized else None
     hold = max(duration - _LONGEST_DRIVE, 0.0)
     background = background_users(rng, spec, junction, cast.users, signals, cast.begin + hold)
+    parked = tuple(parked_vehicles(rng, spec, junction, [user for user in cast.users if user.walks]))
+    if kind is not None:
+        background, parked = [lively(rng, user) for user in background], crowded(rng, parked)
     return Stage(
         spec=spec,
         junction=junction,
         cast=cast,
         background=tuple(_held(user, hold) for user in background),
-        parked=tuple(parked_vehicles(rng, spec, junction, [user for user in cast.users if user.walks])),
+        parked=parked,
         signals=signals,
+        kind=kind,
     )
 
 
@@ -148,8 +177,10 @@ def try_accident(stage: Stage) -> Performance | float:
     if pair is None:
         return np.inf
     unruly = [replace(user, ignores=("signal", "priority")) for user in stage.cast.users]
-    users = [unruly[row] if row in pair else user for row, user in enumerate(stage.users)]
-    performance = _perform(stage, users, _LATEST, watched=pair)
+    ahead = {LEADERS.get(stage.users[row].role) for row in pair}  # whose followers could not come if they waited
+    pushing = [row for row, user in enumerate(stage.cast.users) if row in pair or user.role in ahead]
+    users = [unruly[row] if row in pushing else user for row, user in enumerate(stage.users)]
+    performance = _perform(stage, users, _LATEST, watched=pair, pushing=pushing)
     if performance is None:
         return np.inf
     if performance.simulation.contact is not None:
@@ -175,31 +206,46 @@ def perform_twin(stage: Stage, end: float) -> Performance | None:
     return narrow
 
 
-def recorded_accident(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
-    """The recording that ends with the impact; None records all frames that there are, within limits."""
+def recorded_accident(rng: np.random.Generator, stage: Stage, performance: Performance, frames: int | None) -> Recorded:
+    """The recording that ends with the impact, or, with a kind of accident, about then.
+
+    None records all frames that there are, within limits.
+    """
     pair = stage.cast.pair or (0, 0)
     size = np.array([stage.users[row].body.size[:2] for row in pair])
     impact = impact_of(performance.simulation, pair, size)
-    count = frames or _natural_frames(stage, impact.time)
-    return Recorded(
-        performance=performance, start=impact.time - FRAME_PERIOD * (count - 1), frames=count, impact=impact
-    )
+    end = impact.time
+    if stage.kind is not None:
+        simulation, after = beyond_contact(rng, performance.simulation, pair, size)
+        performance, end = replace(performance, simulation=simulation), end + after
+    count = frames or _natural_frames(stage, end)
+    return Recorded(performance=performance, start=end - FRAME_PERIOD * (count - 1), frames=count, impact=impact)
 
 
-def recorded_normal(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
+def recorded_normal(rng: np.random.Generator, stage: Stage, performance: Performance, frames: int | None) -> Recorded:
     """The recording that ends when ego has arrived, or when time is over; arguments as in `recorded_accident`."""
     begin = stage.cast.begin + WARM_UP
-    natural = _natural_frames(stage, min(_arrival_time(stage, performance), begin + _LATEST_END))
+    if stage.kind is None:
+        natural = _natural_frames(stage, min(_arrival_time(stage, performance), begin + _LATEST_END))
+    else:
+        natural = int(rng.integers(*NORMAL_FRAMES))
     if frames is None:
         return Recorded(performance=performance, start=begin, frames=natural, impact=None)
     end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
     return Recorded(performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None)
 
 
-def usual_duration(rng: np.random.Generator, frames: int | None) -> float:
+def usual_duration(rng: np.random.Generator, frames: int | None, kind: Kind | None = None) -> float:
     """Seconds from the beginning until the pair meets: drawn, or as many as the wanted number of frames needs."""
-    natural = float(rng.uniform(_EARLIEST, _LATEST_END + 0.3))
+    usual = rng.uniform(_EARLIEST, _LATEST_END + 0.3) if kind is None else accident_frames(rng) * FRAME_PERIOD
+    natural = float(usual)
     return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
+
+
+def lasts(stage: Stage, accident: Performance, frames: int | None) -> bool:
+    """Whether an accident has begun early enough for its recording; as designed it always has."""
+    needed = FRAME_PERIOD * (frames or _SHORTEST)
+    return stage.kind is None or accident.simulation.time[-1] - stage.cast.begin > needed
 
 
 def latest_end(stage: Stage, frames: int | None) -> float:
@@ -236,13 +282,17 @@ def _keep_clear(stage: Stage, performance: Performance) -> bool:
 
 
 def _perform(
-    stage: Stage, users: Sequence[RoadUser], end: float, watched: tuple[int, int] | None = None
+    stage: Stage,
+    users: Sequence[RoadUser],
+    end: float,
+    watched: tuple[int, int] | None = None,
+    pushing: Sequence[int] = (),
 ) -> Performance | None:
     """Simulate until nobody touches, each time without those of the background who did; None if named ones touch."""
     present = list(range(len(users)))
     for _ in range(_ROUNDS):
         there = [users[row] for row in present]
-        rights = find_rights(there, minor=stage.spec.road.yielding_arms, blind=watched)
+        rights = find_rights(there, minor=stage.spec.road.yielding_arms, blind=watched, pushing=pushing)
         simulation = simulate(
             there, begin=stage.cast.begin, end=end, rights=rights, signals=stage.signals, watched=watched
         )
@@ -280,8 +330,8 @@ def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
 
 
 def _natural_frames(stage: Stage, end: float) -> int:
-    since = end - (stage.cast.begin + WARM_UP)
-    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, _LEAST_FRAMES, _MOST_FRAMES))
+    frames = int((end - (stage.cast.begin + WARM_UP)) / FRAME_PERIOD + 1e-6) + 1
+    return int(np.clip(frames, _LEAST_FRAMES if stage.kind is None else _SHORTEST, _MOST_FRAMES))
 
 
 def _arrival_time(stage: Stage, performance: Performance) -> float:
@@ -307,6 +357,7 @@ def impact_of(simulation: Simulation, pair: tuple[int, int], size: FloatArray) -
     velocity = simulation.velocities[-1][rows]
     return Impact(
         time=float(simulation.time[-1]) - (1.0 - share) * period,
+        relation="opposite" if np.cos(poses[0, 2] - poses[1, 2]) < _TOWARDS else "same",
         side=contact_side(poses, size),
         strength=float(_AREA_MASS * size[0].prod() * np.hypot(*(velocity[0] - velocity[1]))),
     )
@@ -328,6 +379,8 @@ def _touching_share(before: FloatArray, after: FloatArray, size: FloatArray) -> 
 def contact_side(poses: FloatArray, size: FloatArray) -> ContactSide:
     """The side of the first of two boxes that faces the second across the widest gap along any side's normal.
 
+    Flanks are told by the half, before or behind the first one's middle, in which the middle of the second is.
+
     Poses are (2, 3) x, y (metres), yaw (radians) of the centres, sizes (2, 2) length and width, metres.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -338,8 +391,8 @@ def contact_side(poses: FloatArray, size: FloatArray) -> ContactSide:
     best = int(np.argmax(np.abs(apart) - reach))
     along, across = axes[0] @ (normals[best] * np.sign(apart[best]))
     if abs(along) >= abs(across):
-        return "front" if along > 0 else "back"
-    return "left" if across > 0 else "right"
+        return "front" if along > 0 else "rear"
+    return "front_side" if axes[0, 0] @ (poses[1, :2] - poses[0, :2]) >= 0 else "rear_side"
 
 
 def touching_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[tuple[int, int]]:

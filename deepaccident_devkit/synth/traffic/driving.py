@@ -38,8 +38,6 @@ _BEND_BRAKING = 1.8
 """m/s² with which drivers brake before a bend."""
 _STIFFNESS = 2.5
 """1/s: the braking for each m/s above the allowed speed."""
-_SLOWING = 4.0
-"""m/s²: the hardest braking to the speed that a bend allows."""
 _GENTLE_STOP = (3.0, 1.0)
 """The hardest braking near standstill, m/s², and how much harder it can be for each m/s of speed."""
 _NO_GAP = 0.1
@@ -51,6 +49,8 @@ _CYCLIST_OFFSET = 1.1
 _KERB_ROOM = 0.7
 """Metres from the kerb to where a pedestrian waits to step onto the road."""
 WALKER = "pedestrian"
+Stretch = tuple[float, float, float]
+"""Where a part of a path begins and ends, metres along it, and the most speed there, m/s."""
 
 
 @dataclass(slots=True, eq=False)
@@ -119,10 +119,12 @@ class Tracks:
     """Points along each path, and the speed that its bends allow; one row for each road user.
 
     `lateral` is (A,) m/s², the most sideways acceleration that each accepts in a bend. Those with `stops` (A,) stop at
-    the path's end; others go straight on.
+    the path's end; others go straight on. `paces` has each one's own stretches, before which nobody brakes in advance.
     """
 
-    def __init__(self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray) -> None:
+    def __init__(
+        self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray, paces: Sequence[Sequence[Stretch]] = ()
+    ) -> None:
         reach = max(path.length for path in paths) + _BEYOND
         along = np.arange(0.0, reach, SPACING)
         distinct = {id(path): path for path in paths}
@@ -132,6 +134,10 @@ class Tracks:
         self._points, self._distinct = points, rows  # (P, K, 4), (A,)
         ends = np.where(stops, [path.length for path in paths], np.inf)
         self._allowed = _allowed_speed(along, points[rows, :, 3], lateral, ends)
+        for row, pace in enumerate(paces):
+            for begin, end, most in pace:
+                cells = slice(*np.searchsorted(along, (begin, end)))
+                self._allowed[row, cells] = np.minimum(self._allowed[row, cells], most)
         self._flat = np.ascontiguousarray(points.reshape(-1, 4).T)
         self._first = rows * len(along)
         self._row = np.arange(len(paths))
@@ -180,6 +186,7 @@ class Temper:
         max_speed: (A,) speed on a free straight road, m/s.
         acceleration: (A,) acceleration from standstill, m/s².
         braking: (A,) comfortable braking, m/s².
+        slowing: (A,) the hardest braking to the speed that a bend allows, m/s².
         time_gap: (A,) seconds to the road user ahead.
         min_gap: (A,) metres, bumper to bumper, when standing.
     """
@@ -187,6 +194,7 @@ class Temper:
     max_speed: FloatArray
     acceleration: FloatArray
     braking: FloatArray
+    slowing: FloatArray
     time_gap: FloatArray
     min_gap: FloatArray
 
@@ -194,7 +202,7 @@ class Temper:
 def free_acceleration(temper: Temper, speed: FloatArray, allowed: FloatArray) -> FloatArray:
     """The acceleration (A,) m/s² at a speed if nobody is in the way and the bends ahead allow so much, (A,) m/s."""
     own = temper.acceleration * (1.0 - (speed / temper.max_speed) ** 4)
-    bend = np.maximum(_STIFFNESS * (allowed - speed), -_SLOWING)
+    bend = np.maximum(_STIFFNESS * (allowed - speed), -temper.slowing)
     return np.asarray(np.clip(np.minimum(own, bend), -HARDEST_BRAKING, None))
 
 
@@ -287,6 +295,7 @@ class Manner:
         min_gap: metres, bumper to bumper, when standing.
         lateral: the most sideways acceleration in a bend, m/s².
         max_speed: least and most speed on a free straight road, m/s.
+        slowing: the hardest braking to the speed that a bend allows, m/s².
     """
 
     acceleration: float
@@ -295,6 +304,7 @@ class Manner:
     min_gap: float
     lateral: float
     max_speed: tuple[float, float]
+    slowing: float = 4.0
 
 
 MANNERS = {
@@ -306,6 +316,20 @@ MANNERS = {
     "pedestrian": Manner(1.5, 2.0, 0.4, 0.5, 9.0, (0.9, 1.7)),
 }
 """By category."""
+BRISK_MANNERS = {
+    category: manner
+    if category == WALKER
+    else replace(
+        manner,
+        acceleration=2.0 * manner.acceleration,
+        braking=2.1 * manner.braking,
+        time_gap=0.6 * manner.time_gap,
+        lateral=1.4 * manner.lateral,
+        slowing=7.0,
+    )
+    for category, manner in MANNERS.items()
+}
+"""Of drivers who are late: they speed up and brake harder, and follow more closely."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -325,6 +349,8 @@ class RoadUser:
             stays on the sidewalk.
         ignores: the rules that it breaks.
         alert: seconds before a contact at which it notices the other one of the pair; 0 for never.
+        pace: stretches of its path where it is slow for reasons of its own.
+        brisk: whether it drives as `BRISK_MANNERS` say.
     """
 
     role: Role
@@ -338,6 +364,8 @@ class RoadUser:
     span: tuple[float, float] = (0.0, 0.0)
     ignores: tuple[Rule, ...] = ()
     alert: float = 0.0
+    pace: tuple[Stretch, ...] = ()
+    brisk: bool = False
 
     @property
     def walks(self) -> bool:
@@ -347,7 +375,7 @@ class RoadUser:
     @property
     def manner(self) -> Manner:
         """How it drives."""
-        return MANNERS[self.body.category]
+        return (BRISK_MANNERS if self.brisk else MANNERS)[self.body.category]
 
     @property
     def wheelbase(self) -> float:
@@ -365,6 +393,7 @@ def temper_of(users: Sequence[RoadUser]) -> Temper:
         max_speed=_gather(users, lambda user: user.max_speed),
         acceleration=_gather(users, lambda user: user.manner.acceleration),
         braking=_gather(users, lambda user: user.manner.braking),
+        slowing=_gather(users, lambda user: user.manner.slowing),
         time_gap=_gather(users, lambda user: user.manner.time_gap),
         min_gap=_gather(users, lambda user: user.manner.min_gap),
     )

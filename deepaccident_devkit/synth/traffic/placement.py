@@ -24,6 +24,7 @@ from deepaccident_devkit.synth.traffic.driving import (
     road_crossing,
     temper_of,
 )
+from deepaccident_devkit.synth.traffic.lifelike import Kind, erring, lively
 
 _USUAL_DRIVE = 24.0
 """Seconds that are driven at least."""
@@ -62,7 +63,7 @@ class Approach:
 
 def drive_alone(user: RoadUser, to: float = 0.0) -> Approach:
     """The drive of a road user that is alone and stays on its path, at least until its centre is `to` metres along."""
-    tracks = Tracks([user.path], np.array([user.manner.lateral]), np.array([user.walks]))
+    tracks = Tracks([user.path], np.array([user.manner.lateral]), np.array([user.walks]), [user.pace])
     temper, back = temper_of([user]), user.wheelbase / 2
     along, speed = np.array([user.start - back]), np.array([user.start_speed])
     steps = PERIOD * np.arange(1, DECISION_STEPS + 1)
@@ -91,6 +92,8 @@ _STARTS = (35.0, 75.0)
 """Least and most metres from the start to the junction's middle if the start is not given."""
 _LANE_CHANGE = 28.0
 """Metres that a change of lanes takes."""
+_LENGTH, _CLOSED = 4.6, 0.9
+"""Metres, and the share of a follower's first gap, that are between it and its leader when it meets somebody."""
 _KEEPING_UP = 1.3
 """A follower's wanted speed as a multiple of its leader's, so that the gap does not grow."""
 _FIRST_PLACE = 8.0
@@ -116,8 +119,13 @@ class Cast:
         return next(row for row, user in enumerate(self.users) if user.role == role)
 
 
-def cast_actors(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float) -> Cast:
-    """The moving road users that a file names; the pair meets `duration` seconds after the first recorded frame."""
+def cast_actors(
+    rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float, kind: Kind | None = None
+) -> Cast:
+    """The moving road users that a file names; the pair meets `duration` seconds after the first recorded frame.
+
+    If a follower is one of the pair, its leader is timed. With a kind of accident drivers err.
+    """
     begin = -(duration + WARM_UP)
     named = [actor for actor in spec.actors if actor.role != "parked"]
     leading = [actor for actor in named if actor.role not in LEADERS]
@@ -128,15 +136,25 @@ def cast_actors(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction
         if meeting is None:
             pair = None
         else:
-            approaches = [drive_alone(users[row], to=place) for row, place in zip(pair, meeting, strict=True)]
-            for row, place, late, approach in zip(pair, meeting, (0.0, spec.meet.offset), approaches, strict=True):
+            if kind is not None:
+                users = [lively(rng, user) if row not in pair else user for row, user in enumerate(users)]
+                for row, place in zip(pair, meeting, strict=True):
+                    stops = kind.stops and spec.meet.actors[0] == users[row].role
+                    users[row] = erring(rng, users[row], place, stops=stops)
+            ahead = [_ahead(spec, role) for role in spec.meet.actors]
+            places = [place + more for place, more in zip(meeting, ahead, strict=True)]
+            approaches = [drive_alone(users[row], to=place) for row, place in zip(pair, places, strict=True)]
+            for row, place, late, approach in zip(pair, places, (0.0, spec.meet.offset), approaches, strict=True):
                 users[row] = approach.at(approach.time_to(place) + begin - late)
     for actor in named:
         if actor.role in LEADERS:
             leader = next(user for user in users if user.role == LEADERS[actor.role])
-            stays = spec.actor(leader.role).lane_change is not None  # or it would collide with a vehicle beside it
-            path = leader.route.path if stays and leader.route else leader.path
-            users.append(_follower(rng, actor, leader, path))
+            # a follower does not change lanes with its leader, or it would collide with a vehicle beside it
+            way = leader if kind is None and spec.actor(leader.role).lane_change is None else leader.route or leader
+            users.append(_follower(rng, actor, leader, way.path))
+    if pair is not None and spec.meet is not None:
+        roles = [user.role for user in users]
+        pair = (roles.index(spec.meet.actors[0]), roles.index(spec.meet.actors[1]))
     return Cast(users=tuple(users), begin=begin, pair=pair)
 
 
@@ -145,8 +163,21 @@ def _pair_rows(spec: ScenarioSpec, actors: Sequence[ActorSpec]) -> tuple[int, in
     if spec.meet is None:
         return None
     roles = [actor.role for actor in actors]
-    first, second = spec.meet.actors
+    first, second = _timed_roles(spec.meet)
     return (roles.index(first), roles.index(second)) if first in roles and second in roles else None
+
+
+def _timed_roles(meet: MeetSpec) -> tuple[Role, Role]:
+    """The roles that are timed: leaders in place of their followers; of one behind the other, ego and other."""
+    first, second = (LEADERS.get(role, role) for role in meet.actors)
+    return (first, "ego" if first == "other" else "other") if first == second else (first, second)
+
+
+def _ahead(spec: ScenarioSpec, role: Role) -> float:
+    """About how many metres its leader is ahead of a follower that meets a stranger; 0 for others."""
+    if role not in LEADERS or spec.meet is None or LEADERS[role] in spec.meet.actors:
+        return 0.0
+    return _LENGTH + max(_CLOSED * (spec.actor(role).gap or 0.0), _GAPS[0])
 
 
 def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, timed: bool) -> RoadUser:
@@ -207,11 +238,12 @@ def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path
         path=path,
         start=leader.start - (leader.body.size[0] + body.size[0]) / 2 - gap,
         start_speed=leader.start_speed,
-        max_speed=max(own_speed, _KEEPING_UP * leader.max_speed),
+        max_speed=max(own_speed, leader.max_speed if leader.brisk else _KEEPING_UP * leader.max_speed),
         delay=leader.delay,
         route=leader.route,
         span=leader.span,
         ignores=leader.ignores,
+        brisk=leader.brisk,
     )
 
 
@@ -230,13 +262,18 @@ _THIRD_SPEEDS = (8.0, 12.0)
 _OFFSETS = (-0.2, 0.2)
 
 
-def unplanned(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction) -> ScenarioSpec:
-    """A designed scenario with another accident: ego and other obey, and one meets a pedestrian or a third vehicle."""
+def unplanned(
+    rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, *, on_foot: bool | None = None
+) -> ScenarioSpec:
+    """A designed scenario with another accident: ego and other obey, and one meets a pedestrian or a third vehicle.
+
+    Which of the two is drawn if `on_foot` is None.
+    """
     victims: tuple[Role, ...] = ("ego", "other")
     victim = spec.actor(victims[int(rng.integers(2))])
     used = {spec.actor(role).from_arm for role in victims}
     free = [arm for arm in junction.arms if arm not in used]
-    on_foot = rng.random() < _PEDESTRIANS or not free
+    on_foot = (rng.random() < _PEDESTRIANS if on_foot is None else on_foot) or not free
     goes_on = "straight" in junction.turns(victim.from_arm or "west")
     cuts_in = junction.spec.lanes == 2 and goes_on and rng.random() < _CUTTING_IN
     if on_foot:

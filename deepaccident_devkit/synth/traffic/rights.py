@@ -146,10 +146,12 @@ def find_rights(
     *,
     minor: Sequence[Arm] = (),
     blind: tuple[int, int] | None = None,
+    pushing: Sequence[int] = (),
 ) -> Rights:
     """The rights of all pairs; `minor` arms give way to the others (none at a junction with lights).
 
-    A `blind` pair (rows) sees only the others on their own arm; all others let them go first, so that they meet.
+    A `blind` pair (rows) sees only the others on their own arm; all others let them go first, so that they meet. Who is
+    `pushing` (rows) waits for nobody.
     """
     count = len(users)
     together, waits = np.zeros((count, count), dtype=bool), np.zeros((count, count), dtype=bool)
@@ -163,6 +165,7 @@ def find_rights(
         for row in blind:
             waits[row], sees[row] = False, [_same_arm(users[row], other) for other in users]
             sees[row, list(blind)] = False
+        waits[list(pushing)] = False
     widths = np.array([user.body.size[1] for user in users])
     zones = find_zones([user.path for user in users], [user.span for user in users], widths, together)
     return Rights(zones, waits, sees)

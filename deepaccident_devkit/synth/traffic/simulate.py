@@ -205,7 +205,7 @@ class _Run:
         self._walkers = np.flatnonzero(self._walks)
         self._temper = temper_of(users)
         lateral = np.array([user.manner.lateral for user in users])
-        self._tracks = Tracks([user.path for user in users], lateral, self._walks)
+        self._tracks = Tracks([user.path for user in users], lateral, self._walks, [user.pace for user in users])
         self._delay = np.array([user.delay for user in users])
         self._rights = rights
         self._lights = _Lights(users, signals)

@@ -254,7 +254,7 @@ def meta_frames_wrong(victim: Victim) -> Path:
     return _edit_first_line(victim, 8, "99")
 
 
-@META_MEANING.enter("meta-pair", "pair-not-seen")
+@META_MEANING.enter("meta-pair", "counterpart-unknown")
 def meta_pair_wrong(victim: Victim) -> Path:
     """Meta names a colliding actor that is in no label."""
     return _edit_first_line(victim, 1, "7777")

@@ -168,7 +168,7 @@ def meta_short(victim: Victim) -> Path:
     return real_path(victim.editor.scenario.meta_path)
 
 
-@LEGAL.enter("no-collision-in-accident")
+@LEGAL.enter("no-collision-in-accident", "overlap-unnamed")
 def meta_no_collision(victim: Victim) -> Path:
     """The meta file in an accident's folder names no collision."""
     first, _, *rest = victim.editor.meta_lines()

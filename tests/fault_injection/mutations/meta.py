@@ -38,8 +38,7 @@ def _cut(place: Place, rng: np.random.Generator) -> None:
 
 
 def _count_other_frames(place: Place, rng: np.random.Generator) -> None:
-    frames = int(place.meta_lines()[0].split()[-1])
-    _set_word(place, NUMBER_OF_FRAMES, frames + int(rng.choice([-3, -2, -1, 1, 2, 3])))
+    _set_word(place, NUMBER_OF_FRAMES, int(place.meta_lines()[0].split()[-1]) + int(rng.choice([-3, -2, -1, 1, 2, 3])))
 
 
 GROUP.add(
@@ -92,8 +91,7 @@ def _other_pair(place: Place, rng: np.random.Generator) -> None:
 
 def _other_class(place: Place, rng: np.random.Generator) -> None:
     number = int(rng.choice(CLASSES))
-    others = {"pedestrian", "motorcycle"} - {place.meta_lines()[0].split()[number]}
-    _set_word(place, number, rng.choice(sorted(others)))
+    _set_word(place, number, rng.choice(sorted({"pedestrian", "motorcycle"} - {place.meta_lines()[0].split()[number]})))
 
 
 def _no_collision(place: Place, rng: np.random.Generator) -> None:
@@ -102,12 +100,14 @@ def _no_collision(place: Place, rng: np.random.Generator) -> None:
     _write(place, [" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *others])
 
 
+def _other_id(place: Place, rng: np.random.Generator) -> None:
+    words, agents = place.meta_lines()[0].split(), place.agent_ids()
+    _set_word(place, int(rng.choice([number for number in IDS if int(words[number]) in agents])), "19876")
+
+
 GROUP.add(
     {
-        "meta_pair_unknown": (
-            "A colliding actor's id is in no label.",
-            lambda place, rng: _set_word(place, int(rng.choice(IDS)), "19876"),
-        ),
+        "meta_pair_unknown": ("A colliding agent's id is in no label.", _other_id),
         "meta_pair_far_away": (
             "A colliding actor's id is that of another actor, far from the collision.",
             _id_from_afar,
@@ -126,6 +126,24 @@ GROUP.add(
     {"meta_collision_dropped": ("The meta file of an accident names no collision.", _no_collision)},
     only="accident",
     harmless="a scenario in an accident folder can have no collision (docs/format.md, Meta)",
+)
+GROUP.add(
+    {
+        "meta_pair_0": (
+            "A colliding actor's id is 0.",
+            lambda place, rng: _set_word(place, int(rng.choice(IDS)), "0"),
+        ),
+        "meta_nobody_named": (
+            "The colliding agents are 'none none'.",
+            lambda place, _: _set_entry(place, "colliding agents", "none none"),
+        ),
+        "meta_collision_words": (
+            "The words of the collision are new ones.",
+            lambda place, _: (_set_word(place, 6, "across"), _set_word(place, 7, "left_side"))[0],
+        ),
+    },
+    only="accident",
+    harmless="the release has such pairs, and perhaps other words (docs/format.md, Meta)",
 )
 
 

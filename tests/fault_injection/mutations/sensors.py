@@ -123,12 +123,11 @@ def _of_camera(place: Place, rng: np.random.Generator) -> None:
 
 
 def _of_twin(place: Place, rng: np.random.Generator) -> None:
-    twins = {"accident": "normal", "normal": "accident"}
     of_type = place.scenario.scenario_type
     kind = of_type.rsplit("_", 1)[1]
     (agent, other), (frame, other_frame), camera = place.two_agents(rng), _two_frames(place, rng), _camera(rng)
     path = place.file(other, camera, other_frame).relative_to(place.root / of_type)
-    twin = place.root / of_type.replace(kind, twins[kind]) / path
+    twin = place.root / of_type.replace(kind, {"accident": "normal", "normal": "accident"}[kind]) / path
     place.write(place.file(agent, camera, frame), twin.read_bytes())
 
 

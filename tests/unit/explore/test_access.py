@@ -133,8 +133,7 @@ def test_a_ticket_is_right_once_and_for_a_minute(monkeypatch: pytest.MonkeyPatch
     gate = Gate(TinyApp(), access)
 
     def status(token: str) -> int:
-        query = f"token={token}".encode()
-        return int(passed(gate, query_string=query, headers=[(b"host", b"localhost")])[0]["status"])
+        return int(passed(gate, query_string=f"token={token}".encode(), headers=[(b"host", b"localhost")])[0]["status"])
 
     ticket = gate.ticket()
     assert [status(ticket), status(ticket)] == [303, 403]
@@ -293,8 +292,7 @@ def test_no_secret_is_logged(served: Served, caplog: pytest.LogCaptureFixture) -
 def test_a_websocket_is_closed(served: Served) -> None:
     upgrade = (("Upgrade", "websocket"), ("Connection", "Upgrade"), ("Sec-WebSocket-Key", "x" * 24))
     assert ask(served.port, "/", *upgrade, ("Sec-WebSocket-Version", "13")).status == 401
-    gate = Gate(TinyApp(), served.access)
-    assert passed(gate, type="websocket") == [{"type": "websocket.close", "code": 1008}]
+    assert passed(Gate(TinyApp(), served.access), type="websocket") == [{"type": "websocket.close", "code": 1008}]
 
 
 @pytest.mark.parametrize("host", ["hub.example.org", "hub.example.org:8443", "node17:8000", "localhost:8888"])

@@ -14,8 +14,7 @@ def test_work_is_done_once_and_in_order() -> None:
     jobs, done = Jobs(), []
     first = jobs.ask("a", "title of a", lambda: done.append("a") or "aa")
     jobs.ask("b", "title of b", lambda: done.append("b") or "bb")
-    assert jobs.ask("a", "another", lambda: pytest.fail("done again")) is first
-    assert jobs.wait(60)
+    assert (jobs.ask("a", "another", lambda: pytest.fail("done again")) is first, jobs.wait(60)) == (True, True)
     assert done == ["a", "b"]
     assert [(job.name, job.title, job.state, job.result) for job in jobs.all()] == [
         ("a", "title of a", "ready", "aa"),

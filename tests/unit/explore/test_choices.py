@@ -81,8 +81,7 @@ def test_facets_find_what_the_devkit_finds(da: DeepAccident, scenarios: Scenario
     assert [scenarios.tokens[row] for row in found.rows] == [each["token"] for each in da.find(*choices.filters)]
     for name, each in ((name, each) for name, counts in found.counts.items() for each in counts):
         alone = Choices(facets={**chosen, name: (each["value"],)})
-        expected = len(da.find(*alone.filters)), each["value"] in chosen.get(name, ())
-        assert (each["count"], each["chosen"]) == expected
+        assert (each["count"], each["chosen"]) == (len(da.find(*alone.filters)), each["value"] in chosen.get(name, ()))
 
 
 @given(
@@ -165,8 +164,9 @@ def test_what_is_not_computed_yet_is_said(waiting: Scenarios, choices: Choices) 
 
 
 def test_what_cannot_be_computed_is_said(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
-    fails = Mock(side_effect=MemoryError("too little"))
-    monkeypatch.setattr("deepaccident_devkit.explore.scenarios.interactions_of", fails)
+    monkeypatch.setattr(
+        "deepaccident_devkit.explore.scenarios.interactions_of", Mock(side_effect=MemoryError("too little"))
+    )
     scenarios = computed(da)
     found = found_by(scenarios, Choices(query="min_ttc<2"), {})
     assert found.waiting == ("min_ttc<2: cannot be computed (MemoryError: too little)",)

@@ -123,6 +123,5 @@ def test_images_that_come_later_are_shown(da: DeepAccident, tmp_path: Path) -> N
     explorer, token = Explorer(reopened(da, tmp_path / "r", "Camera_*")), accident(da)
     before = explorer.thumbnail(token)
     assert explorer.thumbnail(token) == before
-    ignored = shutil.ignore_patterns(".deepaccident")
-    shutil.copytree(da.dataroot, tmp_path / "r", ignore=ignored, dirs_exist_ok=True)
+    shutil.copytree(da.dataroot, tmp_path / "r", ignore=shutil.ignore_patterns(".deepaccident"), dirs_exist_ok=True)
     assert explorer.thumbnail(token) == thumbnail(da, da.get("scenario", token)) != before

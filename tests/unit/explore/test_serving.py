@@ -71,8 +71,7 @@ def opened(
 
 def test_a_server_answers_when_its_address_is_known_and_not_afterwards() -> None:
     with serving(TinyApp(), port=0) as served, serving(TinyApp(), port=0) as other:
-        assert served.url == f"http://127.0.0.1:{served.port}/?token={served.token}"
-        assert len(served.token) >= 32
+        assert (served.url, len(served.token) >= 32) == (f"http://127.0.0.1:{served.port}/?token={served.token}", True)
         assert ask(served.port, "/page", cookie_of(served)).body == "/page /page"
         assert (other.token != served.token, other.port != served.port) == (True, True)
         assert ask(other.port, "/", cookie_of(served)).status == 401
@@ -99,8 +98,7 @@ def test_by_default_it_takes_the_first_free_port(monkeypatch: pytest.MonkeyPatch
         free.close()
         monkeypatch.setattr(module, "PORTS", (first, second))
         with serving(TinyApp()) as served, serving(TinyApp()) as other:
-            assert served.port == second
-            assert other.port not in (first, second)  # none is left
+            assert (served.port, other.port not in (first, second)) == (second, True)  # none is left
 
 
 def test_a_place_where_it_cannot_listen_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,8 +232,7 @@ def test_the_addresses_are_said(monkeypatch: pytest.MonkeyPatch, where: dict[str
 def test_a_browser_is_opened_with_a_token_for_one_use(monkeypatch: pytest.MonkeyPatch) -> None:
     [said, _], [address] = opened(monkeypatch)
     origin, _, token = said.split()[-1].partition("=")
-    assert address.partition("=")[0] == origin
-    assert token not in address
+    assert (address.partition("=")[0], token not in address) == (origin, True)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ def formats_of(kind: type[Format]) -> Iterator[type[Format]]:
 
 @pytest.mark.slow
 def test_every_format_is_measured_with_links_and_with_copies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=6, image_size=(64, 36)))
+    monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=6, image_size=(64, 36), designed=True))
     for name in ("SCENARIOS", "REPEATS"):
         monkeypatch.setattr(benchmark, name, 1)
     found = {figure.name: figure for figure in benchmark.measure()}

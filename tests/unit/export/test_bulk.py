@@ -133,14 +133,12 @@ def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
     assert {MANIFEST, "counts.json"} < files
     assert (done.written, done.kept, done.tally.samples, done.tally.files) == (3, 0, PICTURES, SCENARIOS * 5 + 1)
     told = json.loads((done.folder / MANIFEST).read_bytes())
-    assert told["written"] == asdict(done.tally)
-    assert told["written"]["left_out"] == {"clouds": PICTURES, "maps": 1}
+    assert (told["written"], told["written"]["left_out"]) == (asdict(done.tally), {"clouds": PICTURES, "maps": 1})
     assert told["written"]["bytes"] == sum(
         (done.folder / name).stat().st_size for name in files - {MANIFEST} if not name.endswith(".jpg")
     )
     hashes = scenario_hashes(small, [record["token"] for record in small.scenario])
-    states = told["release"]["scenarios"]
-    assert {len(state.pop("sensors")) for state in states.values()} == {32}
+    assert {len(state.pop("sensors")) for state in told["release"]["scenarios"].values()} == {32}
     assert told["release"] == {
         "fingerprint": fingerprint(hashes),
         "scenarios": {token: each.as_dict() for token, each in hashes.items()},
@@ -664,9 +662,11 @@ class TestLinks:
         output.link(source, "a.jpg")
         monkeypatch.setattr(Path, "symlink_to", refusing(errno.EPERM))
         output.link(source, "b.jpg")
-        assert output.tally.linked == Counter(symbolic=1, copy=1)
-        assert (tmp_path / "out" / "a.jpg").is_symlink()
-        assert not (tmp_path / "out" / "b.jpg").is_symlink()
+        assert (
+            output.tally.linked,
+            (tmp_path / "out" / "a.jpg").is_symlink(),
+            (tmp_path / "out" / "b.jpg").is_symlink(),
+        ) == (Counter(symbolic=1, copy=1), True, False)
 
     def test_a_copy_where_a_symbolic_link_would_tell_a_path(
         self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
@@ -675,9 +675,11 @@ class TestLinks:
         output.link(source, "a.jpg", symbolic=False)
         monkeypatch.setattr(os, "link", refusing(errno.EXDEV))
         output.link(source, "b.jpg", symbolic=False)
-        assert output.tally.linked == Counter(hard=1, copy=1)
-        assert not (tmp_path / "out" / "b.jpg").is_symlink()
-        assert (tmp_path / "out" / "b.jpg").read_bytes() == source.read_bytes()
+        assert (
+            output.tally.linked,
+            (tmp_path / "out" / "b.jpg").is_symlink(),
+            (tmp_path / "out" / "b.jpg").read_bytes(),
+        ) == (Counter(hard=1, copy=1), False, source.read_bytes())
 
     @pytest.mark.parametrize("link", ["hard", "symbolic"])
     def test_a_full_disk_is_no_reason_for_another_way(
@@ -716,8 +718,7 @@ class TestLinks:
 def test_several_calls_share_the_scenarios(small: DeepAccident, whole: Contents, tmp_path: Path) -> None:
     with ThreadPoolExecutor(3) as threads:
         done = list(threads.map(lambda _: written(small, tmp_path / "shared"), range(3)))
-    assert sum(each.written for each in done) == SCENARIOS
-    assert {each.tally.files for each in done} == {SCENARIOS * 5 + 1}
+    assert (sum(each.written for each in done), {each.tally.files for each in done}) == (SCENARIOS, {SCENARIOS * 5 + 1})
     assert contents(tmp_path / "shared") == whole
 
 

@@ -58,10 +58,9 @@ def nuscenes(out: Path, token: str) -> Found:
     tables, found = tables_of(out / "v1.0-deepaccident"), {}
     for row in tables["sample_data"].values():
         key = tables["sample"][row["sample_token"]]
-        name = row["filename"].split("/")[1].removeprefix("CAM_").title()
         if key["deepaccident_token"] == token and row["is_key_frame"]:
             k = tables["calibrated_sensor"][row["calibrated_sensor_token"]]["camera_intrinsic"]
-            found[name] = k, (row["width"], row["height"])
+            found[row["filename"].split("/")[1].removeprefix("CAM_").title()] = k, (row["width"], row["height"])
     return found
 
 

@@ -14,5 +14,4 @@ def test_keyframes_lead_to_the_last_frame(last: int, number: int) -> None:
     assert 1 <= keys[0] <= KEY_STEP
     assert set(np.diff(keys)) <= {KEY_STEP}
     if number <= last:
-        after = keyframe_after(number, last)
-        assert after == min(key for key in keys if key >= number)
+        assert keyframe_after(number, last) == min(key for key in keys if key >= number)

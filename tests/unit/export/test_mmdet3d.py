@@ -112,8 +112,7 @@ def test_labels_are_nuscenes_own(da: DeepAccident, exported: Exported, tmp_path:
 
 def test_velocities_are_of_the_positions(da: DeepAccident, exported: Exported) -> None:
     info = infos(exported.folder)[1]
-    sample = "{scenario}/{agent}/{frame:03d}".format(**info["deepaccident"])
-    boxes = da.boxes(sample, "lidar", velocity="derived")
+    boxes = da.boxes("{scenario}/{agent}/{frame:03d}".format(**info["deepaccident"]), "lidar", velocity="derived")
     others = boxes.select(boxes.actor_id != OWN_ACTOR_ID)
     assert_allclose([each["velocity"] for each in info["instances"]], others.velocity[:, :2])
     assert np.isfinite(others.velocity).all(axis=1).sum() > 3
@@ -161,8 +160,7 @@ def test_without_labels_there_are_no_instances_and_without_a_split_another_file(
     for name in ("train.txt", "val.txt", "test.txt", "train_mini.txt", "val_mini.txt"):
         (own_release / name).unlink()
     (own_release / "train_kept" / "type1_subtype1_accident").rename(own_release / "type1_subtype1_accident")
-    dataset = DeepAccident("v1", own_release, verbose=False)
-    made = exported_to(dataset, tmp_path / "out", agents=("ego_vehicle",))
+    made = exported_to(DeepAccident("v1", own_release, verbose=False), tmp_path / "out", agents=("ego_vehicle",))
     names = {path.name for path in made.folder.glob("*.pkl")}
     assert names == {f"deepaccident_infos_{split}.pkl" for split in ("test", "unknown", "val")}
     assert [info["instances"] for info in infos(made.folder, "test")] == [[]] * 2

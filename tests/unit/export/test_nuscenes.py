@@ -122,8 +122,7 @@ def test_the_reader_sees_a_wrong_convention(exported: Exported, tables: Tables, 
 def test_boxes_are_where_ours_are_in_every_sensor(da: DeepAccident, tables: Tables) -> None:
     ours = {name: channel for channel, name in CHANNEL_NAMES.items()}
     for data in rows(tables, "sample_data", is_key_frame=True)[::13]:
-        sample = tables["sample"][data["sample_token"]]["deepaccident_token"]
-        boxes = da.boxes(sample, ours[channel_of(tables, data)])
+        boxes = da.boxes(tables["sample"][data["sample_token"]]["deepaccident_token"], ours[channel_of(tables, data)])
         boxes = boxes[boxes.actor_id != OWN_ACTOR_ID]
         _, centers, turned = zip(*boxes_in(tables, data), strict=True)
         assert np.allclose(centers, boxes.center, atol=1e-6)
@@ -137,8 +136,7 @@ def test_files_are_those_of_the_release(da: DeepAccident, exported: Exported, ta
         scenario, agent = scene.rsplit("-", 1)
         sample, channel = f"{scenario.replace('-', '/', 1)}/{agent}/{number:03d}", channel_of(tables, data)
         path = exported.folder / data["filename"]
-        assert path.parent.name == channel
-        assert path.parents[1].name == ("samples" if number in KEYS else "sweeps")
+        assert (path.parent.name, path.parents[1].name) == (channel, "samples" if number in KEYS else "sweeps")
         seen.add(path)
         if channel != "LIDAR_TOP":
             ours = next(each for each, name in CHANNEL_NAMES.items() if name == channel)
@@ -162,7 +160,6 @@ def test_sweeps_belong_to_the_keyframe_after_them(tables: Tables) -> None:
 
 
 def test_scenes_and_splits(da: DeepAccident, exported: Exported, tables: Tables) -> None:
-    splits = json.loads((exported.folder / VERSION / "splits.json").read_text())
     expected = {
         f"deepaccident_{split}": [
             f"{record['token'].replace('/', '-')}-{agent}"
@@ -172,7 +169,7 @@ def test_scenes_and_splits(da: DeepAccident, exported: Exported, tables: Tables)
         ]
         for split in ("train", "val", "test")
     }
-    assert splits == expected
+    assert json.loads((exported.folder / VERSION / "splits.json").read_text()) == expected
     assert sorted(row["name"] for row in tables["scene"].values()) == sorted(chain(*expected.values()))
     for row in tables["map"].values():
         assert (exported.folder / row["filename"]).read_bytes().startswith(b"\x89PNG")
@@ -212,8 +209,9 @@ def test_attributes_say_who_moves(da: DeepAccident, tables: Tables) -> None:
         if row["actor_id"] >= 20000:
             assert word == "vehicle.parked"
         elif row["prev"] and row["category_deepaccident"] == "car":
-            before = tables["sample_annotation"][row["prev"]]["translation"]
-            way = np.hypot(*np.subtract(row["translation"], before)[:2])
+            way = np.hypot(
+                *np.subtract(row["translation"], tables["sample_annotation"][row["prev"]]["translation"])[:2]
+            )
             assert way < 0.5 if word == "vehicle.stopped" else way > 0.02
     assert seen >= {"vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "pedestrian.moving"}
 
@@ -224,16 +222,14 @@ def test_an_id_that_stands_twice_in_a_label_is_two_instances(own_release: Path, 
     tracked = next(line for line in lines[1:] if int(line.split()[10]) > 0)
     label.write_text("\n".join([*lines, tracked, ""]))
     _, tables = one(DeepAccident("v1", own_release, verbose=False))
-    actor = int(tracked.split()[10])
-    assert [row["nbr_annotations"] for row in rows(tables, "instance", actor_id=actor)] == [1, 1]
+    assert [row["nbr_annotations"] for row in rows(tables, "instance", actor_id=int(tracked.split()[10]))] == [1, 1]
     assert list(faults_of(tables)) == []
 
 
 def test_without_sweeps(one: Any) -> None:
     made, tables = one(sweeps=False)
     assert (len(tables["sample_data"]), (made.folder / "sweeps").exists()) == (len(KEYS) * len(CHANNEL_NAMES), False)
-    assert made.tally.left_out["frames between keyframes"] == FRAMES - len(KEYS)
-    assert list(faults_of(tables)) == []
+    assert (made.tally.left_out["frames between keyframes"], list(faults_of(tables))) == (FRAMES - len(KEYS), [])
 
 
 def test_axes_of_nuscenes(da: DeepAccident, one: Any) -> None:
@@ -241,8 +237,7 @@ def test_axes_of_nuscenes(da: DeepAccident, one: Any) -> None:
     made, tables = one(lidar_axes="nuscenes", where=())
     assert disagreement(made.folder, tables) == 0
     data = rows(tables, "sample_data", is_key_frame=True, fileformat="pcd")[0]
-    sample = tables["sample"][data["sample_token"]]["deepaccident_token"]
-    x, y, z = da.load_point_cloud(sample, "lidar").xyz.T
+    x, y, z = da.load_point_cloud(tables["sample"][data["sample_token"]]["deepaccident_token"], "lidar").xyz.T
     assert np.allclose(points_of(made.folder / data["filename"])[:, :3], np.column_stack([-y, x, z]), atol=1e-4)
 
 
@@ -286,8 +281,7 @@ def test_without_labels_there_are_sensors_and_poses(unlabelled: DeepAccident, on
 
 def test_scenes_without_a_split_have_a_list_of_their_own(own_release: Path, one: Any) -> None:
     (own_release / "train").rename(own_release / "moved")
-    flat = own_release / "moved"
-    made, tables = one(DeepAccident("v1", flat, verbose=False), where=())
+    made, tables = one(DeepAccident("v1", own_release / "moved", verbose=False), where=())
     splits = json.loads((made.folder / VERSION / "splits.json").read_text())
     assert splits.pop("deepaccident_unknown") == [row["name"] for row in tables["scene"].values()]
     assert not any(splits.values())

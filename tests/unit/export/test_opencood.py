@@ -92,12 +92,9 @@ def test_agents_share_a_world(scenario: Path) -> None:
 
 def test_every_moment_has_all_files_and_the_pole_is_the_last(scenario: Path) -> None:
     assert agents_of(scenario) == list(PLACES)
-    stems = [f"{number:06d}" for number in range(1, 7)]
     ends = (".yaml", ".json", ".pcd", *(f"_camera{number}.png" for number in range(6)))
-    for place in PLACES:
-        assert {path.name for path in (scenario / place).iterdir()} == {
-            f"{stem}{end}" for stem in stems for end in ends
-        }
+    names = {f"{moment:06d}{end}" for moment in range(1, 7) for end in ends}
+    assert [{path.name for path in (scenario / place).iterdir()} for place in PLACES] == [names] * len(PLACES)
 
 
 def test_json_says_the_same_with_ids_as_words(scenario: Path) -> None:
@@ -117,8 +114,7 @@ def test_cameras_are_where_their_extrinsics_say(da: DeepAccident, scenario: Path
 
 
 def test_images_are_links_to_those_of_the_release(da: DeepAccident, scenario: Path, exported: Exported) -> None:
-    token = scenario.name.replace("__", "/", 1)
-    source = da.get_sample_data_path(f"{token}/ego_vehicle/002/Camera_BackRight")
+    source = da.get_sample_data_path(f"{scenario.name.replace('__', '/', 1)}/ego_vehicle/002/Camera_BackRight")
     assert (scenario / "1" / "000002_camera1.png").samefile(source)
     assert exported.tally.linked == {"hard": len(list(exported.folder.rglob("*.png")))}
 

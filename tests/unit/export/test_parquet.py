@@ -24,8 +24,9 @@ RECORDED = ("agent", "sample", "sample_data", "calibrated_sensor", "ego_pose", "
 
 def rows_of(folder: Path, table: str, split: str = "*") -> list[dict[str, Any]]:
     """The rows of a table, in the order of its files."""
-    paths = sorted((folder / table).glob(f"{split}-*.parquet"))
-    return [row for path in paths for row in pq.read_table(path).to_pylist()]
+    return [
+        row for path in sorted((folder / table).glob(f"{split}-*.parquet")) for row in pq.read_table(path).to_pylist()
+    ]
 
 
 def told(dataset: DeepAccident, table: str) -> dict[str, list[str]]:
@@ -48,8 +49,8 @@ def assert_all_rows(dataset: DeepAccident, folder: Path) -> None:
         if table in ("sensor", "category"):
             assert rows_of(folder, table) == [dict(record) for record in getattr(dataset, table)]
             continue
-        for split, rows in told(dataset, table).items():
-            assert list(map(repr, rows_of(folder, table, split))) == rows
+        expected = told(dataset, table)
+        assert {split: list(map(repr, rows_of(folder, table, split))) for split in expected} == expected
 
 
 @pytest.mark.parametrize("shard_scenarios", [1, 2, 32])
@@ -79,8 +80,7 @@ def test_columns_are_plain(da: DeepAccident, tmp_path: Path) -> None:
             assert not pa.types.is_dictionary(field.type), (table, field)
             assert not field.name.endswith("_row"), (table, field)
     schema = pq.read_schema(next((folder / "ego_pose").iterdir()))
-    assert schema.field("translation").type.list_size == 3
-    assert schema.field("matrix").type.value_type.list_size == 4
+    assert (schema.field("translation").type.list_size, schema.field("matrix").type.value_type.list_size) == (3, 4)
     scenario = pq.read_schema(next((folder / "scenario").iterdir()))
     assert pa.types.is_list(scenario.field("collision").type.field("ids").type)  # can be null: of no fixed size
 
@@ -109,8 +109,7 @@ def test_a_table_without_rows_has_no_file(unlabelled: DeepAccident, tmp_path: Pa
     assert_all_rows(unlabelled, folder)
     _, head, body = (folder / "README.md").read_text().split("---\n", maxsplit=2)
     named = {config["config_name"] for config in yaml.safe_load(head)["configs"]}
-    assert named == set(table_names()) - {"annotation", "instance", "track"}
-    assert "Here: no rows." in body
+    assert (named, "Here: no rows." in body) == (set(table_names()) - {"annotation", "instance", "track"}, True)
 
 
 def test_scenarios_without_a_split_are_called_unknown(da: DeepAccident, tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def mapped(bev_release: DeepAccident, town: str) -> TownMap:
 @pytest.fixture(scope="session")
 def world(bev_release: DeepAccident) -> World:
     """The generator's world of that town."""
-    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), seed=3, unplanned=0, exact=True)
+    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), seed=3, unplanned=0, exact=True, designed=True)
     plan = plan_scenarios(config)[0]
     assert plan.token == bev_release.scenario[0]["token"]
     return build_scenario(config, plan).world

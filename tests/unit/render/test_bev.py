@@ -116,7 +116,11 @@ def test_the_receiver_s_own_box_is_where_it_is_and_the_title_says_what_the_link_
 
 
 def test_the_pair_is_named_and_a_pedestrian_that_is_hit_is_found(tmp_path: Path) -> None:
-    make_release(tmp_path / "r", SynthConfig(scenarios=1, frames=3, unplanned=1.0, seed=0, sensors=False), workers=1)
+    make_release(
+        tmp_path / "r",
+        SynthConfig(scenarios=1, frames=3, unplanned=1.0, seed=0, sensors=False, designed=True),
+        workers=1,
+    )
     da = DeepAccident("v1", tmp_path / "r", verbose=False)
     sample = next(one for one in da.sample if one["agent"] == "ego_vehicle" and one["time_to_impact"] == 0)
     ax, boxes = render_bev(da, sample, view_range=100, ax=new_axes()), da.boxes(sample, "ego")

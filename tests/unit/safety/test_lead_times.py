@@ -41,9 +41,9 @@ def without(root: Path, agent: str) -> DeepAccident:
 
 @pytest.mark.parametrize("kind", ["annotated", "points", "released"])
 def test_each_set_of_agents_by_a_plain_search(da_motion: DeepAccident, kind: str) -> None:
-    scenario = da_motion.find(collision=True)[0]
+    scenario, normal = (da_motion.find(collision=ends)[0] for ends in (True, False))
     times = lead_times(da_motion, scenario, ObservationRule(kind=kind))
-    assert times.ego_collides
+    assert (times.ego_collides, lead_times(da_motion, normal)) == (True, None)
     _, observed = observed_actors(da_motion, scenario, times.actor_ids, times.rule)
     for number, members in enumerate(COALITIONS):
         both = observed[[AGENTS.index(name) for name in members]].any(axis=0).all(axis=0)
@@ -65,6 +65,7 @@ def test_gains_and_losses_are_differences_of_sets() -> None:
         colliding_agents=(None, "other_vehicle"),
         missing=(),
         num_frames=80,
+        touching=None,
         first_frames=80 - np.round(leads * 10).astype(int),
         leads=leads,
         shapley=np.ones(4),
@@ -76,10 +77,6 @@ def test_gains_and_losses_are_differences_of_sets() -> None:
     assert seen == [True, False, False]
     less = replace(times, missing=("infrastructure",))
     assert (less.together, less.losses.tolist()[:3]) == (4.5, [0.5, 1.5, 2.25])
-
-
-def test_a_scenario_without_a_collision_has_no_lead_times(da_motion: DeepAccident) -> None:
-    assert lead_times(da_motion, da_motion.find(collision=False)[0]) is None
 
 
 def test_missing_agents_leave_the_sets_that_are_there(da: DeepAccident, da_partial: DeepAccident) -> None:

@@ -86,14 +86,14 @@ def test_the_pole_has_a_distance_of_its_own() -> None:
 
 
 def test_who_observes_itself(da_motion: DeepAccident, accident: Mapping[str, Any]) -> None:
-    rule = ObservationRule(kind="points", least_points=10**9)
-    _, observed = observed_actors(da_motion, accident, [own_id(da_motion, accident, "ego_vehicle")], rule)
+    rule, ego = ObservationRule(kind="points", least_points=10**9), own_id(da_motion, accident, "ego_vehicle")
+    _, observed = observed_actors(da_motion, accident, [ego], rule)
     assert observed.all(axis=(1, 2)).tolist() == observed.any(axis=(1, 2)).tolist() == [True, *[False] * 4]
 
 
 def test_rules_say_what_they_are() -> None:
-    assert ObservationRule(kind="Points").text == "at least 5 LiDAR points"  # type: ignore[arg-type]
-    assert ObservationRule(kind="annotated").text == "annotated"
+    texts: Any = {"Points": "at least 5 LiDAR points", "annotated": "annotated"}
+    assert {kind: ObservationRule(kind=kind).text for kind in texts} == texts
 
 
 def test_what_does_not_fit_is_refused() -> None:
@@ -116,16 +116,14 @@ def plain_lead(observed: np.ndarray, agents: list[int]) -> float:
 
 @given(observations)
 def test_leads_are_those_of_a_plain_search(observed: np.ndarray) -> None:
-    for lead, members in zip(coalition_leads(observed), coalition_members(4), strict=True):
-        assert lead == pytest.approx(plain_lead(observed, [0, *(np.flatnonzero(members) + 1)]), abs=1e-12)
+    plain = [plain_lead(observed, [0, *(np.flatnonzero(members) + 1)]) for members in coalition_members(4)]
+    assert coalition_leads(observed) == pytest.approx(plain, abs=1e-12)
 
 
 @given(observations)
 def test_more_agents_never_see_later(observed: np.ndarray) -> None:
     leads = coalition_leads(observed)
-    for fewer, more in itertools.product(range(16), repeat=2):
-        if fewer & more == fewer:
-            assert leads[more] >= leads[fewer]
+    assert all(leads[fewer | more] >= leads[fewer] for fewer, more in itertools.product(range(16), repeat=2))
 
 
 @given(observations)
@@ -136,10 +134,8 @@ def test_shapley_values_share_the_whole_gain_and_are_means_over_orders(observed:
     assert (values >= -1e-12).all()
     gains = np.zeros((24, 4))
     for row, order in enumerate(itertools.permutations(range(4))):
-        joined = 0
-        for partner in order:
-            gains[row, partner] = leads[joined | 1 << partner] - leads[joined]
-            joined |= 1 << partner
+        joined = np.cumsum([0, *(1 << partner for partner in order)])
+        gains[row, order] = np.diff(leads[joined])
     np.testing.assert_allclose(values, gains.mean(axis=0), atol=1e-9)
 
 

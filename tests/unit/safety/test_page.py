@@ -60,8 +60,7 @@ def renamed(report: SafetyReport, name: str, **facts: object) -> SafetyReport:
 
 def addresses(page: Page, *, inside: bool = False) -> list[str]:
     """Those of links to other files, or to places in the page."""
-    links = [str(each["href"]) for each in page.all("a")]
-    return [each for each in links if each.startswith("#") == inside]
+    return [each for link in page.all("a") if (each := str(link["href"])).startswith("#") == inside]
 
 
 def test_a_row_has_the_numbers(report: SafetyReport, folder: Path) -> None:
@@ -80,8 +79,8 @@ def test_a_row_has_the_numbers(report: SafetyReport, folder: Path) -> None:
 
 def test_the_whole_page(report: SafetyReport, folder: Path) -> None:
     page = page_of(folder / "report.html")
-    pictures = [str(each["src"])[:22] for each in page.all("img")]
-    assert pictures == ["data:image/png;base64,"] * 2  # one group of accidents, and lead times
+    # one group of accidents, and lead times
+    assert [str(each["src"])[:22] for each in page.all("img")] == ["data:image/png;base64,"] * 2
     assert {f"#{each['id']}" for each in page.all("section")} == set(addresses(page, inside=True))
     (replay,) = addresses(page)
     assert (folder / unquote(replay)).is_file()
@@ -138,8 +137,7 @@ def test_a_replay_page_that_cannot_be_made_is_named(
     fails = Mock(side_effect=SensorFileError("front.jpg: cannot be read"))
     monkeypatch.setattr(replay_page, "render_replay", fails)
     page = page_of(save_safety_report(report, tmp_path, dataset=da_motion, workers=1)[-1])
-    assert "replay pagesfront.jpg: cannot be read" in page.text
-    assert addresses(page) == []
+    assert ("replay pagesfront.jpg: cannot be read" in page.text, addresses(page)) == (True, [])
 
 
 @pytest.mark.usefixtures("_without_figures")
@@ -156,8 +154,7 @@ def test_a_damaged_release(own_release: Path, tmp_path: Path) -> None:
 def test_a_release_without_accidents(da_motion: DeepAccident, tmp_path: Path) -> None:
     report = safety_report(da_motion, da_motion.find(collision=False), workers=1)
     page = page_of(save_safety_report(report, tmp_path, dataset=da_motion, workers=1)[-1])
-    assert "No accident can be replayed." in page.text
-    assert page.all("img") == []
+    assert ("No accident can be replayed." in page.text, page.all("img")) == (True, [])
 
 
 @pytest.mark.usefixtures("_without_figures")
@@ -181,9 +178,6 @@ def test_nothing_is_written_through_a_link(
     for folder in (outside, out):
         folder.mkdir()
     (out / name).symlink_to(outside)
-
-    def save() -> None:
-        save_safety_report(report, out, dataset=da_motion, workers=1)
-
-    assert_refused((save, OutputFolderError, (f"{name}: a symbolic link", "remove it")))
+    told = f"{name}: a symbolic link", "remove it"
+    assert_refused((lambda: save_safety_report(report, out, dataset=da_motion, workers=1), OutputFolderError, told))
     assert not list(outside.iterdir())

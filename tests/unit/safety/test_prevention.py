@@ -124,8 +124,8 @@ def alarm_from(frame: int, score: float = 0.9) -> Scores:
 
 
 def test_ends_that_are_known() -> None:
-    """At 1 s and 6 m/s² 3 s before the impact is enough, 2 s mitigates, 1.5 s does nothing; the fourth is missed."""
-    accidents = [alarm_from(31), alarm_from(41), alarm_from(46), [None] * 13]
+    """At 1 s and 6 m/s² 3 s before the impact is enough, 2 s mitigates, 1.5 s does nothing; an alarm at it is none."""
+    accidents = [alarm_from(31), alarm_from(41), alarm_from(46), alarm_from(IMPACT)]
     result = evaluated(accidents, [[]], threshold=0.5).compute()
     figures = result.groups[GROUP].right[0.0][NOMINAL]
     assert figures.counts == {"avoided": 1, "stopped": 0, "mitigated": 1, "unchanged": 2, "worsened": 0}
@@ -168,11 +168,10 @@ def test_a_siren_prevents_and_costs_the_most_and_silence_nothing(seed: int) -> N
 @given(st.integers(0, 10_000))
 def test_a_higher_threshold_never_prevents_or_costs_more(seed: int) -> None:
     curve = evaluated(random_scores(seed), random_scores(seed + 1)).compute().curves[GROUP]
-    assert curve.threshold[0] == math.inf
+    assert (curve.threshold[0], curve.braking_seconds_per_minute[0].max()) == (math.inf, 0)
     assert (np.diff(curve.threshold) < 0).all()
-    for grows in (curve.avoided, curve.avoided + curve.mitigated, curve.braking_seconds_per_minute):
-        assert (np.diff(grows, axis=0) >= 0).all()
-    assert (curve.braking_seconds_per_minute[0] == 0).all()
+    growing = [curve.avoided, curve.avoided + curve.mitigated, curve.braking_seconds_per_minute]
+    assert (np.diff(growing, axis=1) >= 0).all()
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -195,8 +194,7 @@ def test_without_a_threshold_it_is_the_lowest_within_the_budget(seed: int) -> No
     figures, curve = result.groups[GROUP], result.curves[GROUP]
     cost = curve.braking_seconds_per_minute[:, SETTINGS.index(NOMINAL)]
     assert figures.threshold == figures.quiet_braking == curve.threshold[cost <= 1.0].min()
-    assert result.operating_by == "budget"
-    assert any("on these very recordings" in note for note in result.notes)
+    assert (result.operating_by, any("on these very recordings" in note for note in result.notes)) == ("budget", True)
 
 
 def test_a_budget_that_any_alarm_exceeds_leaves_none() -> None:
@@ -267,8 +265,7 @@ def test_accidents_without_a_table_are_left_out_and_named() -> None:
     )
     result = evaluated([alarm_from(1)] * 3, [[None] * 13], outcomes, threshold=0.5).compute()
     assert result.groups[GROUP].accidents == 1
-    told = (f"the self-check drops {kind}/s0: 2 m apart", f"not judged {kind}/s2: no labels")
-    assert not lacking(result.notes, *told)
+    assert not lacking(result.notes, f"the self-check drops {kind}/s0: 2 m apart", f"not judged {kind}/s2: no labels")
     assert result.as_dict()["dropped"] == [{"scenario": f"{kind}/s0", "reason": "2 m apart"}]
 
 
@@ -295,11 +292,6 @@ def test_nothing_to_count_is_no_number() -> None:
     assert np.isnan([result.groups[GROUP].threshold, result.avoided(GROUP)]).all()
     nothing = evaluated([], []).compute()
     assert (nothing.groups, nothing.notes) == ({}, ())
-
-
-def test_no_alarm_at_the_impact_or_after_it_warns() -> None:
-    result = evaluated([[None] * 12 + [0.9]], [[None] * 13], threshold=0.5).compute()
-    assert result.groups[GROUP].right[0.0][NOMINAL].warned == 0
 
 
 def test_what_does_not_fit_is_refused(da_motion: DeepAccident) -> None:
@@ -373,11 +365,9 @@ def test_tables_are_what_braking_makes_of_the_accident(da_motion: DeepAccident, 
     own = outcomes_of(accident, own_brakes(accident), times)
     both = [outcomes_of(accident, (True, True), times, latency=latency).outcome for latency in pole.latencies]
     assert (ego.latencies, pole.latencies) == ((0.0,), (0.0, 0.1, 0.3))
-    np.testing.assert_array_equal(ego.outcome, [own.outcome])
-    np.testing.assert_array_equal(ego.extrapolated, [own.extrapolated])
+    np.testing.assert_array_equal([ego.outcome, ego.extrapolated], [[own.outcome], [own.extrapolated]])
     assert ego.outcome[0, -1].tolist() == [OUTCOMES.index("unchanged")] * len(BRAKINGS)
-    for each in (pole, behind):
-        np.testing.assert_array_equal(each.outcome, both)
+    np.testing.assert_array_equal([pole.outcome, behind.outcome], [both, both])
 
 
 def test_the_first_alarm_above_the_threshold_decides(da_motion: DeepAccident, crash: str) -> None:
@@ -408,10 +398,12 @@ def test_the_tables_say_what_the_result_does(da_motion: DeepAccident, crash: str
     group = result.groups["ego_involved"]
     cells = [*group.right[0.0][NOMINAL].shares.values(), group.lasting[0.0][NOMINAL].shares["avoided"]]
     assert [float(each) for each in tables[0].rows[1][1:7]] == pytest.approx(cells, abs=5e-4)
-    text = PREVENTED.text(told)
-    assert re.search(r"of 1 accidents \(\d\.\d{3} by alarms that outlast the reaction\), for ", text)
-    assert "at most 1 braking s/min on these recordings" in text
-    assert text.endswith("--threshold-from BUNDLE --threshold-by braking")
+    assert re.search(
+        r"of 1 accidents \(\d\.\d{3} by alarms that outlast the reaction\), for .*"
+        r"at most 1 braking s/min on these recordings.*--threshold-from BUNDLE --threshold-by braking\Z",
+        PREVENTED.text(told),
+        re.DOTALL,
+    )
 
 
 def test_intervals_leave_out_an_accident_and_its_twin(da_motion: DeepAccident) -> None:
@@ -444,13 +436,13 @@ def test_scenarios_that_cannot_be_judged_are_named(own_release: Path) -> None:
     made = accident_outcomes(DeepAccident(dataroot=own_release, verbose=False), asked, workers=1)
     reasons = {each.scenario: each.reason for each in made.skipped}
     assert (made.tables, made.dropped) == ({}, ())
-    for token, told in {
+    expected = {
         seen_once: "together at 1 frames; a motion needs 2",
         unlabelled: "has no labels",
         bare: "has no meta file",
         normal: "its meta file names no collision",
-    }.items():
-        assert told in reasons[token]
+    }
+    assert [token for token, told in expected.items() if told not in reasons[token]] == []
 
 
 def test_boxes_too_far_apart_are_dropped(da_motion: DeepAccident, crash: str, monkeypatch: pytest.MonkeyPatch) -> None:

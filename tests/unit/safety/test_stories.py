@@ -35,7 +35,9 @@ ACCIDENT: dict[str, Any] = {
     "accident": {
         "pair": PAIR,
         "time": 7.0,
-        "gap": 0.1,
+        "gap": 0.14,
+        "touching": None,
+        "apart": False,
         "closing_speed": 9.5,
         "impact_angle": 90,
         "seen": {"ego_vehicle": 1.4, "infrastructure": 3.7},
@@ -73,6 +75,7 @@ CLAUSES = {
     ("accident", "pair", 1, "speed"): "8.4 m/s",
     ("accident", "pair", 1, "delta_v"): "0.6",
     ("accident", "closing_speed"): "closing at 9.5 m/s",
+    ("accident", "gap"): "outlines 0.14 m apart at the last frame",
     ("accident", "seen", "ego_vehicle"): "the ego alone 1.4 s",
     ("accident", "seen", "infrastructure"): "infrastructure saw both 3.7 s before",
     ("accident", "braking"): "Braking",
@@ -94,8 +97,8 @@ UNTOLD = {
     *(("accident", "pair", which, "actor_id") for which in range(2)),
     *(("nearest", "pair", which, "actor_id") for which in range(2)),
     ("accident", "time"),
-    ("accident", "gap"),
     ("accident", "impact_angle"),
+    ("accident", "apart"),
     ("scenario",),
     *((name,) for name in ("collision", "duration")),  # of an accident
     ("nearest", "pair", 0, "category"),  # of an agent
@@ -137,8 +140,7 @@ def test_a_clause_goes_with_its_value(facts: dict[str, Any], path: tuple[Any, ..
 
 @pytest.mark.parametrize("facts", [ACCIDENT, NORMAL])
 def test_each_fact_is_told_or_named_as_untold(facts: dict[str, Any]) -> None:
-    untold = {path for path in leaves(facts) if story_text(without(facts, path)) == story_text(facts)}
-    assert untold <= UNTOLD
+    assert {path for path in leaves(facts) if story_text(without(facts, path)) == story_text(facts)} <= UNTOLD
 
 
 def test_ends_in_words() -> None:
@@ -156,8 +158,29 @@ def test_ends_in_words() -> None:
     ):
         accident["seen"] = {"ego_vehicle": ego, "infrastructure": pole}
         assert said in story_text(facts)
+    accident["touching"] = 0.2
+    assert "outlines touching from 0.2 s before the last frame (within 0.1 s)" in story_text(facts)
+    first["side"] = "left"
+    assert "collides with a truck, turning left at 8.4 m/s, left side to rear side, closing" in story_text(facts)
     accident["braking"] |= {"avoidable": False, "slack": None, "by": ["ego_vehicle", None]}
     assert "by the ego and the other road user would not have avoided it" in story_text(facts)
+
+
+def test_a_pair_that_is_apart_is_not_told_as_hit() -> None:
+    accident = ACCIDENT["accident"] | {"apart": True, "gap": 1.3}
+    text, bounced = (story_text(ACCIDENT | {"accident": accident | {"touching": touching}}) for touching in (None, 0.4))
+    assert not lacking(
+        text,
+        "meta lets the ego, a car going straight at 12.1 m/s, collide with a truck, turning left at 8.4",
+        "but they are 1.3 m apart at the end. The infra",
+    )
+    assert holding(text, "is hit", "Braking", "delta-v") == []
+    assert "apart at the end, outlines touching from 0.4 s before the last frame" in bounced
+
+
+def test_an_overlap_that_meta_does_not_name_is_told() -> None:
+    text = story_text(NORMAL | {"nearest": NORMAL["nearest"] | {"min_gap": 0.0, "min_ttc": 0.0}})
+    assert "meta names no collision in 7.0 s. The outlines of the other vehicle and a cyclist overlap." in text
 
 
 def test_stories_of_a_release(da_motion: DeepAccident) -> None:
@@ -170,8 +193,7 @@ def test_stories_of_a_release(da_motion: DeepAccident) -> None:
     assert f"{pair[0]['speed']:.1f} m/s" in str(story)
     assert json.loads(story.to_json())["text"] == story.text
     assert "nobody collides in 3.4 s" in da_motion.describe(normal).text
-    told = [da_motion.describe(each).text for each in da_motion.scenario]
-    assert [each.text for each in stories(da_motion, workers=1)] == told
+    assert list(stories(da_motion, workers=1)) == [da_motion.describe(each) for each in da_motion.scenario]
     assert_refused((lambda: da_motion.describe("type1/nowhere"), TokenError, ("no scenario", "type1/nowhere")))
 
 

@@ -21,9 +21,8 @@ def recording(
 ) -> Recording:
     """Actors that drive to the right, each a little faster than the one before it."""
     count = len(starts)
-    time = np.arange(frames) / 10
     poses = np.zeros((count, frames, 3))
-    poses[..., 0] = np.array(starts)[:, :1] + (8 + np.arange(count))[:, None] * time
+    poses[..., 0] = np.array(starts)[:, :1] + (8 + np.arange(count))[:, None] * np.arange(frames) / 10
     poses[..., 1] = np.array(starts)[:, 1:]
     return Recording(
         scenario="type1_subtype1_accident/x",

@@ -36,8 +36,7 @@ def test_a_scenario_may_have_no_twin(own_release: Path) -> None:
     for folder in own_release.glob("*/type1_subtype1_normal"):
         shutil.rmtree(folder)
     da = reopened(own_release)
-    alone = da.find(signalized=True)
-    assert {twin_of(da, scenario) is None for scenario in alone} == {True}
+    assert {twin_of(da, scenario) is None for scenario in da.find(signalized=True)} == {True}
 
 
 def test_torn_twins_are_those_of_two_splits(da_b: DeepAccident) -> None:
@@ -109,8 +108,7 @@ def test_when_who_and_how_far() -> None:
         {"parting_frame": None, "largest_distance": 0},
         {"twin_id": None, "largest_distance": None, "collides": False},
     )
-    for actor, values in zip(told["actors"], expected, strict=True):
-        assert {name: actor[name] for name in values} == values
+    assert all(actor.items() >= values.items() for actor, values in zip(told["actors"], expected, strict=True))
 
 
 def test_twins_that_do_not_begin_together_are_told() -> None:
@@ -119,7 +117,7 @@ def test_twins_that_do_not_begin_together_are_told() -> None:
     poses[1, 0, :, 0] += 0.8
     apart = replace(diff, poses=poses)
     assert (diff.begins_together, apart.begins_together, apart.to_dict()["begins_together"]) == (True, False, False)
-    report = TwinReport(dataroot="", version="v1", diffs=(diff, apart), skipped=(), torn=())
+    report = TwinReport(dataroot="", version="v1", fingerprint="", diffs=(diff, apart), skipped=(), torn=())
     assert "1 of them: the recordings do not begin together" in report.to_text()
     poses[1, 0] = np.nan
     assert replace(diff, poses=poses).begins_together, "no agent is there to tell"
@@ -140,9 +138,8 @@ def test_turns_count_the_shorter_way_and_keep_their_sign() -> None:
 def test_the_pairs_least_gap_in_the_twin() -> None:
     diff = made_diff()
     assert diff.gaps[0].tolist() == pytest.approx([7, 5.5, 4, 2.5, 1, math.nan], nan_ok=True)
-    assert diff.nearest_in_twin == pytest.approx((6, 1.5))
-    assert made_diff(shift=2).nearest_in_twin == pytest.approx((8, 1.5))
-    assert made_diff(pair=(0, 2)).nearest_in_twin is None
+    nearest = [each.nearest_in_twin for each in (diff, made_diff(shift=2), made_diff(pair=(0, 2)))]
+    assert nearest == [pytest.approx((6, 1.5)), pytest.approx((8, 1.5)), None]
     assert made_diff().to_dict()["gap_at_impact"] == pytest.approx(1)
 
 

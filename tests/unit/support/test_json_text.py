@@ -26,8 +26,7 @@ def test_brackets_in_texts_are_no_levels(text: str) -> None:
 @pytest.mark.parametrize("far", [0, 3 << 20])
 def test_levels_are_counted(far: int) -> None:
     """Also across the blocks that are looked at one after another."""
-    blanks = b" " * far
-    deepest = b"[" + blanks + b"[" * (MOST_LEVELS - 1) + b"]" * MOST_LEVELS
+    deepest = b"[" + b" " * far + b"[" * (MOST_LEVELS - 1) + b"]" * MOST_LEVELS
     assert parsed_json(deepest)
     assert_refused(
         (lambda: parsed_json(b"[" + deepest + b"]"), ValueError, "nested more than"),

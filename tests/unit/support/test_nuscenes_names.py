@@ -49,9 +49,8 @@ def test_none_of_the_names_is_here(kind: type, names: Mapping[str, str]) -> None
     ids=["dataset", "box", "cloud", "keywords", "fields"],
 )
 def test_each_counterpart_is_here(names: Mapping[str, str]) -> None:
-    for text in names.values():
-        for owner, name in re.findall(r"\b(da|box|cloud|render)\.(\w+)", text):
-            assert hasattr(NAMED[owner], name), text
+    found = re.findall(r"\b(da|box|cloud|render)\.(\w+)", "\n".join(names.values()))
+    assert [(owner, name) for owner, name in found if not hasattr(NAMED[owner], name)] == []
 
 
 def test_each_table_to_use_is_here() -> None:
@@ -128,7 +127,6 @@ def test_a_field_of_nuscenes_names_the_counterpart(da: DeepAccident, table: str)
 
 def test_records_are_dicts_and_their_copies_plain(da: DeepAccident) -> None:
     record = da.sample[0]
-    assert isinstance(record, dict)
     assert (json.loads(json.dumps(record)), repr(record)) == (record, repr(dict(record)))
     for copied in (copy.copy(record), copy.deepcopy(record), pickle.loads(pickle.dumps(record)), record.copy()):
         assert (type(copied), copied) == (dict, record)

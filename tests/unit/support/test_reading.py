@@ -207,8 +207,7 @@ def test_a_sound_array_is_read_as_numpy_reads_it(array: np.ndarray, way: int) ->
     content = npz(array, way)
     found = read_npz(content)
     np.testing.assert_array_equal(found, np.load(io.BytesIO(content))["data"], strict=True)
-    assert found.flags.writeable
-    assert found.flags.f_contiguous == array.flags.f_contiguous
+    assert (found.flags.writeable, found.flags.f_contiguous) == (True, array.flags.f_contiguous)
 
 
 def test_an_archive_is_read_from_its_file_and_closes_it(tmp_path: Path) -> None:

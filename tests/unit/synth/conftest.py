@@ -6,7 +6,7 @@ import pytest
 from deepaccident_devkit.release import ScenarioFolder, find_release
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-CONFIG = SynthConfig(scenarios=2, frames=3, image_size=(192, 108), seed=5)
+CONFIG = SynthConfig(scenarios=2, frames=3, image_size=(192, 108), seed=5, designed=True)
 
 
 @pytest.fixture(scope="session")

@@ -16,10 +16,11 @@ def plans_of(**fields):
     return plan_scenarios(SynthConfig(**fields))
 
 
-def test_accidents_and_twins_by_turns_go_round_the_designs():
+def test_accidents_and_twins_by_turns_go_round_the_designs_all_or_chosen():
     plans = plans_of(scenarios=26)
     assert [plan.accident for plan in plans] == [True, False] * 13
     assert [plan.design for plan in plans[::2]] == [1, 7, 2, 8, 3, 9, 4, 10, 5, 11, 6, 12, 1]
+    assert [plan.design for plan in plans_of(scenarios=6, designs=(3, 9))[::2]] == [3, 9, 3]
     assert {plan.traits.subtype for plan in plans[:4]} == {1, 2}
     for accident, twin in zip(plans[::2], plans[1::2], strict=True):
         assert (accident.name, accident.split, accident.traits) == (twin.name, twin.split, twin.traits)
@@ -32,8 +33,7 @@ def test_names_are_the_release_s_and_unique():
     assert (len({plan.token for plan in plans}), len({plan.name for plan in plans})) == (60, 30)
     towns = {plan.name.split("_")[0] for plan in plans}
     assert (towns <= set(TOWNS), len(towns) > 4) == (True, True)
-    number = f"{plans[6].traits.subtype:04d}_scenario{1 + plans[6].pair:05d}"
-    assert plans[6].name.endswith(f"_type001_subtype{number}")
+    assert plans[6].name.endswith(f"_type001_subtype{plans[6].traits.subtype:04d}_scenario{1 + plans[6].pair:05d}")
 
 
 def test_seeds_differ_and_repeat_and_more_scenarios_leave_the_first_as_they_are_but_for_splits():
@@ -41,10 +41,6 @@ def test_seeds_differ_and_repeat_and_more_scenarios_leave_the_first_as_they_are_
     assert [plan.name for plan in plans_of(seed=1)] != [plan.name for plan in plans_of(seed=2)]
     few, many = plans_of(scenarios=4), plans_of(scenarios=40)
     assert [plan.token for plan in few] == [plan.token for plan in many[:4]]
-
-
-def test_designs_can_be_chosen():
-    assert [plan.design for plan in plans_of(scenarios=6, designs=(3, 9))[::2]] == [3, 9, 3]
 
 
 @pytest.mark.parametrize("design", range(1, 13))
@@ -65,13 +61,10 @@ def test_a_view_that_is_asked_for_holds_for_every_draw():
 
 
 def test_a_house_hides_the_view_in_some_draws_where_none_is_asked_for():
-    plans = plans_of(scenarios=20, designs=(1, 2))
-    assert {plan.draw(np.random.default_rng(7)).view for plan in plans} == {"open", "hidden"}
-
-
-@pytest.mark.parametrize("scenarios", [22, 24, 25, 40])
-def test_no_split_is_empty_from_six_scenarios_on(scenarios):
-    assert {plan.split for plan in plans_of(scenarios=scenarios)} == {"train", "val", "test"}
+    assert {plan.draw(np.random.default_rng(7)).view for plan in plans_of(scenarios=20, designs=(1, 2))} == {
+        "open",
+        "hidden",
+    }
 
 
 def test_the_first_three_pairs_of_a_small_release_fill_the_splits():
@@ -91,8 +84,9 @@ def test_a_large_release_is_split_by_the_official_procedure():
 
 
 @pytest.mark.parametrize("scenarios", [*range(1, 50), 60, 120, 240, 691])
-def test_minis_are_whole_pairs_a_fifth_at_most_and_never_empty(scenarios):
+def test_minis_are_whole_pairs_a_fifth_at_most_and_no_split_is_empty_from_six_scenarios_on(scenarios):
     plans = plans_of(scenarios=scenarios)
+    assert {plan.split for plan in plans} == {"train", "val", "test"} or scenarios <= 5
     splits, pair_of = plan_splits(plans), {plan.token: plan.pair for plan in plans}
     for whole, mini in ((splits.train, splits.train_mini), (splits.val, splits.val_mini)):
         pairs = {pair_of[token] for token in mini}
@@ -102,10 +96,13 @@ def test_minis_are_whole_pairs_a_fifth_at_most_and_never_empty(scenarios):
 
 
 def test_unplanned_accidents_come_at_their_rate():
-    share = np.mean([plan.unplanned for plan in plans_of(scenarios=800, unplanned=0.25)])
-    assert share == pytest.approx(0.25, abs=0.05)
-    none = (*plans_of(scenarios=40, unplanned=0.0), *plans_of(scenarios=40, unplanned=1.0, view="hidden"))
-    assert not any(plan.unplanned for plan in none)
+    asked = (
+        {"unplanned": 0.25, "designed": True},
+        {"unplanned": 0.0, "designed": True},
+        {"unplanned": 1.0, "view": "hidden"},
+    )
+    shares = [np.mean([plan.unplanned for plan in plans_of(scenarios=800, **each)]) for each in asked]
+    assert shares == [pytest.approx(0.25, abs=0.05), 0, 0]
 
 
 def test_a_hidden_view_has_designs_that_a_house_can_hide_and_faster_cars():
@@ -137,24 +134,33 @@ def own(tmp_path):
 
 def test_what_cannot_be_planned_is_refused(own):
     opposite = OWN.replace("view: hidden\n", "").replace("from: south, turn: [left, right]", "from: east")
-    itself = OWN + "meet: {actors: [ego, ego]}\n"
-    needs = ("view: hidden needs ", "in 'unprotected left turn' it is on the side 'o")
     assert_refused(
-        (lambda: plans_of(view="hidden", designs=(3,)), ConfigError, needs),
+        (
+            lambda: plans_of(view="hidden", designs=(3,)),
+            ConfigError,
+            ("view: hidden needs ", "in 'unprotected left turn' it is on the side 'o"),
+        ),
         (
             lambda: plans_of(spec=own(opposite), view="hidden"),
             ConfigError,
             ("own.yaml:2: actors: view: hidden needs ", "choose other arms, or the view open"),
         ),
-        (lambda: plans_of(spec=own(itself)), ConfigError, ("ego cannot meet itself",)),
+        (
+            lambda: plans_of(spec=own(OWN + "meet: {actors: [ego, ego]}\n")),
+            ConfigError,
+            ("ego cannot meet itself",),
+        ),
     )
 
 
 def test_an_own_file_takes_the_designs_place(own):
-    path = own(OWN.replace("turn: right}", "turn: straight}", 1) + "meet: {}\n")
-    plans = plans_of(spec=path, scenarios=40, unplanned=1.0)
-    assert {(plan.design, plan.unplanned) for plan in plans} == {(None, False)}
-    assert {plan.traits.subtype for plan in plans} == {1, 2}
+    plans = plans_of(
+        spec=own(OWN.replace("turn: right}", "turn: straight}", 1) + "meet: {}\n"), scenarios=40, unplanned=1.0
+    )
+    assert {(plan.design, plan.unplanned, plan.traits.subtype) for plan in plans} == {
+        (None, False, 1),
+        (None, False, 2),
+    }
     for plan in plans:
         spec = plan.draw(np.random.default_rng(plan.pair))
         assert (spec.road.signalized, spec.view) == (plan.traits.subtype == 1, "hidden")
@@ -167,13 +173,14 @@ def test_a_file_in_which_nobody_meets_gives_normal_scenarios(own):
 
 
 @pytest.mark.slow
-def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built():
-    config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3)
+@pytest.mark.parametrize("designed", [True, False])
+def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built(designed):
+    config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3, designed=designed)
     plans = plan_scenarios(config)
     assert {plan.unplanned for plan in plans} == {True, False}
 
     def record(plan):
-        meta = build_scenario(config, plan).meta if plan.accident else None
+        meta = build_scenario(config, plan).meta
         return {
             "token": plan.token,
             "name": plan.name,

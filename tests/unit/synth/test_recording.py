@@ -15,10 +15,8 @@ def test_ids_of_all_kinds_occur(scenarios):
     labels = [(agent, read_label(each.label_path(agent, 1))) for each in scenarios for agent in AGENTS]
     ids = np.concatenate([label.actor_id for _, label in labels])
     distance = np.concatenate([np.hypot(*label.center[:, :2].T) for _, label in labels])
-    assert {-100, -1} <= set(ids.tolist())
-    assert (ids >= 20000).any()
+    assert ({-100, -1} <= {*ids.tolist()}, ids.max() >= 20000, 100 < distance.max() <= 120) == (True,) * 3
     np.testing.assert_array_equal(ids == -1, distance > 115)
-    assert 100 < distance.max() <= 120
     assert {(agent == "infrastructure", (label.actor_id == -100).sum()) for agent, label in labels} == {
         (True, 0),
         (False, 1),
@@ -84,5 +82,4 @@ def test_points_are_a_scan_of_32_channels(scenarios):
     elevation = np.rad2deg(np.arcsin(cloud.xyz[:, 2] / reach))
     assert (reach.max() <= 70.3, 25_000 < len(cloud) <= 32 * 1400) == (True, True)
     assert (len(np.unique(elevation.round(3))) <= 32, elevation.min()) == (True, pytest.approx(-30, abs=1e-3))
-    assert 0 <= cloud.intensity.min() < cloud.intensity.max() <= 1
-    assert cloud.intensity.std() > 0.05
+    assert (0 <= cloud.intensity.min() < cloud.intensity.max() <= 1, cloud.intensity.std() > 0.05) == (True, True)

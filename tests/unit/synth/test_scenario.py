@@ -14,7 +14,7 @@ from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 
 pytestmark = pytest.mark.slow
 
-CONFIG = SynthConfig(scenarios=24, frames=None, seed=2, unplanned=0.0)
+CONFIG = SynthConfig(scenarios=24, frames=None, seed=2, unplanned=0.0, designed=True)
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,17 @@ def test_each_design_is_told_by_its_meta(built):
     types = [accident_type(each.meta, signalized=each.plan.traits.subtype == 1) for each in accidents]
     assert sorted(types) == list(DESIGN_NUMBERS)
     assert types == [each.plan.design for each in accidents]
+
+
+def test_clean_accidents_are_those_of_older_releases(built):
+    """Whoever cites numbers of a designed release finds the same scenes again."""
+    metas = [scenario.meta for scenario in built if scenario.plan.accident][:4]
+    assert [(meta.recorded_frames, meta.agent_ids[0], meta.collision.impact) for meta in metas] == [
+        (55, 1308, pytest.approx(9318.248, abs=0.01)),
+        (70, 1155, pytest.approx(9226.524, abs=0.01)),
+        (83, 1629, pytest.approx(3705.879, abs=0.01)),
+        (66, 1501, pytest.approx(2925.796, abs=0.01)),
+    ]
 
 
 def test_the_last_frame_is_the_impact(built):

@@ -19,7 +19,7 @@ from deepaccident_devkit.synth.sensors.render import ray_directions, slopes
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting, make_scene
 from deepaccident_devkit.taxonomy import frame_timestamp
 
-CONFIG = SynthConfig(scenarios=1, frames=2, image_size=(320, 180), seed=11)
+CONFIG = SynthConfig(scenarios=1, frames=2, image_size=(320, 180), seed=11, designed=True)
 FRAME = 2
 LARGE = 30
 """Pixels."""

@@ -16,7 +16,7 @@ from deepaccident_devkit.validation import validate_release
 def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Labels of one accident, long enough for tracks."""
     root = tmp_path_factory.mktemp("healthy") / "release"
-    return make_release(root, SynthConfig(scenarios=2, frames=12, seed=11, sensors=False), workers=1)
+    return make_release(root, SynthConfig(scenarios=2, frames=12, seed=11, sensors=False, designed=True), workers=1)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import json
 import shutil
 import tracemalloc
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -67,14 +68,14 @@ def test_a_few_frames_of_a_sensor_are_listed(release_root: Path, tmp_path: Path)
     root = tmp_path / "release"
     shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident", "Camera_*", "*_BEV_*"))
     scenario = DeepAccident(dataroot=root, verbose=False).scenario[0]
-    for agent, gone in (("ego_vehicle", (1, 3, 4, 6)), ("other_vehicle", (5, 6))):
-        for frame in gone:
-            folder = root / scenario["scenario_type"] / agent / "lidar01" / scenario["name"]
-            (folder / f"{scenario['name']}_{frame:03d}.npz").unlink()
-    few, many = validate_release(root, scenarios=[scenario["token"]]).findings
+    for agent, frame in (*product(["ego_vehicle"], (1, 3, 4, 6)), *product(["other_vehicle"], (5, 6))):
+        folder = root / scenario["scenario_type"] / agent / "lidar01" / scenario["name"]
+        (folder / f"{scenario['name']}_{frame:03d}.npz").unlink()
     remedy = "unpack the sensor's archive again"
-    assert (few.what, few.remedy) == ("has 2 of 6 frames (2, 5)", f"{remedy}, if you want all")
-    assert (many.what, many.remedy) == ("lacks frames 5–6 of 1 to 6", remedy)
+    assert [(each.what, each.remedy) for each in validate_release(root, scenarios=[scenario["token"]]).findings] == [
+        ("has 2 of 6 frames (2, 5)", f"{remedy}, if you want all"),
+        ("lacks frames 5–6 of 1 to 6", remedy),
+    ]
     counted = overview(DeepAccident(dataroot=root, verbose=False))
     assert (counted.samples - counted.files["lidar01"], counted.channels["lidar01"]) == (6, counted.recordings)
     assert f"{counted.files['lidar01']} of {counted.samples}\n" in counted.to_text()
@@ -162,12 +163,13 @@ def test_findings_of_one_scenario_even_if_it_is_left_out(tmp_path: Path) -> None
     assert (finding.code, finding.where, finding.what) == told
     assert [str(finding)] == list(release.problems[0].messages)  # one implementation: what indexing said
     assert not [found for found in release.findings(release.scenario[0]) if found.severity == "error"]
-    assert_refused((lambda: release.findings("nowhere"), TokenError, "has no scenario 'nowhere'"))
-
-
-@pytest.mark.parametrize("scenario", [None, 5, {}, {"token": None}, ["a/b"]])
-def test_findings_of_what_is_no_scenario(da: DeepAccident, scenario) -> None:
-    assert_refused((lambda: da.findings(scenario), TokenError, "expected a token or a record with one, found"))
+    assert_refused(
+        (lambda: release.findings("nowhere"), TokenError, "has no scenario 'nowhere'"),
+        *(
+            (lambda given=each: release.findings(given), TokenError, "expected a token or a record with one, found")
+            for each in (None, 5, {}, {"token": None}, ["a/b"])
+        ),
+    )
 
 
 def test_every_faulty_file_is_named(tmp_path: Path) -> None:
@@ -193,9 +195,55 @@ def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
     known = found("curtain", **curtain, meta="ClearNoon -1 -1 -1 -1 -1 -1 -1 14\n")
     assert {known[code][0] for code in ("sheer-curtain", "no-collision-in-accident", "meta-incomplete")} == {True}
     normal = {"scenario_type": "type1_subtype2_normal"}
-    first, second = (found(n, **normal, name=f"Town07_type001_subtype0002_scenario000{n}") for n in ("28", "27"))
-    assert first["known-collision-in-normal"] == (True, "note")
-    assert second["collision-in-normal"] == (False, "warning")
+    assert found("normal", **normal)["collision-in-normal"] == (True, "note")
+
+
+@pytest.mark.parametrize(
+    ("changes", "codes_told", "said"),
+    [
+        ({"1212 car": "0 car"}, {"counterpart-unknown"}, "nobody annotated actor 0"),
+        ({"1212 car": "7 bus", "ego other": "ego none"}, {"counterpart-unknown"}, "nobody annotated actor 7"),
+        ({"1212 car": "7 car"}, {"counterpart-unknown", "meta-pair"}, "'ego other' are not the pair (1223, 7)"),
+        ({"ego other": "none none"}, {"nobody-named"}, "the colliding agents are 'none none'"),
+        ({"same": "across"}, {"collision-word"}, "spawn relation is 'across', the release is known to have same, opp"),
+        ({"front_side": "left_side"}, {"collision-word"}, "contact side is 'left_side'"),
+        ({"same front_side": "opposite rear"}, set(), ""),
+    ],
+)
+def test_what_meta_says_of_a_collision(
+    tmp_path: Path, changes: dict[str, str], codes_told: set[str], said: str
+) -> None:
+    """The tiny agents stand far apart, which is told in any case."""
+    meta = tiny.META
+    for old, new in changes.items():
+        meta = meta.replace(old, new)
+    report = validate_release(tiny.write_tiny_release(tmp_path, meta=meta))
+    sound = {"no-contact"} if "1223 car 1212" in meta else set()
+    assert codes(report) == codes_told | sound
+    assert all(
+        finding.severity == ("warning" if finding.code in ("meta-pair", "no-contact") else "note")
+        for finding in report.findings
+    )
+    assert any(said in finding.what for finding in report.findings) or not said
+    assert [each.where.endswith(".txt:1") for each in report.findings if each.code == "collision-word"] in ([True], [])
+
+
+@pytest.mark.parametrize(
+    ("speed", "gap", "said"),
+    [(0.0, -0.5, ""), (2.0, 0.5, ""), (2.0, -0.2, "actors 1300, 1400 overlap by up to 0.20 m, frame 4")],
+)
+def test_a_mover_that_overlaps_somebody_is_noted(tmp_path: Path, speed: float, gap: float, said: str) -> None:
+    """Parked rows overlap in the release, and in an accident the pair does."""
+
+    def lines(agent: str, frame: int) -> list[str]:
+        x = 20.0 + speed * (frame - 4) / 10
+        rows = [(x, 1300, speed), (24.0 + gap, 1400, 0.0)] if agent == "infrastructure" else []
+        return ["0 0", *(f"car {at} 0 -1.2 4 2 1.5 0 {now} 0 {actor} 9 True" for at, actor, now in rows)]
+
+    where = {"scenario_type": "type1_subtype1_normal", "meta": "ClearNoon -1 -1 -1 -1 -1 -1 -1 14\n"}
+    root = tiny.write_tiny_release(tmp_path, lines_of=lines, agents=("infrastructure",), **where)
+    told = [finding for finding in validate_release(root).findings if finding.code == "overlap-unnamed"]
+    assert [(finding.what, finding.severity) for finding in told] == ([(said, "note")] if said else [])
 
 
 def test_what_is_left_aside_is_named(tmp_path: Path) -> None:
@@ -271,8 +319,10 @@ def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
         return called("validate", own_release, *words, status=status).stdout
 
     content = json.loads(run("--json", status=0))
-    assert content["counts"] == {"error": 0, "warning": 0, "note": 0}
-    assert content["velocity"]["best"] == "released"
+    assert (content["counts"], content["velocity"]["best"]) == (
+        dict.fromkeys(("error", "warning", "note"), 0),
+        "released",
+    )
     first = labels_of(own_release, "ego_vehicle")[0]
     first.write_text(first.read_text()[:-20])
     (finding,) = json.loads(run("--json", status=1))["findings"]
@@ -289,9 +339,8 @@ def test_the_worst_scenario_comes_first(own_release: Path) -> None:
     rewrite_boxes(sorted(warned.iterdir())[1], lambda row: [row[0], repr(float(row[1]) + 3), *row[2:]])
     findings = validate_release(own_release).findings
     order = [str(scenario).split("/")[1] for scenario in dict.fromkeys(finding.scenario for finding in findings)]
-    severities = [finding.severity for finding in findings]
     assert order == [broken.name, warned.name]
-    assert severities == sorted(severities, key=("error", "warning", "note").index)
+    assert findings == sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.severity))
 
 
 @pytest.mark.parametrize(
@@ -327,8 +376,7 @@ def test_labels_that_are_good_alone_but_not_together_are_a_finding(
 def test_a_crowd_at_one_place_is_told_in_time_that_grows_with_it(small: Path, actor: str) -> None:
     """20,000 boxes would be 200 million pairs."""
     path = labels_of(small, "ego_vehicle")[2]
-    box = "car 9.0 9.0 -1.0 4.0 2.0 1.5 0.0 0.0 0.0 {actor} 5 True"
-    rows = [box.format(actor=actor.format(row=row)) for row in range(40_000, 60_000)]
+    rows = (f"car 9.0 9.0 -1.0 4.0 2.0 1.5 0.0 0.0 0.0 {actor.format(row=row)} 5 True" for row in range(40_000, 60_000))
     lines = [*path.read_text().splitlines(), *rows]
     path.write_text("\n".join(lines))
     tracemalloc.start()

@@ -22,7 +22,9 @@ SETUP = EvaluationSetup(task="accident", protocol="boxes")
 def release_root_b(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The labels-only release with half a second more: at the impact itself nothing can be foreseen."""
     root = tmp_path_factory.mktemp("runs") / "layout_b"
-    return make_release(root, SynthConfig(scenarios=6, frames=6, layout="B", seed=4, sensors=False), workers=1)
+    return make_release(
+        root, SynthConfig(scenarios=6, frames=6, layout="B", seed=4, sensors=False, designed=True), workers=1
+    )
 
 
 @pytest.fixture(scope="session")

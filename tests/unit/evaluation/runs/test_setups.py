@@ -228,7 +228,9 @@ def test_wrong_choices_and_a_horizon_between_samples(da_b: DeepAccident) -> None
 @pytest.mark.slow
 def test_nothing_to_evaluate(tmp_path: Path) -> None:
     short = make_release(
-        tmp_path / "release", SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False), workers=1
+        tmp_path / "release",
+        SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False, designed=True),
+        workers=1,
     )
     assert_refused(
         (

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from asgi import get
 from memory_results import MemoryResults
 
 from deepaccident_devkit import DeepAccident
@@ -15,11 +16,14 @@ from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.explore import Explorer, make_app
+from deepaccident_devkit.explore.pages.scenario import PARTS
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render.outcomes.above import difference_words
 from deepaccident_devkit.render.outcomes.evaluation import sample_verdict
-from deepaccident_devkit.safety import describe
+from deepaccident_devkit.safety import avoidability_report, describe, lead_time_ledger
 from deepaccident_devkit.safety.prevention import prevention_evaluator
+from deepaccident_devkit.statistics import dataset_statistics
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x.collisions import default_scenario
 
@@ -39,9 +43,8 @@ CHANGES: dict[str, tuple[int, str, str | None]] = {
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("unplaced") / "release"
-    make_release(root, SynthConfig(scenarios=4, frames=30, seed=5, sensors="none", unplanned=0), workers=1)
-    return root
+    config = SynthConfig(scenarios=4, frames=30, seed=5, sensors="none", unplanned=0, designed=True)
+    return make_release(tmp_path_factory.mktemp("unplaced") / "release", config, workers=1)
 
 
 @pytest.fixture(scope="module", params=CHANGES)
@@ -56,10 +59,10 @@ def unplaced(request: pytest.FixtureRequest, whole: Path, tmp_path_factory: pyte
     if agents is not None:
         others = [f" colliding agents: {agents}", *others[1:]] if agents else []
     meta.write_text("\n".join([" ".join(first), *others]))
-    lines = [f"{each.parents[1].name} {each.stem}\n" for each in sorted(root.glob("*/meta/*.txt"))]
-    (root / "mine.txt").write_text("".join(lines))
+    split = root / "mine.txt"
+    split.write_text("".join(f"{each.parents[1].name} {each.stem}\n" for each in sorted(root.glob("*/meta/*.txt"))))
     dataset = DeepAccident("v1", root, verbose=False)
-    return SimpleNamespace(dataset=dataset, token=f"{meta.parents[1].name}/{meta.stem}", split=str(root / "mine.txt"))
+    return SimpleNamespace(dataset=dataset, token=f"{meta.parents[1].name}/{meta.stem}", split=str(split))
 
 
 def run_of(unplaced: SimpleNamespace, path: Path, task: Any, protocol: str) -> EvaluationRun:
@@ -78,8 +81,8 @@ SAMPLES = 5 * 6
 @pytest.mark.slow
 def test_it_ends_no_evaluation_of_accidents(unplaced: SimpleNamespace, tmp_path: Path) -> None:
     boxes = run_of(unplaced, tmp_path / "boxes.json", "accident", "boxes").result
-    assert (boxes.unplaced, boxes.at_impact) == (5 * 5, 5)  # those from 2 s before the impact on
-    assert boxes.samples == 4 * SAMPLES - 5 * 5 - 5
+    # those from 2 s before the impact on
+    assert (boxes.unplaced, boxes.at_impact, boxes.samples) == (5 * 5, 5, 4 * SAMPLES - 5 * 5 - 5)
     assert UNPLACED_NOTE.format(boxes.unplaced) in boxes.notes
     assert run_of(unplaced, tmp_path / "paper.json", "accident", "paper").result.samples == 4 * SAMPLES
 
@@ -89,8 +92,7 @@ def test_it_ends_no_evaluation_of_warnings_and_is_no_normal_scenario(unplaced: S
     clean, field = (
         run_of(unplaced, tmp_path / f"{protocol}.json", "warning", protocol) for protocol in ("clean", "field")
     )
-    for run in (clean, field):
-        assert UNPLACED_NOTE.format(SAMPLES) in run.result.notes
+    assert all(UNPLACED_NOTE.format(SAMPLES) in run.result.notes for run in (clean, field))
     recordings = [each.recordings for each in clean.result.groups.values()]
     assert [sum(each[kind] for each in recordings) for kind in ("accident", "twins", "others")] == [5, 10, 0]
     prevented = prevention_evaluator(unplaced.dataset, clean.evaluator, workers=1).compute()
@@ -110,10 +112,29 @@ def test_maps_are_compared_with_maps_as_ever(unplaced: SimpleNamespace) -> None:
 
 def test_nothing_false_is_said(unplaced: SimpleNamespace) -> None:
     story = describe(unplaced.dataset, unplaced.token)
-    assert story.facts["collision"] is True
-    assert "two collide in 2.9 s, but the labels do not show how" in story.text
+    twice = story.facts["partners"] is None
+    words = ("collide in 2.9 s, but the labels do not show how", "two collide", " that no label shows")
+    assert [story.facts["collision"], *(each in story.text for each in words)] == [True, True, twice, not twice]
     assert default_scenario(unplaced.dataset) != unplaced.token  # the other accident can be shown
     verdict: Any = sample_verdict(unplaced.dataset, f"{unplaced.token}/ego_vehicle/020", [ALARM], protocol="boxes")
     assert difference_words(verdict.compared).startswith(
         "an accident comes in 1.0 s that no label shows both actors of"
     )
+
+
+@pytest.mark.slow
+def test_it_is_a_collision_everywhere(unplaced: SimpleNamespace, request: pytest.FixtureRequest) -> None:
+    """Found, counted, skipped by name, shown."""
+    dataset, token = unplaced.dataset, unplaced.token
+    assert token in [scenario["token"] for scenario in dataset.find(collision=True)]
+    assert dataset_statistics(dataset).histograms["collision_angles"].left_out.counts["total"] == 1
+    twice = request.node.callspec.params["unplaced"] == "one actor twice"
+    for report in (lead_time_ledger(dataset, [token], workers=1), avoidability_report(dataset, [token], workers=1)):
+        assert ["counterpart not recorded" in each.reason for each in report.skipped] == [not twice]
+    explorer = Explorer(dataset)
+    app, here = make_app(explorer), f"/scenario/{token}/"
+    addresses = ("/", here, *(f"{here}parts/{part}" for part in PARTS), f"{here}moment/ego_vehicle/30")
+    assert {address: get(app, address).status for address in addresses} == dict.fromkeys(addresses, 200)
+    explorer.jobs.end()
+    of_sample = (dataset.render_sample, dataset.render_bev, dataset.render_visibility)
+    assert all([dataset.render_frame(f"{token}/030"), *(render(f"{token}/ego_vehicle/030") for render in of_sample)])

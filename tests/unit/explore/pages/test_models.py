@@ -132,8 +132,9 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
     quiet = written(folder / "quiet.json", (), tokens)
     runs["second"] = bundle(da, folder / "second", quiet)
     runs["paper"] = bundle(da, folder / "paper", quiet, replace(BOXES, protocol="paper"))
-    few = written(folder / "few.json", ELSEWHERE, tokens[::2])
-    runs["part"] = bundle(da, folder / "part", few, include_results=True)
+    runs["part"] = bundle(
+        da, folder / "part", written(folder / "few.json", ELSEWHERE, tokens[::2]), include_results=True
+    )
     shutil.copytree(folder / "second", folder / HOSTILE)
     edit_summary(folder / HOSTILE, make_hostile)
     for task in ("motion", "detection", "warning"):
@@ -141,8 +142,7 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
         runs[task], _ = stored_run(da, setup, folder / ("maps" if task == "motion" else f"{task}.json"))
         save_run(runs[task], folder / task, include_results=True)
     alone = written(folder / "alone.json", ELSEWHERE, tokens)
-    bundles = [folder / name for name in (*runs, HOSTILE)]
-    explorer = Explorer(da, bundles=bundles, results=[alone], workers=1)
+    explorer = Explorer(da, bundles=[folder / name for name in (*runs, HOSTILE)], results=[alone], workers=1)
     explorer.begin()
     yield Site(explorer, runs, folder)
     explorer.jobs.end()
@@ -234,10 +234,8 @@ def test_warnings_are_listed_in_time_sixty_a_page(site: Site) -> None:
     address, tokens = "/model/warning/samples", site.runs["warning"].evaluator.tokens
     assert site.samples(address) == sorted(tokens)
     assert "worst" not in site.page(address)
-    lengths = [len(hrefs(site.page(f"{address}?page={page}"), "entry")) for page in (1, 2)]
-    assert lengths == [60, len(tokens) - 60]
-    for page in ("-1", "0", "x", "99999999999"):
-        assert hrefs(site.page(f"{address}?page={page}"), "entry")
+    assert [len(hrefs(site.page(f"{address}?page={page}"), "entry")) for page in (1, 2)] == [60, len(tokens) - 60]
+    assert all(hrefs(site.page(f"{address}?page={page}"), "entry") for page in ("-1", "0", "x", "99999999999"))
 
 
 # verdicts
@@ -372,8 +370,7 @@ def test_results_of_other_scenarios_are_told(opened: Callable[..., Site], tmp_pa
 
 
 def test_names_are_escaped_and_lead_to_their_pages(site: Site) -> None:
-    link = next(each for each in hrefs(site.page("/models/"), "entry") if "onerror" in each)
-    address = urljoin("/models/", link)
+    address = urljoin("/models/", next(each for each in hrefs(site.page("/models/"), "entry") if "onerror" in each))
     own, listed = site.page(address), site.page(urljoin(address, "samples"))
     sample = site.page(urljoin(urljoin(address, "samples"), hrefs(listed, "entry")[0]))
     for page in (site.page("/models/"), own, listed, sample, site.page(of("compare", "first", HOSTILE_PART, ""))):
@@ -415,8 +412,7 @@ def test_a_folders_address_gets_its_slash(site: Site) -> None:
 )
 def test_what_is_not_there_is_not_found(site: Site, address: str) -> None:
     answer = site.get(address)
-    assert answer.status == 404
-    assert "<script>" not in answer.text
+    assert (answer.status, "<script>" not in answer.text) == (404, True)
 
 
 @pytest.mark.parametrize(
@@ -441,8 +437,7 @@ def test_a_damaged_summary_is_a_sentence(site: Site, opened: Callable[..., Site]
 def test_what_is_partial_says_so(site: Site) -> None:
     words = site.runs["part"].partial.text()  # type: ignore[union-attr]
     assert words.startswith("PARTIAL")
-    for address in ("/models/", "/model/part/", "/compare/part/part/"):
-        assert words in site.page(address)
+    assert all(words in site.page(address) for address in ("/models/", "/model/part/", "/compare/part/part/"))
     assert "PARTIAL" not in site.page("/model/first/")
 
 

@@ -78,8 +78,7 @@ def test_perfect_detections_of_an_export_evaluate_as_perfect(da_motion: DeepAcci
     assert read_results(out).meta == {"use_lidar": True}
     listed = ("--split", "train", "--samples", "all", "--protocol", "paper", "--resamples", "0", "--json")
     summary = json.loads(verb("evaluate", "detection", da_motion.dataroot, "--results", out, *listed).stdout)
-    classes = summary["metrics"]["classes"]
-    found = {name: each["mean_AP"] for name, each in classes.items() if each["truths"] != [0]}
+    found = {name: each["mean_AP"] for name, each in summary["metrics"]["classes"].items() if each["truths"] != [0]}
     assert found == {**dict.fromkeys(("car", "truck", "motorcycle", "pedestrian"), 100.0), "van": 0.0}
 
 
@@ -89,15 +88,13 @@ def test_fields_mean_what_they_mean_in_nuscenes(da_motion: DeepAccident, tmp_pat
     given = [entry(name, detection_score=number / 16) for number, name in enumerate(names)]
     given[1]["velocity"] = [float("nan"), float("nan")]
     given[1]["ego_translation"] = [float("nan")] * 3
-    file = written(tmp_path / "nuscenes.json", {other: given, sample: []})
-    found = results_from_nuscenes(da_motion, file)
+    found = results_from_nuscenes(da_motion, written(tmp_path / "nuscenes.json", {other: given, sample: []}))
     assert list(found.boxes) == [other, sample]
     boxes, scores = found.boxes[other].boxes, found.boxes[other].scores
     assert (boxes.frame, boxes.category_names) == ("world", [*OURS.values(), "van", "cyclist"])
     assert scores.tolist() == [number / 16 for number in range(7)]
     assert (boxes.center[0].tolist(), boxes.size[0].tolist()) == ([105.0, -33.0, 1.0], [4.5, 2.0, 1.5])
-    assert boxes.yaw[0] == pytest.approx(2 * np.arctan2(0.8, 0.6))
-    assert boxes.velocity[0].tolist() == [3.0, -4.0, 0.0]
+    assert (boxes.yaw[0], boxes.velocity[0].tolist()) == (pytest.approx(2 * np.arctan2(0.8, 0.6)), [3.0, -4.0, 0.0])
     assert np.isnan(boxes.velocity[1]).any()
     assert found.left_out == {"barrier": 1, "bus": 2, "construction_vehicle": 1, "traffic_cone": 1, "trailer": 1}
     assert not len(found.boxes[sample])
@@ -156,8 +153,7 @@ def test_the_first_wrong_box_is_named(
 
 def test_only_keyframes_are_samples_of_the_export(da_motion: DeepAccident, tmp_path: Path, sample: str) -> None:
     keys = da_motion.samples("train", "all")
-    file = written(tmp_path / "a.json", {key: [] for key in keys})
-    assert list(results_from_nuscenes(da_motion, file).boxes) == keys
+    assert list(results_from_nuscenes(da_motion, written(tmp_path / "a.json", {key: [] for key in keys})).boxes) == keys
     between = f"{sample[:-3]}{int(sample[-3:]) + 1:03d}"
     assert_refused(
         (

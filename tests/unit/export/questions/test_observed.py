@@ -88,8 +88,7 @@ def _moved(pose: AnyArray) -> AnyArray:
 def test_an_unknown_speed_is_not_taken_from_the_moment_after(da_motion: DeepAccident, tmp_path: Path) -> None:
     found = edited(da_motion, tmp_path, of_all_rows(_without_speed))
     sample = next(sample for sample in found.lines if sample.startswith(accident_of(da_motion)))
-    speeds = [speed for actor in found.question(sample)["actors"] for speed in actor["speed"]]
-    assert set(speeds) == {None}
+    assert {speed for actor in found.question(sample)["actors"] for speed in actor["speed"]} == {None}
 
 
 def _without_speed(row: list[str]) -> None:
@@ -208,8 +207,7 @@ def test_pictures_have_neutral_names_and_show_no_path(
     paths = [path for path in folder.rglob("*") if path.is_file()]
     assert not any(path.is_symlink() for path in paths)
     assert not any(re.search(r"accident|normal|scenario|town", str(path.relative_to(folder)).lower()) for path in paths)
-    pictures = sum(path.suffix == ".jpg" for path in paths)
-    assert found.done.tally.linked == {way: pictures} != {way: 0}
+    assert found.done.tally.linked == {way: sum(path.suffix == ".jpg" for path in paths)} != {way: 0}
 
 
 def _refusing(*_: object) -> None:

@@ -88,8 +88,7 @@ def test_places_headings_speeds_and_sizes_are_those_of_the_labels(da_motion: Dee
         for actor in question["actors"]:
             assert actor["time"] == sorted(set(actor["time"]))
             for number, time in enumerate(actor["time"]):
-                frame = int(sample[-3:]) + round(10 * time)
-                token = f"{agents[actor['seen_by'][number][0]]}/{frame:03d}"
+                token = f"{agents[actor['seen_by'][number][0]]}/{int(sample[-3:]) + round(10 * time):03d}"
                 boxes = da_motion.boxes(token, velocity="label").transform(ego_from_world, "ego")
                 row = np.flatnonzero(boxes.actor_id == truth["actors"][actor["name"]]).item()
                 assert actor["position"][number] == pytest.approx(boxes.center[row, :2].tolist(), abs=0.011)
@@ -282,8 +281,7 @@ def test_what_cannot_be_asked_is_counted(
     change(root, accident_of(da_motion))
     found = ask(DeepAccident(dataroot=root, verbose=False, workers=1), tmp_path, form)
     assert dict(found.done.tally.left_out) == said
-    others = {sample.rsplit("/", 2)[0] for sample in found.lines} - {accident_of(da_motion)}
-    assert len(others) == 1
+    assert len({sample.rsplit("/", 2)[0] for sample in found.lines} - {accident_of(da_motion)}) == 1
 
 
 def test_a_release_in_which_nothing_can_be_asked(da_motion: DeepAccident, da_b: DeepAccident, tmp_path: Path) -> None:
@@ -352,8 +350,7 @@ def test_the_moments_of_a_window() -> None:
 def test_windows_lie_in_the_recording_before_its_end(last: int, observe: int, stride: int) -> None:
     windows = WindowRules(observe=observe, stride=stride / 2).windows(last)
     for window in windows:
-        assert window.frames[0] >= 1
-        assert window.present < last
+        assert 1 <= window.frames[0] <= window.present < last
         assert window.present in keyframes(last)  # where evaluations have their samples
         assert len(window.frames) == observe * 2 + 1
         assert set(map(int.__sub__, window.frames[1:], window.frames)) <= {5}

@@ -75,7 +75,7 @@ def test_the_default_hump_hides_a_pedestrian():
         ({"arm": "up"}, "hump.arm: expected one of west, south, east, north, found 'up'"),
         ({"length": 0.0}, "hump: expected a length above 0 and a height of 0 or more, found 0.0 and 2.4"),
         ({"distance": 130.0}, r"hump: 70 m around 130 m do not fit on an arm of 150 m; make it shorter"),
-        ({"height": 5.0}, r"hump: 5 m over 70 m are a grade of 19.0%; make it longer or lower, 14% is the most"),
+        ({"height": 6.0}, r"hump: 6 m over 70 m are a grade of 22.9%; make it longer or lower, 21% is the most"),
     ],
 )
 def test_impossible_humps_are_refused(fields, sentence):

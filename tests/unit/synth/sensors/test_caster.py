@@ -57,8 +57,7 @@ def test_rays_end_on_the_ground(rng, request, kind, place):
     distance, face = kind(np.zeros((0, 8, 3)), terrain).cast(origin, directions)
     points = origin + distance[:, None] * directions
     near = np.abs(points[:, :2]).max(axis=1) < 100
-    assert near.mean() > 0.5
-    assert (face[near] == GROUND).all()
+    assert (near.mean() > 0.5, set(face[near].tolist())) == (True, {GROUND})
     np.testing.assert_allclose(points[near, 2], terrain.height(points[near, :2]), atol=0.05)
 
 

@@ -50,8 +50,7 @@ def test_an_exchange_keeps_the_scene_but_for_the_names():
     for spec in made:
         mover, turner = (spec.actor(role) for role in (("other", "ego") if spec.exchange else ("ego", "other")))
         assert (spec.actor("ego").from_arm, turner.ignores, mover.category) == ("west", ("priority",), "van")
-        assert spec.actor(f"{mover.role}_behind").gap == 7
-        assert spec.meet.actors == (mover.role, turner.role)
+        assert (spec.actor(f"{mover.role}_behind").gap, spec.meet.actors) == (7, (mover.role, turner.role))
         assert spec.road.hump.arm == mover.from_arm, "the hump turns with the arms"
         assert spec.actor("pedestrian").from_arm == ARMS[(ARMS.index(mover.from_arm) + 2) % 4]
 

@@ -42,10 +42,15 @@ def test_everyone_starts_with_room(scene):
 
 def test_nobody_starts_between_the_named_ones_and_the_junction(scene):
     _, named, background = scene
-    for user in named:
-        for other in background:
-            if other.route and other.route.from_arm == user.route.from_arm and other.route.lane == user.route.lane:
-                assert not user.start < other.start < user.route.exit_s
+    between = [
+        other
+        for user in named
+        for other in background
+        if other.route
+        and (other.route.from_arm, other.route.lane) == (user.route.from_arm, user.route.lane)
+        and user.start < other.start < user.route.exit_s
+    ]
+    assert between == []
 
 
 def test_crosswalks_are_walked_over_while_their_arm_has_red(scene):
@@ -65,8 +70,7 @@ def test_parked_vehicles_stand_on_their_own_slots():
     assert (len(vehicles), touching_pairs(poses[None], size, 0.3)) == (MANY.parked + 1, [])
     x, y, yaw = poses[0]
     assert y < -SPEC.road.lanes_edge  # who drives towards the junction from the east has the south on his left
-    assert (vehicles[0].body.category, abs(np.cos(yaw))) == ("van", pytest.approx(1.0))
-    assert x == pytest.approx(40.0, abs=3.5)
+    assert (vehicles[0].body.category, abs(np.cos(yaw)), x) == ("van", pytest.approx(1), pytest.approx(40, abs=3.5))
 
 
 def test_nobody_parks_where_one_steps_onto_the_road():

@@ -6,7 +6,9 @@ from deepaccident_devkit.synth.traffic.rights import find_rights
 from deepaccident_devkit.synth.traffic.simulate import simulate
 
 ONE = np.ones(1)
-TEMPER = Temper(max_speed=10 * ONE, acceleration=2 * ONE, braking=2.5 * ONE, time_gap=ONE, min_gap=2 * ONE)
+TEMPER = Temper(
+    max_speed=10 * ONE, acceleration=2 * ONE, braking=2.5 * ONE, slowing=4 * ONE, time_gap=ONE, min_gap=2 * ONE
+)
 
 
 @pytest.mark.parametrize(

@@ -36,16 +36,17 @@ def last_step(first, second, velocities):
 
 
 @pytest.mark.parametrize(
-    ("second", "velocities", "side"),
+    ("second", "velocities", "words"),
     [
-        ((4.4, 0.0, np.pi), ((8, 0), (-8, 0)), "front"),
-        ((-4.4, 0.0, 0.0), ((2, 0), (10, 0)), "back"),
-        ((0.0, 3.4, -np.pi / 2), ((0, 0), (0, -8)), "left"),
-        ((0.0, -3.4, np.pi / 2), ((0, 0), (0, 8)), "right"),
+        ((4.4, 0.0, np.pi), ((8, 0), (-8, 0)), ("opposite", "front")),
+        ((-4.4, 0.0, 0.0), ((2, 0), (10, 0)), ("same", "rear")),
+        ((0.5, 3.4, -np.pi / 2), ((0, 0), (0, -8)), ("same", "front_side")),
+        ((-0.5, -3.4, np.pi / 2), ((0, 0), (0, 8)), ("same", "rear_side")),
     ],
 )
-def test_the_side_that_is_hit(second, velocities, side):
-    assert impact_of(last_step((0, 0, 0), second, velocities), (0, 1), SIZE).side == side
+def test_meta_s_words_of_the_impact(second, velocities, words):
+    impact = impact_of(last_step((0, 0, 0), second, velocities), (0, 1), SIZE)
+    assert (impact.relation, impact.side) == words
 
 
 def test_the_boxes_just_touch_at_its_time():

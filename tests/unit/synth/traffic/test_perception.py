@@ -34,8 +34,7 @@ def test_who_is_not_ahead(driver, arms, before, sees):
 
 def test_who_stands_across_the_lane_is_ahead_and_does_not_move_along_it(driver, walker):
     gap, speed = look([driver(before=20.0), walker(start=(-15.0, -1.75))])
-    assert 10.0 < gap[0] < 25.0
-    assert speed[0] == pytest.approx(0.0, abs=1e-9)
+    assert (10.0 < gap[0] < 25.0, speed[0]) == (True, pytest.approx(0.0, abs=1e-9))
 
 
 def test_one_sees_round_its_own_bend(driver):

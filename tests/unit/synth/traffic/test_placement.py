@@ -84,8 +84,7 @@ def test_those_who_meet_may_notice_each_other_at_the_last_moment_and_nobody_else
     ]
     assert 5 < sum(alert == 0 for alert in alerts) < 35
     assert 0.1 < max(alerts) < 0.5
-    behind = (user.alert for user in cast().users if user.role in ("ego_behind", "other_behind"))
-    assert list(behind) == [0.0, 0.0]
+    assert [user.alert for user in cast().users if user.role in ("ego_behind", "other_behind")] == [0.0, 0.0]
 
 
 def test_a_start_that_is_given_is_kept_where_nobody_is_to_meet():

@@ -60,16 +60,14 @@ def test_one_who_has_to_wait_lets_the_other_pass(driver, other, before):
     users = [driver(*mine, before=30.0), driver(*other, before=before)]
     minor = ("west", "east") if other[0] == "north" else ()
     run = simulate(users, begin=0.0, end=12.0, rights=find_rights(users, minor=minor))
-    assert not touching_pairs(run.poses, sizes(users), 0.1)
+    assert (touching_pairs(run.poses, sizes(users), 0.1), run.states[:, 1, 3].min() > 6.0) == ([], True)
     assert users[0].path.project(run.poses[-1:, 0, :2])[0][0] > users[0].route.exit_s - 5.0
-    assert run.states[:, 1, 3].min() > 6.0
 
 
 def test_one_on_foot_is_let_over_the_road(driver, walker):
     users = [driver("west", before=35.0), walker()]
     run = simulate(users, begin=0.0, end=20.0, rights=find_rights(users))
-    assert not touching_pairs(run.poses, sizes(users), 0.3)
-    assert run.states[:, 0, 3].min() < 5.0
+    assert (touching_pairs(run.poses, sizes(users), 0.3), run.states[:, 0, 3].min() < 5.0) == ([], True)
     assert users[0].path.project(run.poses[-1:, 0, :2])[0][0] > users[0].route.exit_s
 
 
@@ -94,14 +92,19 @@ def test_it_stops_a_little_before_the_other_s_way(driver):
     assert 0.5 < to_zone - gap_of_the_first(users) < 2.0
 
 
-@pytest.mark.parametrize(("before", "waits"), [(25.0, True), (120.0, False)])
-def test_it_waits_for_one_who_is_near_and_not_for_one_who_is_far(driver, before, waits):
-    assert np.isfinite(gap_of_the_first([driver("south", before=10.0), driver("west", before=before)])) == waits
-
-
-@pytest.mark.parametrize("held", [False, True])
-def test_it_does_not_wait_for_one_whom_a_red_light_holds(driver, held):
-    assert np.isinf(gap_of_the_first([driver("south", before=10.0), driver("west", before=25.0)], held=held)) == held
+@pytest.mark.parametrize(
+    ("mine", "other", "held", "waits"),
+    [
+        ({"before": 10.0}, {"before": 25.0}, False, True),
+        ({"before": 10.0}, {"before": 25.0}, True, False),  # a red light holds it
+        ({"before": 10.0}, {"before": 120.0}, False, False),
+        # who creeps through the crossing is not gone soon, though it might speed up
+        ({"before": 30.0, "speed": 6.0}, {"before": -6.0, "speed": 1.0}, False, True),
+        ({"before": 30.0, "speed": 6.0}, {"before": -6.0, "speed": 10.0}, False, False),
+    ],
+)
+def test_it_waits_for_one_who_is_near_not_far_nor_held_nor_soon_gone(driver, mine, other, held, waits):
+    assert np.isfinite(gap_of_the_first([driver("south", **mine), driver("west", **other)], held=held)) == waits
 
 
 @pytest.mark.parametrize(("fastest", "waits"), [(1.2, False), (5.0, True)])
@@ -111,11 +114,4 @@ def test_it_knows_how_fast_the_other_can_get_there(driver, walker, fastest, wait
         driver("west", before=1.0, speed=2.0),
         walker(start=(-11.0, 9.0), yaw=-np.pi / 2, length=18.0, start_speed=0.0, max_speed=fastest),
     ]
-    assert np.isfinite(gap_of_the_first(users)) == waits
-
-
-@pytest.mark.parametrize(("speed", "waits"), [(1.0, True), (10.0, False)])
-def test_it_counts_on_the_other_s_present_speed(driver, speed, waits):
-    """One who creeps through the crossing is not gone soon, though it might speed up."""
-    users = [driver("south", before=30.0, speed=6.0), driver("west", before=-6.0, speed=speed)]
     assert np.isfinite(gap_of_the_first(users)) == waits
