@@ -155,7 +155,7 @@ def _speed(subject: Subject, agent: int) -> Iterator[Finding]:
     moved = _central(subject.positions[agent, :, :2])
     least, share = _SPEED_DIFFERENCE
     off = ~(np.linalg.norm(said - moved, axis=1) <= least + share * np.linalg.norm(moved, axis=1))  # NaN is off too
-    off[max(0, subject.num_frames - _LAST_FRAMES) :] = False
+    off[max(subject.num_frames // 2, subject.num_frames - _LAST_FRAMES) :] = False
     if off.any():
         what = f"the first line is over {least:.0f} m/s off the displacement, {frames_text(np.flatnonzero(off) + 1)}"
         yield subject.finding("speed-off", subject.label_where(agent), what)
