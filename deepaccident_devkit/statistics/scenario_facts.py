@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.accidents.twins import twin_of
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import shortened
-from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs, side_gaps
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs, signed_gaps
 from deepaccident_devkit.release import Meta, read_meta
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats
@@ -183,8 +183,7 @@ def _of_contact(seen: _Seen, pair: tuple[int, int]) -> dict[str, ArrayLike]:
     if len(rows) < 2 or len(known) < 2:
         return {}
     first, other = seen.boxes[rows][:, known]
-    _, gap, reach = side_gaps(first, other)
-    apart = (np.abs(gap) - reach).max(axis=1)
+    apart = signed_gaps(first, other)
     touching, last_second = np.flatnonzero(apart <= 0), _SECOND * (np.ceil((seen.frames - 1) / _SECOND) - 1)
     before = max(int([*touching, len(known) - 1][0]) - 1, 0)
     turn, velocity = first[before, 4] - other[before, 4], seen.velocity[rows, known[before]]

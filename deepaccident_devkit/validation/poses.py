@@ -36,7 +36,8 @@ _POLE_CHANGE = 0.02
 _JUMP = 0.75
 """Metres off the middle of the frames around."""
 _LAST_FRAMES = 4
-"""The blow can be up to three frames before the last; what follows it fits no displacement."""
+"""The blow can be up to three frames before the last; what follows it fits no displacement. Of fewer than eight frames
+the first half is judged all the same."""
 _SPEED_DIFFERENCE = (1.0, 0.2)
 """m/s, and as a share of the speed, between a label's first line and the displacement around it."""
 _ACTOR_OFF = (3, 0.8)
