@@ -18,6 +18,7 @@ from deepaccident_devkit.safety import (
     TornTwins,
     TwinDiff,
     TwinReport,
+    safety_report,
     torn_twins,
     twin_diff,
     twin_of,
@@ -219,3 +220,10 @@ def test_a_report_of_several_lists_torn_twins(da_b: DeepAccident) -> None:
     first = report.diffs[0]
     line = next(each for each in report.to_text().splitlines() if each.startswith(first.accident))
     assert f"{first.nearest_in_twin.gap:.2f}" in line
+
+
+def test_a_report_says_which_recordings_it_is_of(da_motion: DeepAccident, da_b: DeepAccident) -> None:
+    first, again, other = (twin_report(each, []) for each in (da_motion, da_motion, da_b))
+    assert first.fingerprint == again.fingerprint != other.fingerprint
+    assert f"({first.fingerprint})" in first.to_text()
+    assert first.to_dict()["fingerprint"] == safety_report(da_motion, []).to_dict()["fingerprint"] == first.fingerprint
