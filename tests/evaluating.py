@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from deepaccident_devkit import DeepAccident
@@ -46,7 +46,7 @@ def labels_as_maps(dataset: DeepAccident, token: str) -> Sequence[Any]:
 @dataclass(frozen=True)
 class Ratio:
     ratio: float
-    nothing: float = math.nan
+    nothing: float = field(default=math.nan, compare=False)  # from Python 3.13 on, equal fields only make equal records
     median_of_all: float = 0.5
 
 
