@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit import overview, selection, v2x
+from deepaccident_devkit import overview
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError, escaped
 from deepaccident_devkit.release import find_release
@@ -66,10 +66,10 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from deepaccident_devkit import interactions as pairs
-    from deepaccident_devkit import maps, motion, render, safety, validation
+    from deepaccident_devkit import maps, motion, render, safety, selection, v2x, validation
     from deepaccident_devkit.maps import pictures as map_pictures
 else:
-    motion, render, validation = map(_Package, ("motion", "render", "validation"))
+    motion, render, selection, v2x, validation = map(_Package, ("motion", "render", "selection", "v2x", "validation"))
     map_pictures = maps = pairs = safety = _Ring()
 
 

@@ -13,7 +13,6 @@ from typing import Any
 
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder, write_bytes
-from deepaccident_devkit.support.pages import rendered
 from deepaccident_devkit.support.text import columns_text, path_of
 
 Row = Sequence[object]
@@ -90,6 +89,8 @@ def record_rows(kind: type[Any], records: Iterable[object]) -> list[Row]:
 
 def table_html(rows: Sequence[Sequence[str]], caption: str = "") -> str:
     """A table for a notebook; the first row is the heading."""
+    from deepaccident_devkit.support.pages import rendered  # here: for notebooks alone
+
     return rendered("notebook_table.html", rows=rows, caption=caption)
 
 

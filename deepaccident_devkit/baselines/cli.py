@@ -7,13 +7,11 @@ import click
 
 from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, predict_results
 from deepaccident_devkit.baselines.predict_results import is_predicted
+from deepaccident_devkit.cli.agents import cooperating_parameter, link_parameters, names_or_configuration
 from deepaccident_devkit.cli.options import (
     PATH,
-    cooperating_parameter,
     engine_of,
-    link_parameters,
     model_parameters,
-    names_or_configuration,
     refuse_unused,
     release_of,
     release_parameters,

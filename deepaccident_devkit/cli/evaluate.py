@@ -11,11 +11,10 @@ from typing import Any, get_args
 
 import click
 
+from deepaccident_devkit.cli.agents import agent_names, agents_parameter
 from deepaccident_devkit.cli.options import (
     DATAROOT,
     PATH,
-    agent_names,
-    agents_parameter,
     engine_of,
     engine_parameters,
     json_parameter,

@@ -7,15 +7,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from deepaccident_devkit.cli.agents import agent_names, agents_parameter, cooperating_parameter, names_or_configuration
 from deepaccident_devkit.cli.options import (
     PATH,
-    agent_names,
-    agents_parameter,
     channels_parameter,
-    cooperating_parameter,
     engine_of,
     frame_range_parameter,
-    names_or_configuration,
     refuse_unused,
     release_parameters,
     where_parameter,

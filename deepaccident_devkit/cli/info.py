@@ -18,13 +18,14 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.overview import overview, scenario_lines
-from deepaccident_devkit.selection.fields import fields_text
 
 _OF_STATISTICS = ("interactions", "out")
 
 
 def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
     if wanted:
+        from deepaccident_devkit.selection.fields import fields_text
+
         click.echo(fields_text())
         context.exit()
 

@@ -5,7 +5,8 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import agent_names, agents_parameter, engine_of, release_parameters, switches_of
+from deepaccident_devkit.cli.agents import agent_names, agents_parameter
+from deepaccident_devkit.cli.options import engine_of, release_parameters, switches_of
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError

@@ -3,22 +3,18 @@
 import functools
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import click
 from click.core import ParameterSource
 
-from deepaccident_devkit.cli.verbs import Function, WordChoice, advanced, field_option, together
-from deepaccident_devkit.parallel import cluster_executor
+from deepaccident_devkit.cli.verbs import Function, WordChoice, advanced, together
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.support.text import choice
-from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
-from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE, Link
+from deepaccident_devkit.taxonomy import VERSIONS
 
-_ALL = ("all", AVAILABLE)
 _WORDS = {"yes": "true", "no": "false"}
 
 
@@ -65,12 +61,6 @@ where_parameter = click.option(
     help="Only scenarios that match, such as town=Town03,Town05, weather!=Clear, length=40..60 or collision=true. "
     "If you repeat this option, all filters must match.",
 )
-agents_parameter = click.option(
-    "--agents",
-    multiple=True,
-    metavar="NAME[,NAME…]",
-    help="Only samples of these agents; it does not choose who cooperates.  [default: all]",
-)
 channels_parameter = click.option(
     "--channels",
     multiple=True,
@@ -91,12 +81,14 @@ def engine_parameters(run_verb: Function) -> Function:
 
     @functools.wraps(run_verb)
     def run(*arguments: Any, scheduler: str | None, **options: Any) -> Any:
-        if scheduler is not None:
-            refuse_unused("with a scheduler, which has workers of its own", "workers")
-        file = Path(scheduler) if scheduler is not None and scheduler.endswith(".json") else None
-        with cluster_executor(None if file else scheduler, file) as executor:
-            if executor is not None:  # workers have working folders of their own
-                options = {name: each.absolute() if isinstance(each, Path) else each for name, each in options.items()}
+        if scheduler is None:
+            return run_verb(*arguments, executor=None, **options)
+        from deepaccident_devkit.parallel import cluster_executor  # here: most verbs start without it
+
+        refuse_unused("with a scheduler, which has workers of its own", "workers")
+        options = {name: each.absolute() if isinstance(each, Path) else each for name, each in options.items()}
+        file = Path(scheduler) if scheduler.endswith(".json") else None
+        with cluster_executor(None if file else scheduler, file) as executor:  # workers have folders of their own
             return run_verb(*arguments, executor=executor, **options)
 
     return cast("Function", workers_parameter(_SCHEDULER(run)))
@@ -151,42 +143,6 @@ def say_report(report: Any, written: Sequence[Path], folder: Path | None, *, as_
 def words_of(given: Sequence[str]) -> list[str]:
     """The words of the texts of a repeated option, each text one word or several with commas."""
     return [word for text in given for word in text.split(",")]
-
-
-def agent_names(given: Sequence[str]) -> tuple[str, ...]:
-    """The agents of repeated --agents; no text means all.
-
-    `all` and `available` do too: this only chooses among the samples that are there.
-    """
-    names = [choice("--agents", name, (*AGENTS, *_ALL)) for name in words_of(given)]
-    return AGENTS if not names or set(names) & set(_ALL) else tuple(names)
-
-
-def cooperating_parameter(whose: str, default: str) -> Callable[[Function], Function]:
-    """An option --agents for agents that cooperate (`names_or_configuration` reads it)."""
-    return click.option(
-        "--agents",
-        multiple=True,
-        metavar="NAME[,NAME…]",
-        help=f"{whose}: names, or one of {', '.join(AGENT_SETS)} (those that are there).  [default: {default}]",
-    )
-
-
-def names_or_configuration(given: Sequence[str]) -> str | list[str] | None:
-    """Repeated --agents for agents that cooperate: one configuration, names, or None if it was not given."""
-    names = words_of(given)
-    if len(names) != 1:
-        return names or None
-    alone = choice("--agents", names[0], (*AGENT_SETS, *AGENTS))
-    return names if alone in AGENTS else alone
-
-
-def link_parameters(latency: float = 0.0, pose_noise: float = 0.0) -> Callable[[Function], Function]:
-    """Options for what happens to partners' data, with these defaults."""
-    return together(
-        field_option(Link, "latency", default=latency),
-        field_option(Link, "pose_noise", default=pose_noise, type=float),
-    )
 
 
 seed_parameter = click.option("--seed", default=0, show_default=True, help="Seed of all that is drawn.")

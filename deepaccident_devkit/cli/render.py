@@ -9,12 +9,10 @@ from typing import Any, cast, get_args
 
 import click
 
+from deepaccident_devkit.cli.agents import cooperating_parameter, link_parameters, names_or_configuration
 from deepaccident_devkit.cli.options import (
     PATH,
-    cooperating_parameter,
     frame_range_parameter,
-    link_parameters,
-    names_or_configuration,
     pixel_size,
     refuse_unused,
     release_parameters,

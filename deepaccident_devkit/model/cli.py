@@ -5,15 +5,8 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import (
-    PATH,
-    cooperating_parameter,
-    model_parameters,
-    names_or_configuration,
-    reader_parameters,
-    release_of,
-    use_threads_sparingly,
-)
+from deepaccident_devkit.cli.agents import cooperating_parameter, names_or_configuration
+from deepaccident_devkit.cli.options import PATH, model_parameters, reader_parameters, release_of, use_threads_sparingly
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.taxonomy import ModelFusion, ModelPreset

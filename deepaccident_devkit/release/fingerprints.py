@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers, frame_sizes
 from deepaccident_devkit.release.store import ReleasePath, places_of, read_content
 from deepaccident_devkit.support.reading import FileKind
@@ -73,6 +72,8 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
         ReleaseError: a file cannot be read.
     """
     folders = scenario_folders(dataset, scenarios)
+    from deepaccident_devkit.parallel import Places, run_batch  # here: opening a release waits for this module
+
     places = Places(reads=places_of(dataset.dataroot))
     found = run_batch(folder_hashes, list(folders.values()), places=places, **how)
     return dict(zip(folders, found, strict=True))

@@ -70,7 +70,7 @@ class ScenarioFolder:
 
     def kind_folder(self, agent: str, kind: str) -> ReleasePath:
         """The folder of one kind of file (`label`, `calib` or a channel) of one agent."""
-        return self.root / self.folder / self.scenario_type / agent / kind / self.name
+        return self.root / self.folder / f"{self.scenario_type}/{agent}/{kind}/{self.name}"
 
     def file(self, agent: str, kind: str, frame: int, ending: str) -> ReleasePath:
         """One frame's file of a kind."""

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError, VersionError
-from deepaccident_devkit.parallel import Engine, Places, Store
 from deepaccident_devkit.release import ReleaseLayout
 from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in, places_of
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -40,20 +39,15 @@ from deepaccident_devkit.support.files import (
 from deepaccident_devkit.support.reading import RefusedFileError, fault_text, file_checksum, limit_of, read_bytes
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.arrow_files import table_path
-from deepaccident_devkit.tables.indexing import (
-    SCHEMA_VERSION,
-    Outcome,
-    SplitAssignment,
-    assign_splits,
-    index_scenario,
-    join_tables,
-)
-from deepaccident_devkit.tables.records import table_specs
+from deepaccident_devkit.tables.records import SCHEMA_VERSION, table_specs
 from deepaccident_devkit.tables.scan import contents_digest, folder_digest
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+    from deepaccident_devkit.parallel import Engine, Store
+    from deepaccident_devkit.tables.indexing import Outcome, SplitAssignment
 
 logger = logging.getLogger(__name__)
 
@@ -238,6 +232,9 @@ def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpa
 
     Broken scenarios do not stop it: they are listed in the manifest. Damaged rows and tables are made again.
     """
+    from deepaccident_devkit.parallel import Places  # here, as below: opening an index that is there needs none of it
+    from deepaccident_devkit.tables.indexing import assign_splits, index_scenario
+
     _refuse_newer(folder)
     fingerprint, splits = _fingerprint(layout), assign_splits(layout)
     store = _store(folder, f"{SCHEMA_VERSION} {fingerprint} {check_files}")
@@ -276,6 +273,8 @@ def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpa
 
 
 def _store(folder: Path, command: str) -> Store:
+    from deepaccident_devkit.parallel import Store
+
     return Store(folder, folder, "makes an index", IndexStoreError, command)
 
 
@@ -308,6 +307,8 @@ def _written_tables(
     else:
         remove_in(store.folder, name)  # damaged, or of a process that was stopped before its manifest
         with replacing_folder(folder) as temporary:
+            from deepaccident_devkit.tables.indexing import join_tables
+
             join_tables(temporary, [store.path(each.token) for each in outcomes], assigned)
             files = table_files(temporary)
     return name, files

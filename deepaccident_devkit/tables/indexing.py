@@ -27,7 +27,7 @@ from deepaccident_devkit.tables.arrow_files import (
 )
 from deepaccident_devkit.tables.build import scenario_rows, sensor_rows
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec
-from deepaccident_devkit.tables.records import table_specs
+from deepaccident_devkit.tables.records import SCHEMA_VERSION, table_specs
 from deepaccident_devkit.tables.scan import (
     Finding,
     ScenarioFiles,
@@ -40,8 +40,6 @@ from deepaccident_devkit.tables.scan import (
 )
 from deepaccident_devkit.taxonomy import CATEGORIES, MINI_SPLITS, SPLITS
 
-SCHEMA_VERSION = 4
-"""Counts up whenever the stored columns, their meaning or the form of the index change."""
 _SHARED_TABLES = ("sensor", "category")
 """Tables that are the same for every scenario and are not kept with any."""
 _FROM_OTHERS: Mapping[str, Mapping[str, Callable[[Columns], AnyArray]]] = {

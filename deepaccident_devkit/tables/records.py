@@ -36,6 +36,9 @@ from deepaccident_devkit.taxonomy import (
     VELOCITY_FRAMES,
 )
 
+SCHEMA_VERSION = 4
+"""Counts up whenever the stored columns, their meaning or the form of the index change."""
+
 
 class CollisionRecord(TypedDict):
     """The collision that ended a scenario, as meta names it."""

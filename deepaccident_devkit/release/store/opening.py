@@ -15,7 +15,6 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError
-from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.release.store.members import (
     FORM,
     MINI_FOLDER,
@@ -162,6 +161,8 @@ def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path
         with suppress(IndexStoreError):  # a damaged list is made again
             return StorePath(opened_store(str(path), str(base), known))
     jobs = [(str(archive), archive.relative_to(base).as_posix()) for archive in archives]
+    from deepaccident_devkit.parallel import Places, run_batch  # here: few dataroots are archives
+
     listings = run_batch(_listed_archive, jobs, label="listing archives", places=Places(reads=(base,)), **how)
     beside = {file: state for file, state in states.items() if _is_split(file)}
     known = _written(places, name, _with_loose(listings, beside))

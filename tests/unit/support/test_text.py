@@ -13,7 +13,7 @@ from verbs import commands
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.cli.options import agent_names, names_or_configuration
+from deepaccident_devkit.cli.agents import agent_names, names_or_configuration
 from deepaccident_devkit.cli.verbs import WordChoice
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, TableError, TokenError, VersionError
 from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, WarningEvaluator
