@@ -11,7 +11,7 @@ import numpy as np
 from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.geometry import SE3, conventions
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
-from deepaccident_devkit.release.pickles import load_arrays, pickled
+from deepaccident_devkit.release.pickles import load_arrays, load_stacked, pickled
 from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content
 from deepaccident_devkit.support.arrays import LARGEST, AnyArray, BoolArray, FloatArray, ShortRepr, in_range, readonly
 from deepaccident_devkit.support.files import write_bytes
@@ -89,7 +89,7 @@ def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, Any
             that is not rigid, or asks for anything but numpy arrays to be made (nothing of such a file is run).
     """
     file = read_unchecked_calib(path)
-    calibs = _converted([path], [file])
+    calibs = _converted([path], _stacked([file]))
     if raw:
         return file
     return Calib(
@@ -102,7 +102,13 @@ def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, Any
 
 def read_calibs(paths: Sequence[ReleasePath]) -> Calibs:
     """The calibrations of several files as stacked arrays; raises as `read_calib` does."""
-    return _converted(paths, [read_unchecked_calib(path) for path in paths])
+    contents = [read_content(path, "calib", CalibError) for path in paths]
+    files = [_loaded(path, content) for path, content in zip(paths[:1], contents[:1], strict=True)]
+    arrays = load_stacked(contents)
+    if arrays is None:  # of several layouts
+        files += [_loaded(path, content) for path, content in zip(paths[1:], contents[1:], strict=True)]
+        arrays = _stacked(files)
+    return _converted(paths, arrays)
 
 
 def write_calib(path: Path, calib: Calib) -> None:
@@ -131,7 +137,10 @@ def read_unchecked_calib(path: ReleasePath) -> dict[str, AnyArray]:
 
     Raises as `read_calib` does, but not for NaN and transforms that are not rigid.
     """
-    content = read_content(path, "calib", CalibError)
+    return _loaded(path, read_content(path, "calib", CalibError))
+
+
+def _loaded(path: ReleasePath, content: bytes) -> dict[str, AnyArray]:
     try:
         loaded = load_arrays(content)
     except pickle.UnpicklingError as error:
@@ -154,14 +163,15 @@ def _checked_raw(path: ReleasePath, loaded: Any) -> dict[str, AnyArray]:
     return loaded
 
 
-def _converted(paths: Sequence[ReleasePath], files: Sequence[Mapping[str, AnyArray]]) -> Calibs:
-    """Check the numbers of all files at once and turn them right-handed."""
+def _stacked(files: Sequence[Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
+    return {key: np.array([file[key] for file in files]).reshape(-1, *shape) for key, shape in KEYS.items()}
 
-    def stacked(keys: Sequence[str], shape: tuple[int, int]) -> FloatArray:
-        rows = [file[key] for file in files for key in keys]
-        return np.array(rows, dtype=np.float64).reshape(len(files), len(keys), *shape)
 
-    poses, intrinsics = stacked(_POSE_KEYS, (4, 4)), stacked(_INTRINSIC_KEYS, (3, 3))
+def _converted(paths: Sequence[ReleasePath], arrays: Mapping[str, AnyArray]) -> Calibs:
+    """Check the numbers of all files (N, …) at once and turn them right-handed."""
+    poses, intrinsics = (
+        np.stack([arrays[key] for key in keys], axis=1).astype(np.float64) for keys in (_POSE_KEYS, _INTRINSIC_KEYS)
+    )
     rigid = _surely_rigid(poses).all(axis=1)
     finite = in_range(intrinsics).all(axis=(1, 2, 3))
     for index in np.flatnonzero(~(rigid & finite)).tolist():

@@ -66,15 +66,19 @@ class ScenarioFolder:
     @property
     def meta_path(self) -> ReleasePath:
         """The scenario's meta file."""
-        return self.root / self.folder / self.scenario_type / "meta" / f"{self.name}.txt"
+        return self._below(f"meta/{self.name}.txt")
 
     def kind_folder(self, agent: str, kind: str) -> ReleasePath:
         """The folder of one kind of file (`label`, `calib` or a channel) of one agent."""
-        return self.root / self.folder / f"{self.scenario_type}/{agent}/{kind}/{self.name}"
+        return self._below(f"{agent}/{kind}/{self.name}")
 
     def file(self, agent: str, kind: str, frame: int, ending: str) -> ReleasePath:
         """One frame's file of a kind."""
-        return self.kind_folder(agent, kind) / f"{self.name}_{frame:03d}.{ending}"
+        return self._below(f"{agent}/{kind}/{self.name}/{self.name}_{frame:03d}.{ending}")
+
+    def _below(self, path: str) -> ReleasePath:
+        place = f"{self.folder}/{self.scenario_type}" if self.folder else self.scenario_type
+        return self.root / f"{place}/{path}"  # one join: a release has half a million files
 
     def label_path(self, agent: str, frame: int) -> ReleasePath:
         """One frame's label file."""

@@ -73,6 +73,15 @@ def load_arrays(content: bytes) -> Any:
     return value
 
 
+def load_stacked(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
+    """The arrays of several pickles of one layout, by key: (N, …) of N pickles, in their own dtypes.
+
+    None if one of them is of no layout that `load_arrays` has read, or another's, or more than a dict of C-ordered
+    arrays: then each is to be loaded by itself.
+    """
+    return next((found for each in layouts if (found := each.stacked(contents)) is not None), None)
+
+
 def pickled(value: object) -> bytes:
     """A value as a pickle."""
     return _with_old_names(pickle.dumps(value, protocol=_PROTOCOL))
@@ -141,6 +150,23 @@ class _Layout(NamedTuple):
 
     def fits(self, content: bytes) -> bool:
         return len(content) == self.size and all(content.startswith(part, start) for start, part in self.parts)
+
+    def stacked(self, contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
+        """The arrays of all contents if they fit, and the value is a dict of arrays with bytes of their own."""
+        arrays = self.value if isinstance(self.value, dict) else {}
+        plain = all(
+            isinstance(each, _Array) and isinstance(each.content, slice) and each.order == "C"
+            for each in arrays.values()
+        )
+        if not arrays or not plain or {self.size} != set(map(len, contents)):
+            return None
+        rows = np.frombuffer(b"".join(contents), np.uint8).reshape(-1, self.size)
+        for start, part in self.parts:
+            if (rows[:, start : start + len(part)] != np.frombuffer(part, np.uint8)).any():
+                return None
+        return {
+            key: rows[:, each.content].copy().view(each.dtype).reshape(-1, *each.shape) for key, each in arrays.items()
+        }
 
 
 layouts: list[_Layout] = []

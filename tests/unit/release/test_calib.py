@@ -22,8 +22,8 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "calib.pkl"
 
 
-def dump(path: Path, raw: object) -> Path:
-    path.write_bytes(pickle.dumps(raw, 2))
+def dump(path: Path, raw: object, protocol: int = 2) -> Path:
+    path.write_bytes(pickle.dumps(raw, protocol))
     return path
 
 
@@ -60,9 +60,25 @@ def test_raw_is_the_files_own_dict(path: Path, raw_calib: RawCalib) -> None:
         assert_array_equal(read[key], array)
 
 
-def test_several_files_are_stacked(tmp_path: Path, raw_calib: RawCalib) -> None:
-    moved = raw_calib | {"ego_to_world": np.eye(4)}
-    paths = [dump(tmp_path / "1.pkl", raw_calib), dump(tmp_path / "2.pkl", moved)]
+@pytest.mark.parametrize(
+    ("protocols", "moved"),
+    [
+        ((2, 2), np.eye(4)),
+        ((4, 4), np.eye(4)),  # of one layout, as the next two are
+        ((4, 4), np.eye(4, dtype=">f4")),
+        ((4, 4), np.asfortranarray(np.eye(4) + np.eye(4, k=3))),
+        ((4, 3), np.eye(4, dtype=np.int64)),
+    ],
+)
+def test_several_files_are_stacked(
+    tmp_path: Path, raw_calib: RawCalib, protocols: tuple[int, int], moved: np.ndarray
+) -> None:
+    first = raw_calib | {"ego_to_world": moved}
+    contents = first, first | {"lidar_to_ego": np.eye(4)}
+    paths = [
+        dump(tmp_path / f"{name}.pkl", raw, protocol)
+        for name, raw, protocol in zip("12", contents, protocols, strict=True)
+    ]
     calibs = read_calibs(paths)
     assert len(calibs) == 2
     for index, single in enumerate(map(read_calib, paths)):
