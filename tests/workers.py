@@ -38,3 +38,7 @@ def told_or_broken(path: str) -> None:
 
 def following(item: int) -> int:
     return item + 1
+
+
+def process(item: int) -> int:
+    return os.getpid()

@@ -23,6 +23,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.motion.sample_labels import no_samples_text
+from deepaccident_devkit.parallel import workers_kept
 from deepaccident_devkit.rooms import need_room
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import choice
@@ -98,6 +99,7 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
     predicted(model, purpose, agents=agents, link=link, seed=seed, **options)
 
 
+@workers_kept()
 def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, out: Path, **options: Any) -> None:
     refuse_unused("with a baseline", "device", "images_cache")
     agents = agents or _ALONE

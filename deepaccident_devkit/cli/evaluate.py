@@ -60,6 +60,7 @@ from deepaccident_devkit.evaluation.runs.setups import (
 )
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings
+from deepaccident_devkit.parallel import workers_kept
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
 from deepaccident_devkit.rooms import added
@@ -188,6 +189,7 @@ def _task_verb(task: TaskName) -> click.Command:
     return evaluated
 
 
+@workers_kept()
 def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any) -> None:
     out: Path | None = options["out"]
     _refuse_unused(setup, options)

@@ -4,7 +4,7 @@ Every function that works on many scenarios or samples takes `workers` and `exec
 """
 
 from deepaccident_devkit.parallel.batches import Engine, Places, Progress, in_order, run_batch, run_unordered
-from deepaccident_devkit.parallel.executors import cluster_executor, own_threads
+from deepaccident_devkit.parallel.executors import cluster_executor, own_threads, workers_kept
 from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
 from deepaccident_devkit.parallel.store import Store, unfinished_folder
 
@@ -22,4 +22,5 @@ __all__ = [
     "run_batch",
     "run_unordered",
     "unfinished_folder",
+    "workers_kept",
 ]

@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, CancelledError
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -23,7 +24,7 @@ from deepaccident_devkit.errors import MOST_TOLD, DeepAccidentError, MissingExtr
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor, ThreadPoolExecutor
+    from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 
     from distributed import Client
 
@@ -35,6 +36,8 @@ MPI: Final = "mpi"
 SECONDS: Final = 10.0
 """How long an empty file of a scheduler may still get its address."""
 _PACKAGE: Final = __name__.partition(".")[0]
+_kept: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
+"""Within `workers_kept`: number of processes → a pool of them that waits for work."""
 
 
 def width_of(executor: Executor) -> int:
@@ -161,6 +164,23 @@ def _address_in(file: Path) -> str:
 
 
 @contextmanager
+def workers_kept() -> Iterator[None]:
+    """Keep own workers that begin in the block for what comes after in it: to begin takes each most of a second.
+
+    They end with the outermost such block.
+    """
+    pools: dict[int, ProcessPoolExecutor] = {}
+    token = _kept.set(pools) if _kept.get() is None else None
+    try:
+        yield
+    finally:
+        if token is not None:
+            _kept.reset(token)
+        for pool in pools.values():
+            pool.shutdown()
+
+
+@contextmanager
 def own_workers(count: int) -> Iterator[Executor]:
     """A pool of spawned processes: an error of an item lets the others end what they do; all else ends them at once.
 
@@ -170,7 +190,10 @@ def own_workers(count: int) -> Iterator[Executor]:
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
-    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
+    kept = _kept.get()
+    pool = kept.pop(count, None) if kept else None
+    if pool is None:
+        pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
     try:
         yield pool
     except BaseException as error:
@@ -180,7 +203,8 @@ def own_workers(count: int) -> Iterator[Executor]:
                 process.kill()
         pool.shutdown(wait=of_an_item, cancel_futures=of_an_item)
         raise
-    pool.shutdown()
+    if kept is None or kept.setdefault(count, pool) is not pool:
+        pool.shutdown()
 
 
 def own_threads() -> ThreadPoolExecutor:

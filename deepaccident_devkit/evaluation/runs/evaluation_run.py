@@ -40,7 +40,7 @@ from deepaccident_devkit.evaluation.runs.setups import (
     scenario_of,
 )
 from deepaccident_devkit.evaluation.task import headlines, plain
-from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.parallel import run_batch, workers_kept
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.taxonomy import SPLITS
@@ -320,6 +320,7 @@ class _AttributesWhenAsked(Mapping[str, SampleAttributes]):
         return len(self.tokens)
 
 
+@workers_kept()
 def evaluate_results(
     dataset: Dataset,
     results: Results | str | os.PathLike[str],

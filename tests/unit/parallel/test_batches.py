@@ -21,7 +21,16 @@ from processes import is_running, wait_for
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ReleaseError, SomeFailedError, WorkerError
-from deepaccident_devkit.parallel import Failure, Places, Tried, check_failures, in_order, run_batch, run_unordered
+from deepaccident_devkit.parallel import (
+    Failure,
+    Places,
+    Tried,
+    check_failures,
+    in_order,
+    run_batch,
+    run_unordered,
+    workers_kept,
+)
 from deepaccident_devkit.parallel.batches import Call, marked
 from deepaccident_devkit.parallel.executors import signals_put_off
 
@@ -185,6 +194,20 @@ def ctrl_c_counts() -> Iterator[None]:
 def test_a_killed_worker_is_our_error() -> None:
     with pytest.raises(WorkerError, match=r"^a worker process was killed \(.*memory ran out; .* with fewer workers$"):
         run_batch(workers.killed, range(6), workers=2)
+
+
+def test_kept_workers_do_what_comes_next_until_one_is_killed_or_the_block_ends() -> None:
+    with workers_kept():
+        with workers_kept():
+            first = run_batch(workers.process, range(6), workers=2)
+        second = run_batch(workers.process, range(6), workers=2)
+        assert all(map(is_running, first + second))
+        assert len({*first, *second}) <= 2
+        with pytest.raises(WorkerError):
+            run_batch(workers.killed, range(6), workers=2)
+        third = run_batch(workers.process, range(6), workers=2)
+        assert {*first, *second}.isdisjoint(third)
+    assert not any(map(is_running, first + second + third))
 
 
 def test_workers_leave_ctrl_c_to_the_parent() -> None:
