@@ -24,6 +24,7 @@ NAMES = (
     "engine",
     "stores",
     "explore",
+    "beside",
 )
 
 
@@ -32,7 +33,7 @@ NAMES = (
 @click.option("--json", "as_json", is_flag=True, help="One flat JSON object (name: number) and nothing else.")
 def main(names: tuple[str, ...], as_json: bool) -> None:  # noqa: FBT001 - click's flag
     """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels, evaluation,
-    coverage, safety, render, synth, export, loader, engine, stores, explore.
+    coverage, safety, render, synth, export, loader, engine, stores, explore, beside.
     """
     figures = []
     for name in names or NAMES:

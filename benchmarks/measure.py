@@ -17,7 +17,7 @@ class Figure:
         unit: of value and bound.
         bound: what it should not be worse than, None for a figure that only informs.
         higher_is_better: whether the bound is a lower one.
-        reference: what the released code takes, in the same unit; None where it has no like.
+        reference: what the released code takes, or in `beside` the other way, in the same unit; None without such.
     """
 
     name: str
@@ -56,13 +56,13 @@ def one_core() -> Iterator[None]:
 
 def table(figures: Sequence[Figure]) -> str:
     """The figures as aligned text."""
-    rows = [["figure", "measured", "bound", "times better", "released code", "times faster"]]
+    rows = [["figure", "measured", "bound", "times better", "the other", "times faster"]]
     for figure in figures:
         row = [figure.name, f"{_number(figure.value)} {figure.unit}".strip(), "", "", "", ""]
         if figure.bound is not None:
             row[2:4] = f"{_number(figure.bound)} {figure.unit}", f"{figure.ratio:.2f}"
         if figure.reference is not None:
-            row[4:6] = f"{_number(figure.reference)} {figure.unit}", f"{figure.reference / figure.value:.0f}"
+            row[4:6] = f"{_number(figure.reference)} {figure.unit}", f"{figure.reference / figure.value:.3g}"
         rows.append(row)
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
     widths = [max(map(len, column)) for column in columns]
