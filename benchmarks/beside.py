@@ -119,7 +119,7 @@ def gaps_by_skimage(instance: Any, ids: Any) -> object:
 
 
 def as_tensors(labels: MotionLabels) -> tuple[Any, ...]:
-    """Maps that take the nearest value (T, 6, H, W), the centres' peaks, and where each frame's points are (T, 2, 3)."""
+    """Maps for nearest values (T, 6, H, W), the centres' peaks, and where each frame's points are (T, 2, 3)."""
     import torch
 
     maps = labels.segmentation[:, None], labels.instance[:, None], labels.offset, labels.flow
