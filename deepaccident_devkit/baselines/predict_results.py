@@ -7,7 +7,7 @@ alone, and several processes share the scenarios.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -95,6 +95,8 @@ def predict_results(
 ) -> Path:
     """Write a baseline's predictions of samples to a results file (of motion, a folder); returns its path.
 
+    Scenario follows scenario there, in the order in which the samples name them.
+
     The bytes do not depend on workers. If a call is interrupted, the same call continues it: only the scenarios at hand
     are lost. Several processes that are given the same `out` share the scenarios. Complete results of the same samples
     and settings are left as they are.
@@ -117,6 +119,7 @@ def predict_results(
     task, path = choice("task", task, get_args(ResultsTask)), path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
     work = _Work(dataset, task, baseline or Baseline(), tuple(scenarios))
+    tokens = [token for own in scenarios.values() for token in own]
     name = work.digest(tokens)
     store = Store(unfinished_folder(path), path, "predicts for it", ResultsError, name)
     if work.is_done(path, tokens):
@@ -134,7 +137,9 @@ def predict_results(
         if not work.is_done(path, tokens):  # by another process meanwhile
             store.run(_predict, jobs, label=work.task, places=places, **how)
         if turn.alone() and not work.is_done(path, tokens):
-            _join(work.writer(path), jobs, tokens)
+            with work.writer(path) as whole:
+                for job in jobs.values():
+                    whole.add_part(read_results(job.path))
             store.remove()
     return path
 
@@ -147,8 +152,10 @@ def is_predicted(
     baseline: Baseline | None = None,
 ) -> bool:
     """Whether `predict_results` has written its results with these arguments before."""
-    scenarios = tuple(dict.fromkeys(map(scenario_of, tokens)))
-    return _Work(dataset, task, baseline or Baseline(), scenarios).is_done(path_of(out).absolute(), tokens)
+    path = path_of(out).absolute()
+    scenarios = samples_by_scenario(path, tokens)
+    work = _Work(dataset, task, baseline or Baseline(), tuple(scenarios))
+    return work.is_done(path, [token for own in scenarios.values() for token in own])
 
 
 def samples_by_scenario(path: Path, tokens: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -226,11 +233,3 @@ def _predict(job: _Job) -> None:
         if isinstance(error.__cause__, OSError):
             raise error.__cause__ from None
         raise
-
-
-def _join(whole: ResultsWriter, jobs: Mapping[str, _Job], tokens: Sequence[str]) -> None:
-    """Write the results of all scenarios as one."""
-    kept = {scenario: read_results(job.path) for scenario, job in jobs.items()}
-    with whole:
-        for token in tokens:
-            whole.add(token, kept[scenario_of(token)].prediction(token))

@@ -141,7 +141,7 @@ class MotionContents:
         """Check the manifest, and that its shards exist and have their sizes; raises ContentError."""
         self._path, self._root = path, path.parent
         self.meta = meta
-        self._shards = document.shards
+        self.shards = document.shards
         with at("form"):
             self.form = MotionForm.from_record(document.form)
         self._shard_of = _shards_of(document.shards, path.parent)
@@ -160,7 +160,7 @@ class MotionContents:
     def check(self, **how: Any) -> None:
         """Read every array, as `run_batch` is told; raises ResultsError that names shard, token and array."""
         check = partial(check_shard, self._root, self.form)
-        run_batch(check, self._shards, label="shards", places=Places(reads=(self._root,)), **how)
+        run_batch(check, self.shards, label="shards", places=Places(reads=(self._root,)), **how)
 
 
 def _shards_of(shards: Sequence[Shard], root: Path) -> dict[str, Shard]:

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -20,7 +21,7 @@ from deepaccident_devkit.errors import EvaluationError, ResultsError, shortened
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, checked_prediction
 from deepaccident_devkit.evaluation.results.motion import HEADS, MEMBER, MotionForm
-from deepaccident_devkit.evaluation.results.reader import read_results
+from deepaccident_devkit.evaluation.results.reader import Results, contents_of, read_results
 from deepaccident_devkit.evaluation.results.records import (
     ENTRY_RECORDS,
     FORMAT,
@@ -43,6 +44,8 @@ from deepaccident_devkit.support.reading import file_checksum
 from deepaccident_devkit.support.text import choice, differing_text, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
+_BODY, _END = ',\n"results": {', "\n}\n}\n"
+"""What is before and after the entries in a file; no line ends in the notes."""
 _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 _MOST_SAMPLES: Final = 64
 MOST_BYTES: Final = 32 * 2**20
@@ -159,6 +162,18 @@ class ResultsWriter:
             raise _unwritten(self.path, error) from error
         self._tokens.add(token)
 
+    def add_part(self, part: Results) -> None:
+        """Write all predictions of results that a `ResultsWriter` of the same arguments wrote, bytes as they are.
+
+        Raises:
+            ResultsError: nothing can be read or written.
+        """
+        if self._body is None:
+            raise ResultsError(f"{self.path}: is not open; add parts inside `with ResultsWriter(…) as writer:`")
+        with _told(self.path):
+            self._body.add_part(part)
+        self._tokens.update(part.tokens)
+
     def _check_free(self) -> None:
         with _told(self.path):
             empty = self.task == "motion" and self.path.is_dir() and not any(self.path.iterdir())
@@ -204,7 +219,7 @@ class EntryWriter:
         self._file = path.open("w", encoding="utf-8", newline="\n")
         for name, value in header.items():
             self._file.write(f"{',' if self._file.tell() else '{'}\n{json.dumps(name)}: {json.dumps(value)}")
-        self._file.write(',\n"results": {')
+        self._file.write(_BODY)
 
     def add(self, token: str, prediction: object) -> None:
         """Write the entries of a sample; raises ResultsError or ContentError, and nothing of it is written then."""
@@ -213,11 +228,17 @@ class EntryWriter:
         self._file.write(f"{',' if self._count else ''}\n{json.dumps(token)}: {entries}")
         self._count += 1
 
+    def add_part(self, part: Results) -> None:
+        """Write the entries of a file that another of this class wrote."""
+        body = part.path.read_text(encoding="utf-8").partition(_BODY)[2].removesuffix(_END)
+        self._file.write(f"{',' if self._count else ''}{body}")
+        self._count += len(part)
+
     def finish(self) -> None:
         """Write the end; raises ResultsError if nothing was added."""
         if not self._count:
             raise ResultsError("no prediction was added; results of no sample cannot be read")
-        self._file.write("\n}\n}\n")
+        self._file.write(_END)
         self.close()
 
     def close(self) -> None:
@@ -331,6 +352,16 @@ class ShardWriter:
         written = sum(entry.compress_size for entry in self._archive.infolist())
         if len(self._in_shard) >= _MOST_SAMPLES or written >= MOST_BYTES:
             self._end_shard()
+
+    def add_part(self, part: Results) -> None:
+        """Copy the shards of a folder that another of this class wrote, of the same grid and frames."""
+        self._end_shard()
+        contents: Any = contents_of(part.path / RESULTS_FILE)[0]
+        self._grid, self._frames = contents.form.grid, contents.form.frames
+        self._predictions = max(self._predictions, contents.form.predictions)
+        for shard in contents.shards:
+            shutil.copyfile(part.path / shard.file, self._folder / self._file)
+            self._shards.append(msgspec.structs.replace(shard, file=self._file))
 
     def finish(self) -> None:
         """Write the manifest; raises ResultsError if nothing was added."""
