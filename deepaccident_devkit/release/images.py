@@ -106,7 +106,7 @@ def encode_jpeg(path: ReleasePath, image: ByteArray, quality: int = JPEG_QUALITY
 
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
         raise SensorFileError(f"{path}: expected shape (H, W, 3) of uint8, found {image.shape} of {image.dtype}")
-    done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    done, encoded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise SensorFileError(f"{path}: an image of shape {image.shape} cannot be encoded as JPEG")
     return bytes(encoded.tobytes())

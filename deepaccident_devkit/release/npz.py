@@ -151,5 +151,7 @@ def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
 
 def write_bev(path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = _FAST) -> None:
     """Write tags and object ids, both (1200, 1200), forward up; `level` is that of `write_npz`."""
-    high, low = instance >> 8, instance & 255
-    write_npz(path, np.stack([high, low, semantic], axis=-1).astype(np.uint8), level=level)
+    import cv2
+
+    high, low = (instance >> 8).astype(np.uint8), instance.astype(np.uint8)
+    write_npz(path, np.asarray(cv2.merge([high, low, np.ascontiguousarray(semantic)])), level=level)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping
-from contextlib import nullcontext
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+
+import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.styles import GRID_COLOR, current_style, size_in_style
@@ -26,6 +28,8 @@ Layer = Literal[
 above, `labels` what the motion labels say."""
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 _UNDATED: Final[Mapping[str, dict[str, Any]]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+_PASSES, _STILL = 4, 1e-5
+"""How often a figure is laid out at most; of its width or height, how far a panel that does not move may move."""
 PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
 
 
@@ -93,8 +97,8 @@ def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
     return ax
 
 
-def settled(fig: Figure, passes: int = 1) -> Figure:
-    """The figure, laid out so many times.
+def settled(fig: Figure) -> Figure:
+    """The figure, laid out once.
 
     matplotlib measures the room for titles and legends before it makes the panels' scales equal, so the room is too
     small. When it lays the figure out again at rendering, it starts from panels that are nearly right.
@@ -102,9 +106,25 @@ def settled(fig: Figure, passes: int = 1) -> Figure:
     engine = fig.get_layout_engine() if fig.figure is fig else None  # a part of a figure is laid out with it
     if engine is not None:
         with getattr(fig, "settings", nullcontext)():
-            for _ in range(passes):
-                engine.execute(fig)
+            engine.execute(fig)
     return fig
+
+
+@contextmanager
+def _laid_out(fig: Figure, dpi: float) -> Iterator[None]:
+    """Lay a figure out until its panels move no more, a few times at most; in the block, matplotlib does not do it."""
+    engine, usual, places = fig.get_layout_engine(), fig.dpi, np.zeros(0)
+    fig.set_dpi(dpi)  # letters are measured in pixels
+    for _ in range(_PASSES):
+        before, places = places, np.array([ax.get_position(original=False).bounds for ax in settled(fig).axes])
+        if before.shape == places.shape and np.abs(places - before).max(initial=0) < _STILL:
+            break
+    fig.set_layout_engine(None)
+    try:
+        yield
+    finally:
+        fig.set_layout_engine(engine)
+        fig.set_dpi(usual)
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
@@ -144,13 +164,14 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
     `words` are the text entries of a PNG file. The figure is one from `detached_figure`; others stay open in pyplot.
     """
     kind = path.suffix[1:].lower()
-    with replacing(path) as temporary:
-        settled(figure, passes=3).savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
+    with replacing(path) as temporary, _laid_out(figure, dpi):
+        figure.savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
     return path
 
 
 def figure_png(figure: Figure, *, dpi: float) -> bytes:
     """A figure from `detached_figure` as the bytes of a PNG file."""
     written = io.BytesIO()
-    settled(figure, passes=3).savefig(written, format="png", dpi=dpi)
+    with _laid_out(figure, dpi):
+        figure.savefig(written, format="png", dpi=dpi)
     return written.getvalue()

@@ -298,8 +298,8 @@ def cloud_text(recording: Recording, agent: str, frame: int) -> str | None:
     ground = np.percentile(height, _GROUND) if len(height) else 0.0
     raised = cloud.xyz[height > ground + _LEAST_HEIGHT]
     world = dataset.world_from(sample, "ego").apply(raised)[:, :2] - recording.origin
-    cells = np.floor(world / _CELL).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
+    column, row = np.floor(world / _CELL).astype(np.int64).T
+    _, first = np.unique((column << 32) + row, return_index=True)  # one number sorts faster than two
     kept = world[first[:: max(1, -(-len(first) // _MOST))]]
     decimetres = np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1)
     return base64.b64encode(decimetres.astype("<i2").tobytes()).decode("ascii")

@@ -88,8 +88,7 @@ class EmbreeCaster:
         if self._is_empty or not len(rays):
             distance, face = np.full(len(rays), np.inf, np.float32), np.full(len(rays), NOTHING, np.int32)
         else:
-            starts = np.empty_like(rays)
-            starts[:] = origin
+            starts = np.broadcast_to(origin.astype(np.float32), rays.shape)
             ends = None if reach is None else reach.astype(np.float32)  # a copy, because Embree writes into it
             hits = self._scene.run(starts, rays, ends, query="INTERSECT", output=True)
             face, distance = hits["primID"] >> 1, hits["tfar"]

@@ -222,7 +222,7 @@ def scan(
     back = np.flatnonzero(returned)
     ray, reach = rows[back], reach[back]
     measured = np.maximum(reach + np.float32(RANGE_NOISE) * normal[noise + ray], np.float32(0.1))
-    return Scan((ray_directions()[ray] * measured[:, None]).astype(np.float32), ray, face[back], reach)
+    return Scan((ray_directions().take(ray, axis=0) * measured[:, None]).astype(np.float32), ray, face[back], reach)
 
 
 def intensity(points: Scan, air: Air) -> Float32Array:

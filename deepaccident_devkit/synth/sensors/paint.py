@@ -52,16 +52,18 @@ class Palette:
 class Colors:
     """The same as `Palette` for all faces of a moment, and for `GROUND` and `NOTHING`, as tables for a quick look-up.
 
+    Those of (F + 2,) uint32 are painted: red, green, blue and kind (`FACADE`, `SHINES` or 0), one byte each.
+
     Attributes:
-        wall: (F + 2,) uint32: red, green, blue and kind (`FACADE`, `SHINES` or 0), one byte each.
-        shaded: (F + 2, 3) uint8.
-        window: (F + 2, 3) uint8.
+        wall: (F + 2,) uint32.
+        shaded: (F + 2,) uint32; the kind is 0.
+        window: (F + 2,) uint32; the kind is `SHINES`, because the light of lamps does not show on glass.
         shining: (F + 2, 3) uint8.
     """
 
     wall: NDArray[np.uint32]
-    shaded: NDArray[np.uint8]
-    window: NDArray[np.uint8]
+    shaded: NDArray[np.uint32]
+    window: NDArray[np.uint32]
     shining: NDArray[np.uint8]
 
 
@@ -96,8 +98,16 @@ def packed(still: Palette, moving: Palette, lamps: Mapping[int, Color]) -> Color
     kind = np.concatenate([still.facade, moving.facade, [False, False]]).astype(np.uint8)
     shines: BoolArray = np.asarray(shining.any(axis=1))
     kind[shines] = SHINES
-    table = np.ascontiguousarray(np.column_stack([np.where(shines[:, None], shining, wall), kind]))
-    return Colors(table.view(np.uint32)[:, 0], shaded, window, shining)
+    return Colors(
+        _paints(np.where(shines[:, None], shining, wall), kind), _paints(shaded), _paints(window, SHINES), shining
+    )
+
+
+def _paints(colors: ByteArray, kind: ByteArray | int = 0) -> NDArray[np.uint32]:
+    """Colours (F, 3) and their kinds as (F,) uint32."""
+    table = np.empty((len(colors), 4), dtype=np.uint8)
+    table[:, :3], table[:, 3] = colors, kind
+    return table.view(np.uint32)[:, 0]
 
 
 def is_facade(surfaces: Surfaces) -> BoolArray:
@@ -200,26 +210,27 @@ def on_facades(
     """The façade of each pixel (R, C) that shows one, and its place on it; `xyz` are metres of the points shown."""
     x, y, z = xyz
     pixel = np.flatnonzero(shown)
-    met = face.reshape(-1)[pixel]
-    across = x.reshape(-1)[pixel] + y.reshape(-1)[pixel] - facades.start[met]
-    return OnFacades(pixel, met, across, z.reshape(-1)[pixel] - facades.foot[met])
+    met = face.take(pixel)
+    across = x.take(pixel) + y.take(pixel) - facades.start.take(met)
+    return OnFacades(pixel, met, across, z.take(pixel) - facades.foot.take(met))
 
 
-def windows_on(picture: ByteArray, places: OnFacades, facades: Facades, colors: Colors, *, lit: bool) -> None:
-    """Paint windows on façades into a picture (R, C, 3), in place; if `lit`, two of five shine."""
+def windows_on(painted: NDArray[np.uint32], places: OnFacades, facades: Facades, colors: Colors, *, lit: bool) -> None:
+    """Paint windows on façades into a picture (R, C), as `Colors` has them, in place; if `lit`, two of five shine."""
     if not len(places.pixel):
         return
     length = facades.length
     density = np.maximum(np.rint(length * np.float32(1 / _BAY)), 1) / np.maximum(length, 1)
-    bays = places.across * density[places.face]
+    bays = places.across * density.take(places.face)
     storeys = (places.up - np.float32(_FLOOR)) * np.float32(1 / STOREY)
     bay, storey = np.floor(bays), np.floor(storeys)
-    in_bay, in_storey = bays - bay, storeys - storey
-    pane = (in_bay > _BAY_SPAN[0]) & (in_bay < _BAY_SPAN[1])
-    pane &= (in_storey > _STOREY_SPAN[0]) & (in_storey < _STOREY_SPAN[1]) & (storey >= 0)
+    bays -= bay
+    storeys -= storey
+    pane = (bays > _BAY_SPAN[0]) & (bays < _BAY_SPAN[1]) & (storey >= 0)
+    pane &= (storeys > _STOREY_SPAN[0]) & (storeys < _STOREY_SPAN[1])
     glass = np.flatnonzero(pane)
-    flat, face = picture.reshape(-1, 3), places.face[glass]
-    flat[places.pixel[glass]] = colors.window[face]
+    face, flat = places.face.take(glass), painted.reshape(-1)
+    flat[places.pixel.take(glass)] = colors.window.take(face)
     if lit:
         number = bay[glass].astype(np.int64) * 7 + storey[glass].astype(np.int64) * 13 + face
-        flat[places.pixel[glass[number % 5 < _LIT_OF_FIVE]]] = _LIT
+        flat[places.pixel[glass[number % 5 < _LIT_OF_FIVE]]] = _paints(np.array([_LIT], dtype=np.uint8), SHINES)

@@ -41,8 +41,8 @@ from deepaccident_devkit.synth.sensors.paint import (
 from deepaccident_devkit.synth.sensors.scene import Scene, Setting
 from deepaccident_devkit.synth.sensors.shadows import (
     Ground,
+    PassingGround,
     WallShadows,
-    ground_of,
     shadows_on,
     still_ground,
     wall_shadows,
@@ -62,12 +62,14 @@ class Rays:
         down: how far down they are there, in the same way.
         face: (R, C) as in `Scene.cast`.
         depth: (R, C) float32, metres along the camera's axis; infinite for the sky.
+        spacing: by how much `right` differs from ray to ray.
     """
 
     right: Float32Array
     down: Float32Array
     face: IntArray
     depth: Float32Array
+    spacing: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +79,7 @@ class Buffers:
     Attributes:
         all: every pixel, (H, W); a pixel on an outline shows what the first of its rays meets.
         outline: (E,) rows, of H · W, of the pixels on outlines.
-        fine: the two rays of each of these pixels, next to each other, (R, 256), padded at the end.
+        fine: the two rays of each of these pixels, (2 · R, 256): all first ones, then all second ones, both padded.
     """
 
     all: Rays
@@ -93,19 +95,20 @@ def look(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Buffers:
     right, down = slopes(camera, coarse_column, coarse_row)
     movers = nearest_movers(scene, camera, ground_from_camera)
     rays = ray_directions(ground_from_camera, right[None, :], down[:, None])
-    still = scene.setting.cast_columns(ground_from_camera.translation, rays)
+    origin, setting = ground_from_camera.translation, scene.setting
+    still = setting.kept(ground_from_camera.matrix.tobytes(), lambda: setting.cast_columns(origin, rays))
     near = np.flatnonzero(movers[: height + 2 : 2, : width + 2 : 2].ravel() < still[0])
-    depth, face = scene.with_movers(ground_from_camera.translation, rays.reshape(-1, 3), still, near)
+    depth, face = scene.with_movers(origin, rays.reshape(-1, 3), still, near)
     coarse_face, coarse_depth = face.reshape(shape), depth.reshape(shape).astype(np.float32)
     full_face, mixed = _spread(coarse_face, height, width)
     full_depth = _interpolated(coarse_depth, height, width)
     outline = np.flatnonzero(mixed)
     fine = _fine(scene, camera, ground_from_camera, outline, movers)
-    count = len(_SUBPIXELS) * len(outline)
-    full_face.reshape(-1)[outline] = fine.face.reshape(-1)[: count : len(_SUBPIXELS)]
-    full_depth.reshape(-1)[outline] = fine.depth.reshape(-1)[: count : len(_SUBPIXELS)]
+    full_face.reshape(-1)[outline] = fine.face.reshape(-1)[: len(outline)]
+    full_depth.reshape(-1)[outline] = fine.depth.reshape(-1)[: len(outline)]
     all_right, all_down = slopes(camera, np.arange(width), np.arange(height))
-    return Buffers(Rays(all_right[None, :], all_down[:, None], full_face, full_depth), outline, fine)
+    spacing = _spacing(all_right[:2])
+    return Buffers(Rays(all_right[None, :], all_down[:, None], full_face, full_depth, spacing), outline, fine)
 
 
 def slopes(camera: Camera, column: AnyArray, row: AnyArray) -> tuple[Float32Array, Float32Array]:
@@ -129,39 +132,44 @@ def _spread(coarse: IntArray, height: int, width: int) -> tuple[IntArray, NDArra
     same = coarse[:-1, :-1] == coarse[1:, :-1]
     same &= coarse[:-1, :-1] == coarse[:-1, 1:]
     same &= coarse[:-1, :-1] == coarse[1:, 1:]
-    full, mixed = (each.repeat(2, axis=0).repeat(2, axis=1)[:height, :width] for each in (coarse[:-1, :-1], ~same))
-    return np.ascontiguousarray(full), np.ascontiguousarray(mixed)
+    full, mixed = (np.empty((2 * same.shape[0], 2 * same.shape[1]), dtype=each.dtype) for each in (coarse, same))
+    for fine, each in ((full, coarse[:-1, :-1]), (mixed, ~same)):
+        fine[::2, ::2] = fine[::2, 1::2] = each
+        fine[1::2] = fine[::2]
+    return np.ascontiguousarray(full[:height, :width]), mixed[:height, :width]
 
 
 def _interpolated(depth: Float32Array, height: int, width: int) -> Float32Array:
     """Depths of all pixels (H, W) from those of every second pixel: the inverse of a plane's depth is linear."""
     inverse = 1 / depth
-    full = np.empty((2 * (len(inverse) - 1), 2 * (inverse.shape[1] - 1)), dtype=np.float32)
-    full[::2, ::2] = inverse[:-1, :-1]
-    full[1::2, ::2] = (inverse[:-1, :-1] + inverse[1:, :-1]) / 2
-    full[:, 1::2] = full[:, ::2] / 2
-    full[::2, 1::2] += inverse[:-1, 1:] / 2
-    full[1::2, 1::2] += (inverse[:-1, 1:] + inverse[1:, 1:]) / 4
+    rows = np.empty((2 * (len(inverse) - 1), inverse.shape[1]), dtype=np.float32)
+    rows[::2], rows[1::2] = inverse[:-1], (inverse[:-1] + inverse[1:]) / 2
+    full = np.empty((len(rows), 2 * (rows.shape[1] - 1)), dtype=np.float32)
+    full[:, ::2], full[:, 1::2] = rows[:, :-1], (rows[:, :-1] + rows[:, 1:]) / 2
     with np.errstate(divide="ignore"):
         return np.ascontiguousarray(1 / full[:height, :width])
 
 
 def _fine(scene: Scene, camera: Camera, ground_from_camera: SE3, outline: IntArray, movers: Float32Array) -> Rays:
     """Two rays for each pixel of `outline`; `movers` comes from `nearest_movers`."""
-    row, column = np.divmod(outline, camera.optics.width)
-    offsets = np.array(_SUBPIXELS)
-    right, down = slopes(camera, column[:, None] + offsets[:, 0], row[:, None] + offsets[:, 1])
-    filled = -len(outline) * len(_SUBPIXELS) % _COLUMNS
-    right, down = (
-        np.pad(each.reshape(-1), (0, filled), mode="edge" if len(outline) else "empty") for each in (right, down)
-    )
+    width, height = camera.optics.width, camera.optics.height
+    filled = np.pad(outline, (0, -len(outline) % _COLUMNS), mode="edge" if len(outline) else "empty")
+    row, column = np.divmod(filled, width)
+    across, downwards = np.array(_SUBPIXELS).T[..., None]
+    right, down = slopes(camera, np.arange(width) + across, np.arange(height) + downwards)
+    spacing = _spacing(right[:, column[:1]].ravel())
+    right, down = right.take(column, axis=1).reshape(-1), down.take(row, axis=1).reshape(-1)
     rays = ray_directions(ground_from_camera, right, down)
     still = scene.setting.caster.cast(ground_from_camera.translation, rays)
-    reach = still[0][: len(outline) * len(_SUBPIXELS)]
-    near = np.flatnonzero(movers[row, column].repeat(len(_SUBPIXELS)) < reach)
+    near = np.flatnonzero(np.tile(movers[row, column], len(_SUBPIXELS)) < still[0])
     depth, face = scene.with_movers(ground_from_camera.translation, rays, still, near)
-    shape = -1, _COLUMNS
-    return Rays(right.reshape(shape), down.reshape(shape), face.reshape(shape), depth.reshape(shape).astype(np.float32))
+    right, down, face, depth = (each.reshape(-1, _COLUMNS) for each in (right, down, face, depth))
+    return Rays(right, down, face, depth.astype(np.float32), spacing)
+
+
+def _spacing(right: Float32Array) -> float:
+    """How far apart two neighbouring rays are, metres a metre ahead."""
+    return float(np.abs(np.diff(right)).max(initial=1e-3))
 
 
 _COARSER = (1.0, 4.0)
@@ -214,17 +222,16 @@ def shade(rays: Rays, around: Surroundings, ground_from_camera: SE3) -> ByteArra
     import cv2
 
     points = _points(rays, ground_from_camera)
-    packed = around.colors.wall.take(rays.face, mode="wrap")
-    table = packed.view(np.uint8).reshape(*packed.shape, 4)
+    painted = around.colors.wall.take(rays.face, mode="wrap")
+    table = painted.view(np.uint8).reshape(*painted.shape, 4)
+    places = on_facades(table[..., 3] == FACADE, rays.face, (points.x, points.y, points.z), around.facades)
+    shadows_on(painted, places, around.shadows, around.colors)
+    windows_on(painted, places, around.facades, around.colors, lit=around.light.lamps > 0.5)
     picture = np.asarray(cv2.cvtColor(table, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
     _add_ground(picture, rays, points, around.ground, float(ground_from_camera.translation[2]))
-    kind = table[..., 3]
-    places = on_facades(kind == FACADE, rays.face, (points.x, points.y, points.z), around.facades)
-    shadows_on(picture, places, around.shadows, around.colors)
     if around.lamplight is not None:
-        share = np.where(kind == SHINES, 0, np.where(rays.face == GROUND, 1, _ON_THINGS)).astype(np.float32)
+        share = np.where(table[..., 3] == SHINES, 0, np.where(rays.face == GROUND, 1, _ON_THINGS)).astype(np.float32)
         picture = _lamplit(picture, share, points, around)
-    windows_on(picture, places, around.facades, around.colors, lit=around.light.lamps > 0.5)
     picture = _hazed(picture, rays, around.light)
     _add_sky(picture, rays.face == NOTHING, points, around.sky)
     return picture
@@ -242,30 +249,28 @@ def _add_ground(picture: ByteArray, rays: Rays, points: Points, ground: Ground, 
     """Paint the pixels that show the ground, in place, each from the picture with the matching resolution."""
     import cv2
 
-    shown = rays.face == GROUND
-    spread = float(np.abs(np.diff(rays.right[:1, :2])).max(initial=1e-3)) or 1e-3
-    ends = [0.0, *(np.sqrt(span * max(height, 0.5) / max(spread, 1e-3)) for span in _COARSER), np.inf]
-    for level in range(len(ground.levels)):
-        mask = shown & (rays.depth >= ends[level]) & (rays.depth < ends[level + 1])
-        for rows, here in _rows_of(mask):
-            cv2.copyTo(ground.at(points.x[rows], points.y[rows], level), here, picture[rows])
+    shown, ends = rays.face == GROUND, (np.sqrt(span * max(height, 0.5) / rays.spacing) for span in _COARSER)
+    for level, end in enumerate((*ends, np.inf)):
+        here = shown & (rays.depth < end)
+        shown ^= here
+        for part in _part_of(here):
+            colors = ground.at(points.x[part], points.y[part], level)
+            cv2.copyTo(colors, here[part].view(np.uint8), picture[part])
 
 
 def _add_sky(picture: ByteArray, shown: BoolArray, points: Points, sky: Sky) -> None:
     """Paint the pixels that show the sky, in place."""
     import cv2
 
-    for rows, here in _rows_of(shown):
-        cv2.copyTo(sky.toward(points.east[rows], points.north[rows], points.up[rows]), here, picture[rows])
+    for part in _part_of(shown):
+        colors = sky.toward(points.east[part], points.north[part], points.up[part])
+        cv2.copyTo(colors, shown[part].view(np.uint8), picture[part])
 
 
-def _rows_of(mask: BoolArray) -> list[tuple[slice, ByteArray]]:
-    """One slice with all rows in which a mask (R, C) is true, and the mask of these rows; empty if it is never true."""
-    rows = np.flatnonzero(mask.any(axis=1))
-    if not len(rows):
-        return []
-    span = slice(int(rows[0]), int(rows[-1]) + 1)
-    return [(span, mask[span].view(np.uint8))]
+def _part_of(mask: BoolArray) -> list[tuple[slice, slice]]:
+    """The rows and columns around all that is true in a mask (R, C); empty if nothing is."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return [np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]] if len(rows) else []
 
 
 def _lamplit(picture: ByteArray, share: Float32Array, points: Points, around: Surroundings) -> ByteArray:
@@ -289,8 +294,9 @@ def _hazed(picture: ByteArray, rays: Rays, light: Light) -> ByteArray:
     seen *= np.sqrt(1 + rays.right**2 + rays.down**2)
     seen *= np.float32(-light.haze)
     seen = np.asarray(cv2.exp(seen, seen))
+    # row by row: pixel by pixel takes longer than the rest
     haze = np.empty_like(picture)
-    haze[:] = light.horizon.astype(np.uint8)
+    haze.reshape(len(haze), -1)[:] = np.tile(light.horizon.astype(np.uint8), picture.shape[1])
     return np.asarray(cv2.blendLinear(picture, haze, seen, 1 - seen))
 
 
@@ -314,19 +320,19 @@ class Studio:
     def __init__(self, setting: Setting, weather: str, time_of_day: str, rng: np.random.Generator) -> None:
         self.light = light_of(weather, time_of_day)
         self._sky = make_sky(self.light, rng)
-        self._ground = still_ground(setting, self.light, rng)
+        self._ground = PassingGround(still_ground(setting, self.light, rng))
         self._palette = still_palette(setting, self.light)
         self._facades = facades_of(setting.still)
         self._shadows = wall_shadows(setting, self._facades, self.light)
 
     def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings:
-        """The colours of a moment, for the cameras of all agents; `signals` as in `light.lit_lamps`."""
+        """The colours of a moment, for the cameras of all agents, until the next call; `signals` as in `lit_lamps`."""
         lamps = lit_lamps(scene.setting.world, signals)
         rows = scene.setting.props
         return Surroundings(
             light=self.light,
             sky=self._sky,
-            ground=ground_of(self._ground, scene, self.light),
+            ground=self._ground.at(scene, self.light),
             facades=self._facades,
             shadows=self._shadows,
             colors=packed(
@@ -347,8 +353,9 @@ def render(
     buffers = look(scene, camera, ground_from_camera)
     picture = shade(buffers.all, around, ground_from_camera)
     if len(buffers.outline):
-        fine = shade(buffers.fine, around, ground_from_camera).reshape(-1, 2, 3)[: len(buffers.outline)]
-        picture.reshape(-1, 3)[buffers.outline] = (fine.astype(np.uint16).sum(axis=1) // 2).astype(np.uint8)
+        one, other = shade(buffers.fine, around, ground_from_camera).reshape(len(_SUBPIXELS), -1, 3)
+        mean = (one & other) + ((one ^ other) >> 1)  # without more bits than eight
+        picture.reshape(-1, 3)[buffers.outline] = mean[: len(buffers.outline)]
     if around.light.wet:
         picture = _with_reflections(picture, buffers, scene, around, camera, ground_from_camera)
     if around.light.lamps:

@@ -30,8 +30,10 @@ _TAG_OF_CATEGORY = np.array(
 
 def bev_picture(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevImage:
     """The picture around an agent; higher road users cover lower ones."""
+    import cv2
+
     x, y = ground_from_ego.translation[:2].tolist()
-    semantic = tag_of_code()[_map_around(top, x, y, ground_from_ego.yaw)]
+    semantic = np.asarray(cv2.LUT(_map_around(top, x, y, ground_from_ego.yaw), tag_of_code()), dtype=np.uint8)
     instance = np.zeros(BEV_SHAPE, dtype=np.uint16)
     poses = _relative_poses(scene.snapshot.poses, x, y, ground_from_ego.yaw)
     actors = scene.actors

@@ -62,8 +62,8 @@ _UPRIGHT = CATEGORIES.index("pedestrian")
 _ENDLESS = 1e3
 _LEVEL, _CAREFUL = 1e-6, 1e-3
 """The largest angle between two lines that count as one; the share of its length that a ray may be shorter."""
-_CASTS_KEPT = 8
-"""How many results are kept of rays from sensors that have not moved: five LiDARs, and a reserve."""
+_POSES_KEPT = 40
+"""How many poses of sensors are remembered: of five LiDARs and thirty cameras, and a reserve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class Setting:
         self.moving_owner = actors.solid_actor[~solid_parked]
         self.caster = make_caster(self.still.corners, self.terrain)
         self._fence: Caster = make_caster(_endless(self.still.corners))
-        self._kept: dict[bytes, tuple[AnyArray, AnyArray]] = {}
+        self._kept: dict[bytes, tuple[AnyArray, AnyArray] | None] = {}
 
     @property
     def faces(self) -> int:
@@ -178,9 +178,10 @@ class Setting:
         distance = plane_distance(origin[2], flat[:, 2]).astype(np.float32)
         face = np.where(np.isfinite(distance), np.int32(GROUND), np.int32(NOTHING))
         clear = self._clear(origin, rays[0])
-        ends = np.minimum(distance, limit).reshape(rays.shape[:2]) * np.hypot(rays[..., 0], rays[..., 1])
+        level = np.sqrt(rays[..., 0] ** 2 + rays[..., 1] ** 2)
+        ends = np.minimum(distance, limit).reshape(rays.shape[:2]) * level
         open_ = np.flatnonzero((ends > clear * (1 - _CAREFUL)).ravel())
-        distance[open_], face[open_] = self.caster.cast(origin, flat[open_])
+        distance[open_], face[open_] = self.caster.cast(origin, flat.take(open_, axis=0))
         return distance, face
 
     def _clear(self, origin: FloatArray, directions: AnyArray) -> AnyArray:
@@ -193,10 +194,11 @@ class Setting:
         return np.asarray(reached * np.linalg.norm(level, axis=1))
 
     def kept(self, pose: bytes, cast: Callable[[], tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
-        """The result of `cast`; from memory if it was called for the same pose before. Do not change it."""
+        """The result of `cast`; from memory if it was called twice for the same pose before. Do not change it."""
+        stands = pose in self._kept
         found = self._kept.pop(pose, None) or cast()
-        self._kept[pose] = found
-        if len(self._kept) > _CASTS_KEPT:
+        self._kept[pose] = found if stands else None
+        if len(self._kept) > _POSES_KEPT:
             del self._kept[next(iter(self._kept))]
         return found
 
@@ -279,7 +281,8 @@ class Scene:
 
     def _cast_at_movers(self, origin: FloatArray, directions: AnyArray, rows: IntArray) -> tuple[AnyArray, AnyArray]:
         """How far the rays of `rows` go until they meet a moving road user, and the faces that they meet."""
-        reached, met = self.caster.cast(origin if origin.ndim == 1 else origin[rows], directions[rows])
+        rays = directions.take(rows, axis=0)
+        reached, met = self.caster.cast(origin if origin.ndim == 1 else origin[rows], rays)
         return reached, met + self.setting.faces
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepaccident_devkit.support.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.synth import roads
@@ -22,7 +23,7 @@ def add_shadows(picture: ByteArray, corners: FloatArray, to_sun: FloatArray, bri
     cells = _shadowed(_outlines(corners, to_sun))
     dimmed, flat = (np.arange(256) * brightness).astype(np.uint8), picture.reshape(-1, 3)
     # all cells are read before one is written, so that two shadows together are not darker than one
-    flat[cells] = dimmed[flat[cells]]
+    flat[cells] = dimmed[flat.take(cells, axis=0)]
     return cells
 
 
@@ -31,12 +32,11 @@ def _shadowed(outlines: IntArray) -> IntArray:
     import cv2
 
     cells = [np.zeros(0, dtype=np.int64)]
-    for outline in outlines:
-        low, high = np.maximum(outline.min(axis=0), 0), np.minimum(outline.max(axis=0) + 1, MAP_CELLS)
-        if (low >= high).any():
-            continue
+    lows, highs = np.maximum(outlines.min(axis=1), 0), np.minimum(outlines.max(axis=1) + 1, MAP_CELLS)
+    for solid in np.flatnonzero((lows < highs).all(axis=1)).tolist():
+        low, high = lows[solid], highs[solid]
         mask = np.zeros(high[::-1] - low[::-1], dtype=np.uint8)
-        cv2.fillConvexPoly(mask, cv2.convexHull((outline - low).astype(np.int32)), 1)
+        cv2.fillConvexPoly(mask, cv2.convexHull((outlines[solid] - low).astype(np.int32)), 1)
         rows, columns = np.nonzero(mask)
         cells.append((rows + low[1]) * MAP_CELLS + columns + low[0])
     return np.concatenate(cells)
@@ -118,14 +118,17 @@ def _sun_on(setting: Setting, light: Light, faces: IntArray, counts: IntArray) -
     return np.where(met == NOTHING, np.uint8(255), np.uint8(0)).reshape(rows, -1)
 
 
-def shadows_on(picture: ByteArray, places: OnFacades, shadows: WallShadows, colors: Colors) -> None:
-    """Darken façades that a picture (R, C, 3) shows where the sun does not reach them, in place."""
+def shadows_on(painted: NDArray[np.uint32], places: OnFacades, shadows: WallShadows, colors: Colors) -> None:
+    """Darken façades of a picture (R, C), as `Colors` has them, where the sun does not reach them, in place."""
     import cv2
 
     if shadows.lit.size == 1:
         return
-    column = places.across * shadows.density[places.face] + shadows.column[places.face]
-    row = places.up * np.float32(1 / _CELL) - np.float32(0.5)
+    first = shadows.column.take(places.face)
+    sunny = np.flatnonzero(first > 0)
+    face, pixel = places.face.take(sunny), places.pixel.take(sunny)
+    column = places.across.take(sunny) * shadows.density.take(face) + first.take(sunny)
+    row = places.up.take(sunny) * np.float32(1 / _CELL) - np.float32(0.5)
     seen = np.empty(len(row), dtype=np.uint8)
     for start in range(0, len(row), _AT_ONCE):
         block = slice(start, start + _AT_ONCE)
@@ -133,12 +136,13 @@ def shadows_on(picture: ByteArray, places: OnFacades, shadows: WallShadows, colo
             shadows.lit, column[None, block], row[None, block], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
         seen[block] = np.asarray(found)[0]
-    flat = picture.reshape(-1, 3)
+    flat = painted.reshape(-1)
     dark, edge = np.flatnonzero(seen == 0), np.flatnonzero((seen > 0) & (seen < 255))
-    flat[places.pixel[dark]] = colors.shaded[places.face[dark]]
-    weight = seen[edge, None] / np.float32(255)
-    mixed = flat[places.pixel[edge]] * weight + colors.shaded[places.face[edge]] * (1 - weight)
-    flat[places.pixel[edge]] = mixed.astype(np.uint8)
+    flat[pixel.take(dark)] = colors.shaded.take(face.take(dark))
+    weight, shaded = seen[edge, None] / np.float32(255), colors.shaded[face[edge]]
+    lit = flat[pixel[edge]]
+    mixed = lit.view(np.uint8).reshape(-1, 4) * weight + shaded.view(np.uint8).reshape(-1, 4) * (1 - weight)
+    flat[pixel[edge]] = mixed.astype(np.uint8).view(np.uint32)[:, 0]
 
 
 _COLORS = {
@@ -194,16 +198,29 @@ def still_ground(setting: Setting, light: Light, rng: np.random.Generator) -> Gr
     return _with_coarser(plain, _coarser(plain, len(plain) // SHRINK))
 
 
-def ground_of(still: Ground, scene: Scene, light: Light) -> Ground:
-    """The ground at a moment: with the shadows of moving road users, and a dark edge around every vehicle."""
-    finest, coarser = still.levels[0].copy(), still.levels[1].copy()
-    corners = above_ground(scene.movers.corners[scene.movers.solids.main], scene.setting.terrain)
-    cells = [add_shadows(finest, corners, light.to_sun, light.in_shadow)]
-    upwards = np.array([0.0, 0.0, 1.0])
-    for beyond, brightness in _CLOSE_BY:
-        cells.append(add_shadows(finest, _slabs(scene, beyond), upwards, brightness))
-    _follow(coarser, finest, np.concatenate(cells))
-    return _with_coarser(finest, coarser)
+class PassingGround:
+    """The ground at one moment after another: with the shadows of moving road users, and dark edges around vehicles.
+
+    To copy the ground that stands `still` would take longer than to put back what the last moment changed.
+    """
+
+    def __init__(self, still: Ground) -> None:
+        self._still, self._now = still.levels[:2], [level.copy() for level in still.levels[:2]]
+        self._changed = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+
+    def at(self, scene: Scene, light: Light) -> Ground:
+        """The ground at a moment; it is correct until the next call."""
+        for now, still, cells in zip(self._now, self._still, self._changed, strict=True):
+            now.reshape(-1, 3)[cells] = still.reshape(-1, 3).take(cells, axis=0)
+        finest, coarser = self._now
+        corners = above_ground(scene.movers.corners[scene.movers.solids.main], scene.setting.terrain)
+        cells = [add_shadows(finest, corners, light.to_sun, light.in_shadow)]
+        upwards = np.array([0.0, 0.0, 1.0])
+        for beyond, brightness in _CLOSE_BY:
+            cells.append(add_shadows(finest, _slabs(scene, beyond), upwards, brightness))
+        changed = np.concatenate(cells)
+        self._changed = changed, _follow(coarser, finest, changed)
+        return _with_coarser(finest, coarser)
 
 
 def _with_coarser(*levels: ByteArray) -> Ground:
@@ -221,19 +238,22 @@ def _coarser(picture: ByteArray, width: int) -> ByteArray:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _follow(coarser: ByteArray, finest: ByteArray, cells: IntArray) -> None:
+def _follow(coarser: ByteArray, finest: ByteArray, cells: IntArray) -> IntArray:
     """Make the second picture agree with the finest one, in place, where cells of that (K,) have changed.
 
-    To make all of it again would take most of a moment's time if the images are small.
+    To make all of it again would take most of a moment's time if the images are small. Returns its own cells (L,) that
+    may have changed.
     """
     row, column = np.divmod(cells, MAP_CELLS)
     changed = np.zeros(coarser.shape[:2], dtype=bool)
     changed[row // SHRINK, column // SHRINK] = True
-    rows, columns = np.nonzero(changed)
+    own = np.flatnonzero(changed)
+    rows, columns = np.divmod(own, coarser.shape[1])
     squares = finest.reshape(len(coarser), SHRINK, -1, SHRINK, 3)[rows, :, columns]
     if len(squares):
         side_by_side = squares.transpose(1, 0, 2, 3).reshape(SHRINK, -1, 3)
         coarser[rows, columns] = _coarser(side_by_side, len(squares))[0]
+    return own
 
 
 def _slabs(scene: Scene, beyond: float) -> FloatArray:
@@ -258,5 +278,8 @@ def _picture(ground: GroundMap, lit: FloatArray, wet: float, rng: np.random.Gene
     grain = (rng.normal(0, _GRAIN, (_TILE, _TILE)) + np.asarray(patches)).round().clip(-32, 32).astype(np.int16)
     scale = float(lit.mean()) * wet
     shades = (palette[:, None, :] + scale * np.arange(-32, 33)[None, :, None]).clip(0, 255).astype(np.uint8)
-    repeated = np.tile(grain + 32, (MAP_CELLS // _TILE, MAP_CELLS // _TILE))
-    return np.asarray(shades[ground.codes, repeated])
+    repeated, picture = np.tile(grain + 32, MAP_CELLS // _TILE), np.empty((MAP_CELLS, MAP_CELLS, 3), dtype=np.uint8)
+    for top in range(0, MAP_CELLS, _TILE):
+        place = ground.codes[top : top + _TILE].astype(np.intp) * shades.shape[1] + repeated
+        picture[top : top + _TILE] = shades.reshape(-1, 3).take(place, axis=0)
+    return picture
