@@ -261,7 +261,7 @@ class LabelMaps:
 
         They share one piece of memory. Five pieces of a megabyte each would be returned to the system after every
         sample, and to get them again takes as long as all the rasterising. Nor are pieces of several samples returned
-        after glibc's allocator has once freed a larger one, which is never touched.
+        after the allocator (of Linux) has once freed a larger one, which is never touched.
         """
         frames, (height, width) = config.label_frames, config.grid.shape
         count = frames * height * width
