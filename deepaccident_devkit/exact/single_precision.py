@@ -142,10 +142,10 @@ class SamplingLine(NamedTuple):
     shift: AnyArray
     finish: Callable[[AnyArray], AnyArray]
 
-    def points(self) -> AnyArray:
-        """(H, W), of all target cells with the first matrix."""
-        point = np.add.outer(self.of_row[0], self.of_column[0])
-        point += self.shift[0]
+    def points(self, matrix: int = 0) -> AnyArray:
+        """(H, W), of all target cells with one of the matrices."""
+        point = np.add.outer(self.of_row[matrix], self.of_column[matrix])
+        point += self.shift[matrix]
         return self.finish(point)
 
     def points_of(self, matrix: IntArray, row: IntArray, column: IntArray, run: IntArray) -> AnyArray:
