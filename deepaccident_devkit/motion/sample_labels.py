@@ -22,6 +22,8 @@ from deepaccident_devkit.motion.warping import egomotion
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked_number
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables import visible_mask
+from deepaccident_devkit.tables.tables import token_of
+from deepaccident_devkit.tables.tokens import agent_token
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CHANNELS,
@@ -282,8 +284,9 @@ def _seen(
     See docs/released_code.md, Visibility and attributes.
     """
     boxes, agents = dataset.columns("annotation"), dataset.columns("agent")
-    of_agent = {one: _observers(dataset, sample, config) for one, sample in zip(agent.tolist(), group, strict=True)}
-    observers = [of_agent[one] for one in agent.tolist()]
+    one_each = dict(zip(agent.tolist(), group, strict=True))
+    of_agent = {row: _observers(dataset, sample, config) for row, sample in one_each.items()}
+    observers = [of_agent[row] for row in agent.tolist()]
     observer, sample = np.concatenate(observers), np.repeat(np.arange(len(agent)), [len(one) for one in observers])
     known = there[sample]
     row, count = _annotations(dataset, (agents["first_sample_row"][observer][:, None] + index[sample])[known])
@@ -305,9 +308,9 @@ def _seen(
 
 def _observers(dataset: Dataset, sample: RowArgument, config: MotionLabelConfig) -> list[int]:
     """The rows of the agents whose sight counts for a sample's agent."""
-    scenario = dataset.get("sample", sample)["scenario_token"]
+    scenario = token_of(sample).rsplit("/", 2)[0]
     names = cooperating_agents(dataset, sample, config.agents)
-    return [dataset.getind("agent", f"{scenario}/{name}") for name in names]
+    return [dataset.getind("agent", agent_token(scenario, name)) for name in names]
 
 
 def _annotations(dataset: Dataset, rows: IntArray) -> tuple[IntArray, IntArray]:
