@@ -142,7 +142,7 @@ class SamplingLine(NamedTuple):
     shift: AnyArray
     finish: Callable[[AnyArray], AnyArray]
 
-    def points(self, matrix: int = 0) -> AnyArray:
+    def points(self, matrix: int) -> AnyArray:
         """(H, W), of all target cells with one of the matrices."""
         point = np.add.outer(self.of_row[matrix], self.of_column[matrix])
         point += self.shift[matrix]

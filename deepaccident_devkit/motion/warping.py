@@ -235,7 +235,7 @@ def sample_points(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProt
     """
     matrix = checked("source_from_target", source_from_target, (4, 4))
     rows, columns = sampling_lines(matrix[None], grid, rules)
-    return rows.points(), columns.points()
+    return rows.points(0), columns.points(0)
 
 
 def sampling_lines(matrices: AnyArray, grid: BevGrid, rules: LabelProtocol) -> tuple[SamplingLine, SamplingLine]:
