@@ -150,6 +150,7 @@ class DeepAccident(Dataset):
     town_map = maps.town_map
     describe = safety.describe
     motion_labels = motion.motion_labels
+    motion_labels_of = motion.motion_labels_of
     bev_segmentation = motion.bev_segmentation
     samples = motion.samples
     training_samples = motion.training_samples

@@ -142,10 +142,10 @@ class SamplingLine(NamedTuple):
     shift: AnyArray
     finish: Callable[[AnyArray], AnyArray]
 
-    def points(self) -> AnyArray:
-        """(H, W), of all target cells with the first matrix."""
-        point = np.add.outer(self.of_row[0], self.of_column[0])
-        point += self.shift[0]
+    def points(self, matrix: int) -> AnyArray:
+        """(H, W), of all target cells with one of the matrices."""
+        point = np.add.outer(self.of_row[matrix], self.of_column[matrix])
+        point += self.shift[matrix]
         return self.finish(point)
 
     def points_of(self, matrix: IntArray, row: IntArray, column: IntArray, run: IntArray) -> AnyArray:
@@ -228,7 +228,10 @@ def take_cells(cells: AnyArray, indices: CellIndices, fill: float = 0) -> AnyArr
 
 
 def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float = 0) -> Float32Array:
-    """The values (…, H, W) of a raster at sample points, each the weighted mean of the four cells around."""
+    """The values (…, H, W) of a raster at sample points, each the weighted mean of the four cells around.
+
+    Nearly all is done in the memory of the points, whose numbers are lost.
+    """
     rows, columns = raster.shape[-2:]
     wide = columns + 3
     padded = np.full((*raster.shape[:-2], rows + 3, wide), fill, dtype=np.float32)
@@ -241,11 +244,14 @@ def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float
     above += wide + 1
     index = above.astype(np.int32).astype(np.intp)  # in two steps: three times as fast
     up, back = 1 - down, 1 - right
-    result: Float32Array = cells.take(index, axis=-1, mode="clip")
-    value = np.empty_like(result)
+    result: Float32Array = cells.take(index, axis=-1, mode="wrap")  # all are inside; the fastest mode
     result *= up * back
-    for shift, weight in ((1, up * right), (wide, down * back), (wide + 1, down * right)):
-        cells[..., shift:].take(index, axis=-1, mode="clip", out=value)
+    up *= right
+    back *= down
+    down *= right
+    value = np.empty_like(result)
+    for shift, weight in ((1, up), (wide, back), (wide + 1, down)):
+        cells[..., shift:].take(index, axis=-1, mode="wrap", out=value)
         value *= weight
         result += value
     return result
@@ -253,10 +259,10 @@ def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float
 
 def _parted(points: AnyArray, count: int) -> tuple[AnyArray, Float32Array]:
     """The cell before each point, from −1 (padding) to `count` (padding), and how far beyond it the point is."""
-    clipped = np.clip(points, -1, count)
-    before = np.floor(clipped)
-    clipped -= before
-    return before, clipped.astype(np.float32, copy=False)
+    np.clip(points, -1, count, out=points)
+    before = np.floor(points)
+    points -= before
+    return before, points.astype(np.float32, copy=False)
 
 
 @functools.lru_cache(maxsize=64)

@@ -34,7 +34,7 @@ from deepaccident_devkit.model.detection import decode_detections, detected_boxe
 from deepaccident_devkit.model.inputs import mirrored_boxes, model_inputs
 from deepaccident_devkit.model.motion import MotionMaps
 from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.motion import motion_labels
+from deepaccident_devkit.motion import motion_labels_of
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
@@ -208,9 +208,9 @@ def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path:
     """IoU and VPQ of motion results at samples, beside what the notes of shipped weights expect of another release."""
     rules = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)
     evaluator, results = MotionEvaluator(rules, trajectories=False), read_results(path)
-    for token in tokens:
+    for token, labels in zip(tokens, motion_labels_of(dataset, tokens, model.config.labels), strict=True):
         predicted: Any = results.prediction(token)
-        evaluator.update(token, predicted, motion_labels(dataset, token, model.config.labels))
+        evaluator.update(token, predicted, labels)
     here, told = evaluator.compute().ranges["100x100"], model.notes["scored"]
     expected = "IoU {iou:.1%}, VPQ {vpq:.1%}".format_map(told["scores"])
     return (

@@ -25,7 +25,7 @@ from deepaccident_devkit.model.motion import MotionTargets, frame_mask, motion_l
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.results import PredictConfig, predictions
 from deepaccident_devkit.model.training_run import TrainConfig
-from deepaccident_devkit.motion import motion_labels, samples
+from deepaccident_devkit.motion import motion_labels_of, samples
 
 SCORE = "score"
 """The mean of the IoU and the VPQ at all distances: what the best checkpoint has most of."""
@@ -108,8 +108,9 @@ def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config:
     labels, rules = model.config.labels, DETECTION_PROTOCOLS["paper"]
     counted = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)
     motion, detection = MotionEvaluator(counted, trajectories=False), DetectionEvaluator(rules)
-    for found in predictions(model, dataset, tokens, config):
-        motion.update(found.token, found.motion, motion_labels(dataset, found.token, labels))
+    made = predictions(model, dataset, tokens, config)
+    for found, truth in zip(made, motion_labels_of(dataset, tokens, labels), strict=True):
+        motion.update(found.token, found.motion, truth)
         pose = dataset.world_from(found.token, rules.frame).inverse()
         boxes = DetectedBoxes(boxes=found.boxes.boxes.transform(pose, rules.frame), scores=found.boxes.scores)
         detection.update(found.token, boxes, detection_truth(dataset, found.token, rules))

@@ -4,8 +4,8 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 
 | step | from → to | where |
 |---|---|---|
-| which samples, and what one shows | tables → `FrameBoxes`, ego motion | `sample_labels` |
-| who is rasterised, and where | boxes → `FramePolygons` → `Footprints` | `box_polygons`, `exact.polygon_fill` |
+| which samples, and what they show | tables → `BoxRows`, ego motion | `sample_labels` |
+| who is rasterised, and where | boxes → `Polygons` → `Footprints` | `box_polygons`, `exact.polygon_fill` |
 | ids, centres, flow, maps | footprints → centres here and at the next frame → `MotionLabels` | `drawing`, `labels` |
 | all frames in the present ego frame | `MotionLabels` → the same, warped | `labels`, `warping` |
 | to another code, to disk | `MotionLabels` → batches; files | `batch_names`; `label_files` |
@@ -35,7 +35,13 @@ from deepaccident_devkit.motion.instances import (
 )
 from deepaccident_devkit.motion.label_files import LabelFiles, LabelsWritten, write_label_files
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.sample_labels import evaluation_samples, motion_labels, samples, training_samples
+from deepaccident_devkit.motion.sample_labels import (
+    evaluation_samples,
+    motion_labels,
+    motion_labels_of,
+    samples,
+    training_samples,
+)
 from deepaccident_devkit.motion.warping import agents_to_ego, past_to_present
 
 __all__ = [
@@ -64,6 +70,7 @@ __all__ = [
     "labels_from_polygons",
     "motion_labels",
     "motion_labels_from_boxes",
+    "motion_labels_of",
     "past_to_present",
     "predict_instances",
     "samples",

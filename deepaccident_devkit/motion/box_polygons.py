@@ -113,6 +113,30 @@ class FramePolygons(ShortRepr):
         object.__setattr__(self, "key", readonly(checked("FramePolygons.key", self.key, (len(corners),), np.int64)))
 
 
+class Polygons(NamedTuple):
+    """The polygons of F frames in the order in which they are rasterised; fields as in `FramePolygons`.
+
+    Attributes:
+        corners: (n, 4, 2).
+        frame: (n,) int64, ascending.
+        key: (n,) int64.
+    """
+
+    corners: AnyArray
+    frame: IntArray
+    key: IntArray
+
+    @classmethod
+    def of(cls, frames: Sequence[FramePolygons | None]) -> Polygons:
+        """Those of all frames, one after another."""
+        there = [(number, frame) for number, frame in enumerate(frames) if frame is not None]
+        return cls(
+            np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *[frame.corners for _, frame in there]]),
+            np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64),
+            np.concatenate([np.zeros(0, dtype=np.int64), *[frame.key for _, frame in there]]),
+        )
+
+
 class Footprints(NamedTuple):
     """Rasterised polygons of all frames in the order of their frames, in native orientation.
 
@@ -146,42 +170,35 @@ def box_polygons(
     Raises:
         GeometryError: a frame is neither `FrameBoxes` nor None.
     """
-    for given in frames:
-        if not isinstance(given, FrameBoxes | None):
-            raise GeometryError(f"frames: expected FrameBoxes, or None beyond the recording, found {given!r}")
-    there = [number for number, frame in enumerate(frames) if frame is not None]
-    known = [frame for frame in frames if frame is not None]
-    result: list[FramePolygons | None] = [None] * len(frames)
-    if not known:
-        return result
-    boxes, number = _Joined.of(known), np.arange(len(known))
-    moved = _moved(boxes.values, boxes.pose[boxes.frame])
-    own, own_frame = (
-        _own_boxes(known, moved, boxes.pose, config) if config.draw_ego and is_vehicle else (moved[:0], number[:0])
-    )
-    drawn = _drawn(boxes, first=there[0], config=config)
+    polygons = polygons_of(BoxRows.of(frames, is_vehicle=is_vehicle), config)
+    ends = polygons.frame.searchsorted(np.arange(len(frames)), side="right").tolist()
+    return [
+        None if frame is None else FramePolygons(corners=polygons.corners[start:end], key=polygons.key[start:end])
+        for frame, start, end in zip(frames, [0, *ends], ends, strict=False)
+    ]
+
+
+def polygons_of(boxes: BoxRows, config: MotionLabelConfig) -> Polygons:
+    """The polygons of boxes that labels show; in each frame the ego's own first, then the others by their rows."""
+    pose = flip_pose(boxes.ego_from_lidar).astype(np.float32)
+    moved = _moved(_constructed(boxes.center, boxes.size, boxes.yaw), pose[boxes.frame])
+    own, own_frame = _own_boxes(boxes, moved, pose, config)
+    drawn = _drawn(boxes, config)
     others: AnyArray = _corners(_augmented(moved[drawn], config.augmentation))
     if config.rules.pose == "yaw":
-        others = _leaning_corners(known, config.augmentation)[drawn]
+        others = _leaning_corners(boxes, config.augmentation)[drawn]
     if not config.rules.own_box_not_augmented:
         own = _augmented(own, config.augmentation)
     frame = np.concatenate([own_frame, boxes.frame[drawn]])
     order = np.argsort(frame, kind="stable")
-    key = np.concatenate([np.full(len(own), OWN_BOX_ID, dtype=np.int64), boxes.actor_id[drawn]])[order]
-    corners = np.concatenate([_corners(own), others])[order]
-    ends = frame[order].searchsorted(number, side="right").tolist()
-    for index, start, end in zip(there, [0, *ends], ends, strict=False):
-        result[index] = FramePolygons(corners=corners[start:end], key=key[start:end])
-    return result
+    key = np.concatenate([np.full(len(own), OWN_BOX_ID, dtype=np.int64), boxes.actor_id[drawn]])
+    return Polygons(np.concatenate([_corners(own), others])[order], frame[order], key[order])
 
 
-def footprints_of(polygons: Sequence[FramePolygons | None], ids: IntArray, config: MotionLabelConfig) -> Footprints:
-    """The polygons with these ids, rasterised in native orientation; later polygons lie on top."""
+def footprints_of(polygons: Polygons, ids: IntArray, frames: int, config: MotionLabelConfig) -> Footprints:
+    """The polygons of frames with these ids, rasterised in native orientation; later polygons lie on top."""
     native = config.grid.with_orientation(config.rules.native)
-    there = [(number, frame) for number, frame in enumerate(polygons) if frame is not None]
-    corners = np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *[frame.corners for _, frame in there]])
-    frame = np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64)
-    given = corners if config.rules.pose == "yaw" else corners.astype(np.float32, copy=False)
+    given = polygons.corners if config.rules.pose == "yaw" else polygons.corners.astype(np.float32, copy=False)
     x, y = given[..., 0], given[..., 1] if config.rules.right_handed else -given[..., 1]
     place = np.stack((y, x) if native.orientation == "fiery" else (x, y), axis=-1)
     low, _, size = np.array(axes_of(native)[::-1]).T
@@ -191,57 +208,86 @@ def footprints_of(polygons: Sequence[FramePolygons | None], ids: IntArray, confi
     else:
         cells = np.floor((place.astype(np.float64) - low) / size)
     vertices = np.clip(cells, -_FAR, _FAR).astype(np.int64)
-    return Footprints(vertices, frame, ids, topmost(vertices, native.shape, frame, len(polygons)))
+    return Footprints(vertices, polygons.frame, ids, topmost(vertices, native.shape, polygons.frame, frames))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Joined:
-    """The rows of several frames, M in all, as the released code holds them.
+class BoxRows:
+    """The boxes of S samples' label frames, M in all; frames are numbered through all samples, T of each.
+
+    Fields that `FrameBoxes` has too are as they are there, finite and right-handed.
 
     Attributes:
-        frame: (M,) which of the frames.
-        values: (M, 7) float32, `_constructed`'s.
+        frame: (M,) int64, ascending.
+        center: (M, 3) float64.
+        size: (M, 3) float64.
+        yaw: (M,) float64.
         actor_id: (M,) int64.
-        category: (M,) int64.
+        category: (M,) int.
         visible: (M,) bool.
-        pose: (frames, 4, 4) float32, `ego_from_lidar`, left-handed.
+        ego_from_lidar: (S · T, 4, 4) float64; the identity where there is no recording.
+        has_own: (S, T) bool, whether the agent, at this frame of its recording, is a vehicle with a box of its own.
     """
 
     frame: IntArray
-    values: Float32Array
+    center: FloatArray
+    size: FloatArray
+    yaw: FloatArray
     actor_id: IntArray
     category: AnyArray
     visible: BoolArray
-    pose: Float32Array
+    ego_from_lidar: FloatArray
+    has_own: BoolArray
 
     @classmethod
-    def of(cls, frames: Sequence[FrameBoxes]) -> _Joined:
-        columns = zip(*map(_COLUMNS, frames), strict=True)
-        center, size, yaw, actor_id, category, visible = map(np.concatenate, columns)
+    def of(cls, frames: Sequence[FrameBoxes | None], *, is_vehicle: bool) -> BoxRows:
+        """Those of one sample; raises GeometryError."""
+        for given in frames:
+            if not isinstance(given, FrameBoxes | None):
+                raise GeometryError(f"frames: expected FrameBoxes, or None beyond the recording, found {given!r}")
+        known = [_NO_BOXES if frame is None else frame for frame in frames]
+        center, size, yaw, actor_id, category, visible = (
+            np.concatenate(columns) for columns in zip(*map(_COLUMNS, [_NO_BOXES, *known]), strict=True)
+        )
         return cls(
-            frame=np.repeat(np.arange(len(frames)), [len(frame.actor_id) for frame in frames]),
-            values=_constructed(center, size, yaw),
+            frame=np.repeat(np.arange(len(frames)), [len(frame.actor_id) for frame in known]),
+            center=center,
+            size=size,
+            yaw=yaw,
             actor_id=actor_id,
             category=category,
             visible=visible,
-            pose=flip_pose([frame.ego_from_lidar for frame in frames]).astype(np.float32),
+            ego_from_lidar=np.reshape([frame.ego_from_lidar for frame in known], (-1, 4, 4)),
+            has_own=np.array([[frame is not None and is_vehicle for frame in frames]]),
         )
 
 
-def _drawn(boxes: _Joined, first: int, config: MotionLabelConfig) -> BoolArray:
-    """Which rows are rasterised; `first` is the number of the first frame. Own rows are not: `_own_boxes` has them."""
+_NO_BOXES: Final = FrameBoxes(
+    center=np.zeros((0, 3)),
+    size=np.zeros((0, 3)),
+    yaw=np.zeros(0),
+    actor_id=np.zeros(0, dtype=np.int64),
+    category=np.zeros(0, dtype=np.int64),
+    visible=np.zeros(0, dtype=bool),
+    ego_from_lidar=np.eye(4),
+)
+
+
+def _drawn(boxes: BoxRows, config: MotionLabelConfig) -> BoolArray:
+    """Which rows are rasterised. Own rows are not: `_own_boxes` has them."""
     rows: BoolArray = boxes.actor_id != OWN_ACTOR_ID
     if config.only_vehicle:
         rows &= boxes.category != _PEDESTRIAN
     if not config.filter_invisible:
         return rows
     ids, actor = np.unique(boxes.actor_id, return_inverse=True)
-    seen = np.zeros((len(boxes.pose), len(ids)), dtype=bool)
+    seen = np.zeros((boxes.has_own.size, len(ids)), dtype=bool)
     seen[boxes.frame[boxes.visible], actor[boxes.visible]] = True
+    of_sample = seen.reshape(*boxes.has_own.shape, len(ids))
     if config.rules.drawn_when == "present":
-        seen[:] = seen[0] if first == 0 else False
+        of_sample[:] = of_sample[:, :1]
     elif config.rules.drawn_when == "since":
-        seen = np.logical_or.accumulate(seen)
+        of_sample[:] = np.logical_or.accumulate(of_sample, axis=1)
     by_id: BoolArray = seen[boxes.frame, actor]
     if not config.rules.untracked_share_an_id:
         by_id = np.where(boxes.actor_id == UNTRACKED_ID, boxes.visible, by_id)
@@ -249,29 +295,25 @@ def _drawn(boxes: _Joined, first: int, config: MotionLabelConfig) -> BoolArray:
 
 
 def _own_boxes(
-    frames: Sequence[FrameBoxes], moved: Float32Array, pose: Float32Array, config: MotionLabelConfig
+    boxes: BoxRows, moved: Float32Array, pose: Float32Array, config: MotionLabelConfig
 ) -> tuple[Float32Array, IntArray]:
     """The ego's own boxes in the ego frames, at most one for each frame, and the numbers of their frames."""
-    rules, own, of_frame, to_move = config.rules, [], [], []
-    start = 0
-    for number, frame in enumerate(frames):
-        rows = np.flatnonzero(frame.actor_id == OWN_ACTOR_ID)
-        default = rules.own_box_default and len(rows) != 1
-        if default:
-            z = frame.center[0, 2] if len(frame.center) else 0.0
-            own.append(_constructed(np.array([[0, 0, z]]), np.array([_DEFAULT_SIZE]), np.zeros(1))[0])
-        elif len(rows):
-            own.append(moved[start + rows[0]])
-            if rules.own_box_moved_twice:
-                own[-1] = own[-1] - own[-1][5] / 2 * _UP
-        if default or len(rows):
-            of_frame.append(number)
-            to_move.append(default or rules.own_box_moved_twice)
-        start += len(frame.actor_id)
-    boxes, which = np.array(own, dtype=np.float32).reshape(-1, 7), np.array(to_move, dtype=bool)
-    numbers = np.array(of_frame, dtype=np.int64)
-    boxes[which] = _moved(boxes[which], pose[numbers[which]])
-    return boxes, numbers
+    rules, frames = config.rules, np.arange(boxes.has_own.size)
+    rows = np.flatnonzero(boxes.actor_id == OWN_ACTOR_ID)
+    own = np.zeros((len(frames), 7), dtype=np.float32)
+    own[boxes.frame[rows[::-1]]] = moved[rows[::-1]]  # the first one of a frame counts
+    if rules.own_box_moved_twice:
+        own -= own[:, 5:6] / 2 * _UP
+    count = np.bincount(boxes.frame[rows], minlength=len(frames))
+    default = rules.own_box_default & (count != 1)
+    first, last = boxes.frame.searchsorted([frames, frames + 1])
+    z = np.append(boxes.center[:, 2], 0)[np.where(first < last, first, -1)]
+    at = np.stack([np.zeros_like(z), np.zeros_like(z), z], axis=1)
+    own[default] = _constructed(at, np.tile(_DEFAULT_SIZE, (len(z), 1)), np.zeros_like(z))[default]
+    twice = default | rules.own_box_moved_twice
+    own[twice] = _moved(own[twice], pose[twice])
+    shown = np.flatnonzero(boxes.has_own.reshape(-1) & (default | (count > 0)) & config.draw_ego)
+    return own[shown], shown
 
 
 def _constructed(center: FloatArray, size: FloatArray, yaw: FloatArray) -> Float32Array:
@@ -312,12 +354,18 @@ def _corners(boxes: Float32Array) -> Float32Array:
     return np.stack([x, -y], axis=-1)
 
 
-def _leaning_corners(frames: Sequence[FrameBoxes], augmentation: Augmentation | None) -> FloatArray:
-    """(M, 4, 2) x forward, y left of the bottom corners of all frames' boxes, which turn with the whole rotation."""
+def _leaning_corners(boxes: BoxRows, augmentation: Augmentation | None) -> FloatArray:
+    """(M, 4, 2) x forward, y left of the bottom corners of the boxes, which turn with the whole rotation."""
+    ends = boxes.frame.searchsorted(np.arange(len(boxes.ego_from_lidar)), side="right").tolist()
     corners = [
-        Boxes.from_arrays(each.center, np.abs(each.size), each.yaw, frame="lidar")  # labels may have negative sizes
-        .transform(trusted_se3(each.ego_from_lidar), "ego")
+        Boxes.from_arrays(
+            boxes.center[start:end],
+            np.abs(boxes.size[start:end]),  # labels may have negative ones
+            boxes.yaw[start:end],
+            frame="lidar",
+        )
+        .transform(trusted_se3(pose), "ego")
         .bottom_corners()[..., :2]
-        for each in frames
+        for pose, start, end in zip(boxes.ego_from_lidar, [0, *ends], ends, strict=False)
     ]
     return np.concatenate(corners) @ (np.eye(4) if augmentation is None else augmentation.matrix)[:2, :2].T

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -15,7 +15,14 @@ from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.exact.single_precision import SamplingLine
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import cells_in, vectors_in
-from deepaccident_devkit.motion.box_polygons import Footprints, FrameBoxes, FramePolygons, box_polygons, footprints_of
+from deepaccident_devkit.motion.box_polygons import (
+    Footprints,
+    FrameBoxes,
+    FramePolygons,
+    Polygons,
+    box_polygons,
+    footprints_of,
+)
 from deepaccident_devkit.motion.config import LabelProtocol, MotionLabelConfig, label_config
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warping import frames_from_next, nearest_indices, sampling_lines, sampling_matrix
@@ -35,6 +42,8 @@ _MOST_IDS: Final = 2**24
 """The largest id: float32 holds all whole numbers up to here."""
 _VANISHED: Final = 104.0
 """exp(−x) is 0 in float32 from here on."""
+_MOST_KEPT: Final = 31 * 2**20
+"""In bytes: a larger piece does not change what the allocator returns to the system."""
 _MARGIN: Final = 0.75
 """In cells, around a footprint: half a cell for the nearest sampling, and some for the rounding of the points."""
 _FARTHEST: Final = 2.0**16
@@ -94,25 +103,44 @@ def labels_from_polygons(
     past = config.receptive_field - 1
     there = np.array([True] * past + [frame is not None for frame in polygons])
     known = there if valid is None else there & checked("valid", valid, (config.frames,), np.bool_)
-    ids, continued = _numbered(polygons, config, {} if id_map is None else _checked_ids(id_map, config))
-    footprints = footprints_of(polygons, ids, config)
+    return next(labels_of(Polygons.of(polygons), motion[None], known[None], config, id_map))
+
+
+def labels_of(
+    polygons: Polygons,
+    egomotion: Float32Array,
+    valid: BoolArray,
+    config: MotionLabelConfig,
+    id_map: Mapping[int, int] | None,
+) -> Iterator[MotionLabels]:
+    """The labels of S samples, whose frames are numbered one after another: all but the maps is computed at once.
+
+    `egomotion` (S, R, 6) is finite, `valid` (S, R); each sample's ids continue `id_map`. Raises ConfigError.
+    """
+    past, frames = config.receptive_field - 1, config.label_frames
+    ids, continued = _numbered(polygons, len(valid), config, {} if id_map is None else _checked_ids(id_map, config))
+    footprints = footprints_of(polygons, ids, len(valid) * frames, config)
     covered = _covered(footprints, config)
     centers = covered.centers()
-    this_from_next = frames_from_next(motion[past:-1], config.rules, config.augmentation)
+    this_from_next = frames_from_next(egomotion[:, past:].reshape(-1, 6)[:-1], config.rules, config.augmentation)
     following = following_centers(footprints, sampling_matrix(this_from_next, config.rules), config, covered.ids)
     following[np.isnan(centers)] = np.nan
-    maps = label_maps(covered, centers, following, ~known[past:], config)
-    return MotionLabels(
-        config=config,
-        segmentation=maps.segmentation,
-        instance=maps.instance,
-        centerness=maps.centerness,
-        offset=maps.offset,
-        flow=maps.flow,
-        future_egomotion=motion,
-        valid=known,
-        id_map=continued,
-    )
+    del footprints  # else its cells stay until the last sample
+    for sample, own_ids in enumerate(continued):
+        first, last = sample * frames, (sample + 1) * frames
+        shown = covered.between(first, last)
+        maps = label_maps(shown, centers[first:last], following[first:last], ~valid[sample, past:], config)
+        yield MotionLabels(
+            config=config,
+            segmentation=maps.segmentation,
+            instance=maps.instance,
+            centerness=maps.centerness,
+            offset=maps.offset,
+            flow=maps.flow,
+            future_egomotion=egomotion[sample],
+            valid=valid[sample],
+            id_map=own_ids,
+        )
 
 
 def _checked_ids(id_map: Mapping[int, int], config: MotionLabelConfig) -> dict[int, int]:
@@ -133,19 +161,22 @@ def _checked_ids(id_map: Mapping[int, int], config: MotionLabelConfig) -> dict[i
 
 
 def _numbered(
-    polygons: Sequence[FramePolygons | None], config: MotionLabelConfig, id_map: dict[int, int]
-) -> tuple[IntArray, dict[int, int]]:
-    """The id of each polygon of all frames, and the extended map; ids count from 1 in the order of rasterising."""
-    highest, ids = max(id_map.values(), default=0), []
+    polygons: Polygons, samples: int, config: MotionLabelConfig, id_map: dict[int, int]
+) -> tuple[IntArray, list[dict[int, int]]]:
+    """The id of each polygon, and each sample's extended map; ids count from 1 in the order of rasterising."""
+    ids: list[int] = []
+    maps = [id_map.copy() for _ in range(samples)]
     nobody = None if config.rules.untracked_share_an_id else UNTRACKED_ID
-    for frame in polygons:
-        for key in [] if frame is None else frame.key.tolist():
-            if key == nobody or key not in id_map:
+    starts = polygons.frame.searchsorted(np.arange(1, samples) * config.label_frames)
+    for continued, keys in zip(maps, np.split(polygons.key, starts), strict=True):
+        highest = max(continued.values(), default=0)
+        for key in keys.tolist():
+            if key == nobody or key not in continued:
                 highest += 1
                 if key != nobody:
-                    id_map[key] = highest
-            ids.append(highest if key == nobody else id_map[key])
-    return np.array(ids, dtype=np.int64), id_map
+                    continued[key] = highest
+            ids.append(highest if key == nobody else continued[key])
+    return np.array(ids, dtype=np.int64), maps
 
 
 def _covered(footprints: Footprints, config: MotionLabelConfig) -> CoveredCells:
@@ -185,6 +216,18 @@ class CoveredCells:
     frames: int
     ids: int
 
+    def between(self, first: int, last: int) -> CoveredCells:
+        """Those of the frames from `first` to before `last`, which are numbered from 0 then; frames must ascend."""
+        cells = slice(*self.frame.searchsorted([first, last]).tolist())
+        return CoveredCells(
+            frame=self.frame[cells] - first,
+            row=self.row[cells],
+            column=self.column[cells],
+            identity=self.identity[cells],
+            frames=last - first,
+            ids=self.ids,
+        )
+
     @property
     def slot(self) -> IntArray:
         """(P,) frame · (1 + ids) + identity."""
@@ -217,10 +260,12 @@ class LabelMaps:
         """Maps of frames without any actor.
 
         They share one piece of memory. Five pieces of a megabyte each would be returned to the system after every
-        sample, and to get them again takes as long as all the rasterising.
+        sample, and to get them again takes as long as all the rasterising. Nor are pieces of several samples returned
+        after the allocator (of Linux) has once freed a larger one, which is never touched.
         """
         frames, (height, width) = config.label_frames, config.grid.shape
         count = frames * height * width
+        np.empty(min(5 * count * 25, _MOST_KEPT), dtype=np.uint8)
         memory = np.empty(count * 25, dtype=np.uint8)
         memory[: 16 * count].view(np.float32)[:] = config.ignore_index
         memory[16 * count :] = 0
@@ -316,9 +361,9 @@ class _Runs(NamedTuple):
 def following_centers(
     footprints: Footprints, next_from_this: AnyArray, config: MotionLabelConfig, ids: int
 ) -> Float32Array:
-    """(T, 1 + ids, 2) centres of the instances at the next frame, warped to each frame; NaN where they are not seen.
+    """(F, 1 + ids, 2) centres of the instances at the next frame, warped to each frame; NaN where they are not seen.
 
-    `next_from_this` (T − 1, 4, 4) is as `sampling_matrix` gives it, finite.
+    `next_from_this` (F − 1, 4, 4) is as `sampling_matrix` gives it, finite. A sample's last frame has no next one.
     """
     grid, rules = config.grid.with_orientation(config.rules.native), config.rules
     lines = sampling_lines(next_from_this, grid, rules)
@@ -337,7 +382,9 @@ def following_centers(
         frames=len(next_from_this) + 1,
         ids=ids,
     )
-    return warped.centers()
+    centers = warped.centers()
+    centers[config.label_frames - 1 :: config.label_frames] = np.nan
+    return centers
 
 
 def _seen_anywhere(

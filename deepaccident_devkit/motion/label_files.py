@@ -36,7 +36,7 @@ from deepaccident_devkit.motion.label_folder import (
     write_array,
 )
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.sample_labels import motion_labels
+from deepaccident_devkit.motion.sample_labels import motion_labels_of
 from deepaccident_devkit.parallel import Places
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.arrays import AnyArray
@@ -247,12 +247,15 @@ class _Work:
             if self.names is None
             else {batch_path(self.root, recording, frame): (frame,) for frame in frames}
         )
-        return [self._write_file(path, recording, each, source) for path, each in paths.items()]
+        new = {path: each for path, each in paths.items() if _source_of(path, self.names) != source}
+        tokens = [f"{recording}/{frame:03d}" for each in new.values() for frame in each]
+        labels = motion_labels_of(self.dataset, tokens, self.config)
+        for path, each in new.items():
+            self._write_file(path, each, source, labels)
+        return [path in new for path in paths]
 
-    def _write_file(self, path: Path, recording: str, frames: tuple[int, ...], source: str) -> bool:
-        """Write one file, unless it is there; a batch has its code's arrays alone, its source is the zip's comment."""
-        if _source_of(path, self.names) == source:
-            return False
+    def _write_file(self, path: Path, frames: tuple[int, ...], source: str, of_frames: Iterator[MotionLabels]) -> None:
+        """Write one file of the next labels; a batch has its code's arrays alone, its source is the zip's comment."""
         place = place_in(self.root, path.relative_to(self.root))
         with replacing(place) as temporary, zipfile.ZipFile(temporary, "w") as archive:
             if self.names is None:
@@ -260,14 +263,12 @@ class _Work:
                 write_array(archive, "source", np.array(source))
             else:
                 archive.comment = source.encode()
-            for frame in frames:
-                labels = motion_labels(self.dataset, f"{recording}/{frame:03d}", self.config)
+            for frame, labels in zip(frames, of_frames, strict=False):  # the others are of the files after it
                 if self.names is None:
                     StoredLabels.of(labels).write(archive, f"{frame:03d}")
                 else:
                     for name, array in labels.as_batch(self.names).items():
                         write_array(archive, name, array)
-        return True
 
     def _source(self, recording: str, frames: tuple[int, ...]) -> str:
         """A digest of all that files are made from: configuration, samples or names, and the scenario's rows."""

@@ -234,14 +234,17 @@ def sample_points(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProt
     Native orientation; float32, but float64 if `exact`. Raises GeometryError.
     """
     matrix = checked("source_from_target", source_from_target, (4, 4))
-    if not np.isfinite(matrix).all():
-        raise GeometryError("source_from_target: not all numbers are finite; leave out frames without a pose")
     rows, columns = sampling_lines(matrix[None], grid, rules)
-    return rows.points(), columns.points()
+    return rows.points(0), columns.points(0)
 
 
 def sampling_lines(matrices: AnyArray, grid: BevGrid, rules: LabelProtocol) -> tuple[SamplingLine, SamplingLine]:
-    """What `sample_points` computes its rows and columns from, for matrices (N, 4, 4): to sample only some cells."""
+    """What `sample_points` computes its rows and columns from, for matrices (N, 4, 4): to sample only some cells.
+
+    Raises GeometryError.
+    """
+    if not np.isfinite(matrices).all():
+        raise GeometryError("source_from_target: not all numbers are finite; leave out frames without a pose")
     if rules.warp == "fiery":
         numbers = conventions.six_vectors_of(np.linalg.inv(matrices)).astype(np.float32).T[..., None]
         return fiery_lines(numbers[0], numbers[1], numbers[5], grid.x, grid.y)

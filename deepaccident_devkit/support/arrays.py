@@ -91,10 +91,12 @@ class BitView(Sequence[bool]):
         return iter(self[:].tolist())
 
     def __getitem__(self, rows: Any) -> Any:
-        """One row as bool, or a slice with step 1 as a new bool array."""
+        """One row as bool; of a slice with step 1, or of an array of rows, a new bool array."""
         if isinstance(rows, slice):
             start, stop, _ = rows.indices(self._length)
             return self._unpacked(start, max(start, stop))
+        if isinstance(rows, np.ndarray):
+            return (self._packed[rows >> 3] >> (rows & 7).astype(np.uint8) & 1).view(np.bool_)
         return bool(self._packed.item(rows >> 3) >> (rows & 7) & 1)
 
     def _unpacked(self, start: int, stop: int) -> BoolArray:

@@ -144,9 +144,14 @@ def _group_starts(*keys: AnyArray) -> BoolArray:
 
 
 def visible_mask(
-    xy: ArrayLike, category: ArrayLike, num_lidar_pts: ArrayLike, camera_visible: ArrayLike, *, infrastructure: bool
+    xy: ArrayLike,
+    category: ArrayLike,
+    num_lidar_pts: ArrayLike,
+    camera_visible: ArrayLike,
+    *,
+    infrastructure: ArrayLike,
 ) -> BoolArray:
-    """Which boxes of one agent's label the agent sees, by points and cameras alone.
+    """Which boxes of an agent's label the agent sees, by points and cameras alone; also of several agents' labels.
 
     Far boxes need a camera and points (2, or 1 for two-wheelers and pedestrians); near ones a camera or points (5, or
     2; near the infrastructure 1).
@@ -156,7 +161,7 @@ def visible_mask(
         category: (N,) class indices.
         num_lidar_pts: (N,) the agent's LiDAR points in each box.
         camera_visible: (N,) bool.
-        infrastructure: whether the agent is the roadside pole.
+        infrastructure: whether the agent is the roadside pole; (N,) bool for boxes of several agents.
 
     Returns:
         (N,) bool.
@@ -166,9 +171,8 @@ def visible_mask(
     # squares and root, not hypot: boxes on the very edge are decided by the last bit
     distance = np.sqrt(position[:, 0] * position[:, 0] + position[:, 1] * position[:, 1])
     far_seen = camera & (points >= np.where(small, 1, 2))
-    if infrastructure:
-        return np.where(distance < NEAR_INFRASTRUCTURE, camera | (points >= 1), far_seen)
-    return np.where(distance < NEAR_VEHICLE, camera | (points >= np.where(small, 2, 5)), far_seen)
+    near = distance < np.where(infrastructure, NEAR_INFRASTRUCTURE, NEAR_VEHICLE)
+    return np.where(near, camera | (points >= np.where(infrastructure, 1, np.where(small, 2, 5))), far_seen)
 
 
 def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> IntArray:

@@ -36,7 +36,7 @@ from deepaccident_devkit.export.mcap.messages import (
     vector,
 )
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels, predict_instances
+from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels_of, predict_instances
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, PREDICTED_COLOR
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -64,16 +64,16 @@ class MotionMaps:
 
     def write(self, moment: Moment, recording: Recording) -> None:
         """Write the motion labels of the samples of a moment that have labels."""
-        for agent, sample in moment.samples.items():
-            record = self._dataset.get("sample", sample)
-            if record["labelled"]:
-                own = self._dataset.get("agent", record["agent_token"])["actor_id"]
-                points = self._points(sample, agent, own)
-                message = cloud_message(points, frame_id(agent, "ego"), moment.index)
-                recording.write(f"/{agent}/motion_labels/points", message, moment.index)
+        records = {agent: self._dataset.get("sample", sample) for agent, sample in moment.samples.items()}
+        labelled = {agent: record for agent, record in records.items() if record["labelled"]}
+        made = motion_labels_of(self._dataset, labelled.values(), self._config)
+        for (agent, record), labels in zip(labelled.items(), made, strict=True):
+            own = self._dataset.get("agent", record["agent_token"])["actor_id"]
+            points = self._points(labels.to_present(), agent, own)
+            message = cloud_message(points, frame_id(agent, "ego"), moment.index)
+            recording.write(f"/{agent}/motion_labels/points", message, moment.index)
 
-    def _points(self, sample: str, agent: str, own_actor: int | None) -> AnyArray:
-        labels = motion_labels(self._dataset, sample, self._config).to_present()
+    def _points(self, labels: MotionLabels, agent: str, own_actor: int | None) -> AnyArray:
         actors = {own_actor if actor == OWN_BOX_ID else actor: name for actor, name in labels.id_map.items()}
         colors = {name: AGENT_COLORS[agent] for actor, name in labels.id_map.items() if actor == OWN_BOX_ID}
         for actor, name in actors.items():

@@ -6,7 +6,7 @@ A model that encodes each agent's sensors by themselves learns from as many targ
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,7 +20,7 @@ from deepaccident_devkit.export.torch import sensor_data
 from deepaccident_devkit.export.torch.collate import V2XItem
 from deepaccident_devkit.export.torch.config import V2XConfig, augmented_boxes, augmented_six_vectors
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
-from deepaccident_devkit.motion.sample_labels import motion_labels
+from deepaccident_devkit.motion.sample_labels import motion_labels_of
 from deepaccident_devkit.support.arrays import checked_whole
 from deepaccident_devkit.tables.tokens import agent_token
 from deepaccident_devkit.v2x import cooperative_boxes
@@ -158,7 +158,7 @@ class V2XDataset(TorchDataset):
         position = range(len(self))[operator.index(index)]
         sample = self._dataset.sample[int(self._rows[position])]["token"]
         augmentation = self.config.augmentation_of(int(self._epoch), position)
-        return V2XItem(self._received_item(sample, augmentation) | self._target_item(sample, augmentation))
+        return V2XItem(self._received_item(sample, augmentation) | self._target_items([sample], augmentation)[0])
 
     def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
         """The sample's own tensors, and the sensor data that arrived."""
@@ -190,17 +190,17 @@ class V2XDataset(TorchDataset):
             item |= {name: torch.from_numpy(array) for name, array in arrays.items()}  # new arrays: no copy
         return item
 
-    def _target_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
-        """The tensors to be predicted, with the sample's agent as the ego."""
-        item: dict[str, Any] = {}
-        if self.config.boxes is not None:
-            item |= self._box_item(sample, augmentation)
-        if isinstance(self.config.labels, MotionLabelConfig):
-            item |= self._label_item(sample, self.config.labels, augmentation)
-        if self.config.bev_segmentation is not None:
-            target = bev_segmentation(self._dataset, sample, self.config.bev_segmentation, augmentation=augmentation)
-            item |= {"bev_segmentation": tensor(target.masks), "bev_known": tensor(target.known)}
-        return item
+    def _target_items(self, samples: Sequence[str], augmentation: Augmentation) -> list[dict[str, Any]]:
+        """The tensors to be predicted, with each sample's agent as the ego."""
+        items: list[dict[str, Any]] = [{} for _ in samples]
+        for item, sample, labels in zip(items, samples, self._label_items(samples, augmentation), strict=True):
+            if self.config.boxes is not None:
+                item.update(self._box_item(sample, augmentation))
+            item.update(labels)
+            if (grid := self.config.bev_segmentation) is not None:
+                target = bev_segmentation(self._dataset, sample, grid, augmentation=augmentation)
+                item.update(bev_segmentation=tensor(target.masks), bev_known=tensor(target.known))
+        return items
 
     def _box_item(self, sample: str, augmentation: Augmentation) -> dict[str, Tensor]:
         visible = self.config.visible
@@ -216,21 +216,26 @@ class V2XDataset(TorchDataset):
             "actor_ids": tensor(boxes.actor_id),
         }
 
-    def _label_item(self, sample: str, config: MotionLabelConfig, augmentation: Augmentation) -> dict[str, Tensor]:
+    def _label_items(self, samples: Sequence[str], augmentation: Augmentation) -> Iterator[dict[str, Tensor]]:
+        config = self.config.labels
+        if not isinstance(config, MotionLabelConfig):
+            yield from ({} for _ in samples)
+            return
         if self.config.augmentation is not None:
             config = replace(config, augmentation=augmentation)
-        labels = motion_labels(self._dataset, sample, config)
-        if self.config.to_present is not None:
-            labels = labels.to_present(centerness=self.config.to_present)
-        return {
-            "segmentation": tensor(labels.segmentation, np.int64),
-            "instance": tensor(labels.instance, np.int64),
-            "centerness": tensor(labels.centerness),
-            "offset": tensor(labels.offset),
-            "flow": tensor(labels.flow),
-            "future_egomotion": tensor(augmented_six_vectors(labels.future_egomotion, augmentation), np.float32),
-            "label_valid": tensor(labels.label_valid),
-        }
+        for labels in motion_labels_of(self._dataset, samples, config):
+            shown = labels
+            if self.config.to_present is not None:
+                shown = labels.to_present(centerness=self.config.to_present)
+            yield {
+                "segmentation": tensor(shown.segmentation, np.int64),
+                "instance": tensor(shown.instance, np.int64),
+                "centerness": tensor(shown.centerness),
+                "offset": tensor(shown.offset),
+                "flow": tensor(shown.flow),
+                "future_egomotion": tensor(augmented_six_vectors(shown.future_egomotion, augmentation), np.float32),
+                "label_valid": tensor(shown.label_valid),
+            }
 
     def _opened_cache(self) -> ImageCache | None:
         """The cache of images, if one is wanted and has them."""
@@ -353,5 +358,5 @@ class AllEgosDataset(V2XDataset):
         heard = [sensor_data.participants(self._dataset, ego, self._agents) for ego in egos]
         item["egos"] = tuple(egos)
         item["partners"] = tensor(np.array([[name in names for name in item["agents"]] for names in heard]))
-        item["targets"] = [self._target_item(ego, augmentation) for ego in egos]
+        item["targets"] = self._target_items(egos, augmentation)
         return V2XItem(item)

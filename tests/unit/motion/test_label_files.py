@@ -957,15 +957,15 @@ def test_files_that_were_cut_off_are_written_again(da_b: DeepAccident, out: Path
 def test_what_fails_is_listed_and_the_rest_is_done(
     da_b: DeepAccident, out: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, broken = label_files.motion_labels, two_agents(da_b, 4)[3]
+    made, broken = label_files.motion_labels_of, two_agents(da_b, 4)[3]
 
-    def fail_once(dataset: DeepAccident, token: str, *more: object) -> MotionLabels:
-        if token == broken:
+    def fail_once(dataset: DeepAccident, tokens: list[str], *more: object) -> Iterator[MotionLabels]:
+        if broken in tokens:
             raise NotAvailableError("nothing to see")
-        return made(dataset, token, *more)
+        return made(dataset, tokens, *more)
 
     with monkeypatch.context() as patch:
-        patch.setattr(label_files, "motion_labels", fail_once)
+        patch.setattr(label_files, "motion_labels_of", fail_once)
         assert_refused(
             (
                 lambda: write(da_b, out, two_agents(da_b)),

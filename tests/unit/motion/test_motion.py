@@ -66,6 +66,7 @@ WRITTEN = {
     "sample_labels.samples": "protocol='released', horizon=2.0, scope='accident'",
     "sample_labels.evaluation_samples": "protocol='released', horizon=2.0, scope='accident'",
     "sample_labels.motion_labels": "config=None, id_map=None",
+    "sample_labels.motion_labels_of": "config=None",
     "warping.present_from_frames": "augmentation=None",
     "warping.frames_from_next": "augmentation=None",
     "warping.present_from_past": "augmentation=None",

@@ -81,12 +81,12 @@ def changed(**switches: object) -> MotionLabelConfig:
     ],
 )
 def test_it_draws_what_boxes_poses_and_visible_actors_say(da_motion: DeepAccident, config: MotionLabelConfig) -> None:
-    """The same through the public calls, a moment at a time."""
-    for scenario in da_motion.scenario:
-        for agent in AGENTS:
-            for number in (1, 13, 26, 35):
-                record = da_motion.get_sample(scenario["token"], agent, number)
-                assert_same(da_motion.motion_labels(record, config), by_public_calls(da_motion, record, config))
+    """The same through the public calls, a moment at a time; of one sample, and of many whatever lies beside them."""
+    places = [(scenario["token"], agent) for scenario in da_motion.scenario for agent in AGENTS]
+    records = [da_motion.get_sample(*place, number) for number in (1, 13, 26, 35) for place in places]
+    for record, labels in zip(records, da_motion.motion_labels_of(records, config), strict=True):
+        assert_same(labels, by_public_calls(da_motion, record, config))
+    assert_same(da_motion.motion_labels(records[-1], config), labels)
 
 
 def by_public_calls(release: DeepAccident, record: dict, config: MotionLabelConfig) -> MotionLabels:
@@ -289,6 +289,7 @@ def test_what_is_no_sample_and_agents_that_do_not_exist(small: DeepAccident) -> 
             (partial(small.motion_labels, sample), TokenError, r"no token|expected a token or a record")
             for sample in ("", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3})
         ],
+        (lambda: small.motion_labels_of(f"{EGO}/001"), ChoiceError, "put it into a list"),
         *[
             (lambda wrong=wrong: MotionLabelConfig(agents=wrong), ChoiceError, r"agents?: expected")
             for wrong in ("everybody", "ego_vehicle", ("pole",), ())
