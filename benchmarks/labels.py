@@ -82,7 +82,7 @@ def split_samples_per_s() -> list[Figure]:
         Figure(
             name="labels_from_tables_ms", value=from_tables, unit="ms", bound=RELEASED_MS / 40, reference=RELEASED_MS
         ),
-        Figure(name="labels_from_tables_five_ms", value=together / len(five), unit="ms", bound=from_tables / 2),
+        Figure(name="labels_from_tables_five_ms", value=together / len(five), unit="ms", bound=1.32),
         Figure(name="labels_from_files_ms", value=from_files, unit="ms"),
         Figure(name="split_samples_per_s_1_worker", value=rates[1], unit="samples/s"),
         Figure(
