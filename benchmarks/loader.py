@@ -1,7 +1,7 @@
-"""Items a second of `V2XDataset` with images of 704 × 256 alone, whole, scaled and cached, beside a plain loader.
+"""Items a second of `V2XDataset` with images of 704 × 256 alone, whole, scaled and cached, beside what else loads them.
 
-The plain loader decodes and resizes with Pillow and stacks with numpy, without poses. The milliseconds of an item are
-processor time on one core, the fastest of some items; images are in the page cache.
+The others (`loader_rivals`) load images alone, without poses. The milliseconds of an item are processor time on one
+core, the fastest of some items; images are in the page cache. `normalised` items are float32, as for ImageNet.
 """
 
 import tempfile
@@ -14,6 +14,7 @@ from typing import Any
 import click
 import numpy as np
 
+from benchmarks.loader_rivals import CROP, MEAN, SIZE, STD, Rival, rivals
 from benchmarks.measure import Figure, best_of, one_core
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
@@ -26,8 +27,9 @@ from deepaccident_devkit.taxonomy import AGENTS
 
 RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0, designed=True)
 SCENARIOS = 4
-IMAGES = ImageConfig(resize=(396, 704), crop=(140, 0, 256, 704), dtype="uint8")
+IMAGES = ImageConfig(resize=SIZE, crop=CROP, dtype="uint8")
 SCALED = replace(IMAGES, decode="scaled")
+NORMALISED: dict[str, Any] = {"dtype": "float32", "mean": MEAN, "std": STD}
 TEAMS: dict[str, tuple[str, ...]] = {
     "one": AGENTS[:1],
     "two": ("ego_vehicle", "infrastructure"),
@@ -39,25 +41,16 @@ REPEATS = 2
 
 
 class PlainItems:
-    """What one writes without the devkit: paths to an array (agents, cameras, 3, h, w)."""
+    """What one writes without the devkit, by a rival: an agent's paths to (cameras, 3, h, w)."""
 
-    def __init__(self, paths: list[list[list[Path]]]) -> None:
-        self._paths = paths
+    def __init__(self, rival: Rival, paths: list[list[Path]], *, normalised: bool) -> None:
+        self._rival, self._paths, self._normalised = rival, paths, normalised
 
     def __len__(self) -> int:
         return len(self._paths)
 
     def __getitem__(self, index: int) -> Any:
-        return np.stack([np.stack([plain_image(path) for path in agent]) for agent in self._paths[index]])
-
-
-def plain_image(path: Path) -> Any:
-    from PIL import Image
-
-    top, left, height, width = IMAGES.crop or (0, 0, 0, 0)
-    with Image.open(path) as image:
-        whole = image.resize((IMAGES.resize or (0, 0))[::-1], Image.Resampling.BILINEAR)
-    return np.asarray(whole)[top : top + height, left : left + width].transpose(2, 0, 1)
+        return self._rival.load(self._paths[index], normalised=self._normalised)
 
 
 def measure() -> list[Figure]:
@@ -93,21 +86,24 @@ def ways(dataset: DeepAccident, root: Path, agents: tuple[str, ...]) -> dict[str
         "cached_jpeg": replace(base, images_cache=root / "jpeg"),
     }
     found: dict[str, Any] = {way: V2XDataset(dataset, tokens, config) for way, config in configs.items()}
-    together = [[token.replace(f"/{agents[0]}/", f"/{agent}/") for agent in agents] for token in tokens]
-    paths = [
-        [[dataset.get_sample_data_path(each, camera) for camera in IMAGES.cameras] for each in moment]
-        for moment in together
-    ]
-    return {**found, "plain": PlainItems(paths)}
+    if len(agents) == 1:
+        paths = [[dataset.get_sample_data_path(token, camera) for camera in IMAGES.cameras] for token in tokens]
+        for way, images in (("full", IMAGES), ("scaled", SCALED)):
+            config = replace(base, images=replace(images, **NORMALISED))
+            found[f"{way}_normalised"] = V2XDataset(dataset, tokens, config)
+        for name, rival in rivals().items():
+            found[name] = PlainItems(rival, paths, normalised=False)
+            found[f"{name}_normalised"] = PlainItems(rival, paths, normalised=True)
+    return found
 
 
 def speeds(way: str, team: str, items: Any) -> list[Figure]:
-    """The processor time of an item, and items a second of a loader with no worker and with two."""
+    """The processor time of an item, and items a second of a loader with no worker, one and two."""
     name, count = f"loader_{way}_{team}", len(items)
     with one_core():
         seconds = min(processor_seconds(items, index % count) for index in range(max(count, REPEATS)))
     figures = [Figure(name=f"{name}_ms", value=seconds * 1e3, unit="ms", bound=BOUNDS.get((way, team)))]
-    for workers in (0, 2):
+    for workers in (0, 1, 2):
         value = count / loading_seconds(items, workers)
         figures.append(Figure(name=f"{name}_items_per_s_{workers}_workers", value=value, unit="items/s"))
     return figures

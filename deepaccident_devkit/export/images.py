@@ -5,8 +5,10 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate
 from math import gcd
-from typing import Final, Literal, SupportsIndex, get_args
+from typing import Any, Final, Literal, SupportsIndex, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,10 +37,10 @@ class ImageConfig:
         mean: subtracted from the channels R, G, B in [0, 1]; `float32` only.
         std: the channels are then divided by this; `float32` only.
         cameras: the cameras, in this order.
-        decode: how images are resized: `full`, or `scaled` in a third of the time, with slightly other pixels
-            (docs/training.md). `full` decodes whole images and resizes by Pillow's bilinear filter; `scaled` decodes
-            JPEG at the smallest of 1/1, 1/2, 1/4 and 1/8 that is no smaller than `resize` and resizes by OpenCV's area
-            filter.
+        decode: how images are resized: `full`, or `scaled` in two thirds of the time, with slightly other pixels
+            (docs/training.md). `full` decodes whole images and resizes as Pillow's bilinear filter; `scaled` decodes
+            JPEG at the smallest of 1/1, 1/2, 1/4 and 1/8 that is no smaller than `resize` and resizes as OpenCV's area
+            filter. A pixel is at most 1 of 255 from what these libraries make.
     """
 
     resize: tuple[int, int] | None = None
@@ -82,10 +84,10 @@ class ImageConfig:
             ConfigError: the crop reaches beyond the image.
         """
         lens = dataset.camera(camera)
-        if self.decode == "scaled" and self.resize is not None:
-            image = dataset.load_image(camera, least=self.resize)
-            return resized_part(image, self.resize, self.crop), self.intrinsic(lens, self.resize)
-        image = dataset.load_image(camera, size=self.resize)
+        if self.resize is not None:
+            image = dataset.load_image(camera, least=self.resize if self.decode == "scaled" else None)
+            return resized_part(image, self.resize, self.crop, self.decode), self.intrinsic(lens, self.resize)
+        image = dataset.load_image(camera)
         height, width = image.shape[:2]
         return self.cropped(image), self.intrinsic(lens, (height, width))
 
@@ -110,42 +112,90 @@ class ImageConfig:
         """Images (A, P, C, 3, h, w) uint8 as an array of `dtype`; where `known` (A, P) is False they stay 0."""
         if self.dtype == "uint8":
             return images
-        result = np.zeros(images.shape, dtype=np.float32)
+        result = (np.empty if known.all() else np.zeros)(images.shape, dtype=np.float32)
         mean, std = (np.array(three, dtype=np.float32)[:, None, None] for three in (self.mean, self.std))
-        changed = (self.mean, self.std) != (_NO_MEAN, _NO_STD)
+        scale, shift = np.float32(1) / (np.float32(255) * std), mean / std
         for a, p in np.argwhere(known).tolist():
             for image, out in zip(images[a, p], result[a, p], strict=True):  # one fits into the processor's cache
-                np.divide(image, np.float32(255), out=out, dtype=np.float32)
-                if changed:
-                    np.divide(np.subtract(out, mean, out=out), std, out=out)
+                np.copyto(out, image)
+                np.multiply(out, scale, out=out)
+                np.subtract(out, shift, out=out)
         return result
 
 
-def resized_part(image: ByteArray, size: tuple[int, int], crop: tuple[int, int, int, int] | None) -> ByteArray:
-    """A part (top, left, height, width) of an image resized to `size` by OpenCV's area filter; None is all of it.
+def resized_part(
+    image: ByteArray, size: tuple[int, int], crop: tuple[int, int, int, int] | None, decode: Decoding
+) -> ByteArray:
+    """A part (top, left, height, width) of an image (H, W, 3) resized to `size`; None is all of it.
 
-    Where the image shrinks, a pixel depends on the area that it covers alone, so little more than the part is made.
+    Args:
+        image: the whole image.
+        size: height and width to which all of it would be resized; little more than the part is made.
+        crop: the part.
+        decode: which filter: of `full`, weights fall linearly with the distance, over two pixels of the smaller of both
+            images in each direction, as of Pillow's bilinear filter; of `scaled`, they are the areas that pixels share,
+            as of OpenCV's area filter.
+
+    Returns:
+        (height, width, 3), the view of an array (3, height, width): at most 1 of 255 from what these libraries make.
     """
     import cv2
 
     top, left, height, width = crop or (0, 0, *size)
-    shrinks = size[0] <= image.shape[0] and size[1] <= image.shape[1]
-    rows = _widened(top, top + height, size[0], image.shape[0] if shrinks else 1)
-    columns = _widened(left, left + width, size[1], image.shape[1] if shrinks else 1)
-    (high, low), (first, last) = (
-        (made.start * old // new, made.stop * old // new)
-        for made, new, old in zip((rows, columns), size, image.shape, strict=False)
-    )
-    part = image[high:low, first:last]
-    if part.shape[:2] != (len(rows), len(columns)):
-        part = cv2.resize(part, (len(columns), len(rows)), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-    return part[top - rows.start :, left - columns.start :][:height, :width]
+    rows = _resampled(image.reshape(len(image), -1), size[0], range(top, top + height), decode)
+    turned: Any = cv2.transpose(rows.reshape(height, -1, 3)).reshape(-1, 3 * height)
+    columns = _resampled(turned, size[1], range(left, left + width), decode).reshape(width, height, 3)
+    return np.stack([cv2.transpose(each) for each in cv2.split(columns)], dtype=np.uint8).transpose(1, 2, 0)
 
 
-def _widened(start: int, stop: int, new: int, old: int) -> range:
-    """Pixels of `new` resized ones, around some of them, whose ends are at borders of the `old` ones too."""
-    step = new // gcd(new, old)
-    return range(start // step * step, -(-stop // step) * step)
+def _resampled(rows: ByteArray, new: int, part: range, decode: Decoding) -> ByteArray:
+    """A part of the `new` rows to which rows (old, n) are resized: running means of old rows, many at once."""
+    import cv2
+
+    if len(rows) == new:
+        return rows[part.start : part.stop]
+    result = np.empty((len(part), rows.shape[1]), dtype=np.uint8)
+    groups = _groups(len(rows), new, part, decode)
+    means = np.zeros((max(len(made) for made, _ in groups), rows.shape[1]), dtype=np.float32)
+    for made, olds in groups:
+        out = result[made.start - part.start : made.stop - part.start : made.step]
+        if len(olds) == 2:
+            (first, whole), (second, rest) = olds
+            cv2.addWeighted(rows[first], whole - rest, rows[second], rest, 0, out)
+        else:
+            mean = means[: len(made)]
+            for old, share in olds:
+                cv2.accumulateWeighted(rows[old], mean, share)
+            cv2.convertScaleAbs(mean, out)
+    return result
+
+
+@lru_cache
+def _groups(old: int, new: int, part: range, decode: Decoding) -> list[tuple[range, list[tuple[slice, float]]]]:
+    """Which of `new` rows are the same means of the `old` rows near them, and of which.
+
+    Returns:
+        For each group its rows, those that lie alike between the old ones, and a list of the old rows: the first one
+        of the mean for each row of the group, and so on, with their share in the mean of all up to them. Places are
+        counted in the 2 `new`-th part of an old row, and so in whole numbers.
+    """
+    reach = 2 * max(old, new) if decode == "full" else old
+    step, stride = new // gcd(old, new), old // gcd(old, new)
+    edge = -((old - reach) // (2 * old))  # so many rows at both ends reach beyond the old ones
+    inner = range(max(part.start, edge), min(part.stop, new - edge))
+    groups = []
+    for made in [range(i, i + 1) for i in part if i not in inner] + [inner[i::step] for i in range(step) if inner[i:]]:
+        centre = (2 * made[0] + 1) * old
+        rows = range(max((centre - reach) // (2 * new), 0), min(-((-centre - reach) // (2 * new)), old))
+        near = [reach - abs((2 * row + 1) * new - centre) for row in rows]
+        weights = [max(each, 0) if decode == "full" else min(each + new, 2 * min(old, new)) for each in near]
+        shares = [
+            (slice(row, row + stride * (len(made) - 1) + 1, stride), weight / total)
+            for row, weight, total in zip(rows, weights, accumulate(weights), strict=True)
+            if weight
+        ]
+        groups.append((made, shares))
+    return groups
 
 
 def _pixels(name: str, given: Iterable[SupportsIndex], meaning: str, least: Sequence[int]) -> tuple[int, ...]:

@@ -207,8 +207,7 @@ def test_images_that_are_none_or_of_different_sizes_are_refused(
     monkeypatch.setattr(type(da), "sensor_path", lambda *_: tmp_path / "broken.jpg")
     data = V2XDataset(da, [sample], V2XConfig(points=False, images=ImageConfig()))
     assert_refused((lambda: data[0], SensorFileError, r"broken\.jpg: not a readable image"))
-    images = map(np.zeros, [(4, 5, 3), (4, 6, 3)], ["u1", "u1"])
-    monkeypatch.setattr(type(da), "load_image", lambda *_, **__: next(images))
+    monkeypatch.setattr(type(da), "load_image", lambda _, name: np.zeros((4, 5 + name.endswith("Left"), 3), "u1"))
     assert_refused((lambda: data[0], ConfigError, r"different sizes, \(4, 5\) and \(4, 6\); choose resize="))
 
 

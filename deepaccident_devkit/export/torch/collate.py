@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from multiprocessing.reduction import ForkingPickler
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.evaluator import Evaluator, EvaluatorT
+from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.taxonomy import AGENTS
 
 if TYPE_CHECKING:
@@ -37,6 +39,10 @@ class V2XItem(dict[str, Any]):
         return f"V2XItem({self.get('token')}, agents {self.get('agents')}: {', '.join(others)})"
 
 
+class _WorkersBatch(dict[str, Any]):
+    """A batch in a worker, which its receiver gets as a dict."""
+
+
 def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """B items as one dict with an axis of agents: for models with a fixed number of agents, or with a mask for them.
 
@@ -47,9 +53,11 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     Raises:
         ConfigError: there are no items, or they do not fit together: other configurations, images of different sizes.
     """
+    from torch.utils.data import get_worker_info
+
     _check_alike(items)
     agents = max(len(item["agents"]) for item in items)
-    batch: dict[str, Any] = {}
+    batch: dict[str, Any] = {} if get_worker_info() is None else _WorkersBatch()
     for key in items[0]:
         values = [item[key] for item in items]
         if key in _LISTS:
@@ -138,6 +146,37 @@ with suppress(ImportError):  # torch's documented registry, which has no public 
     default_collate_fn_map.update({V2XItem: _collate_by_default})  # the site's mock of torch takes no items
 
 
+class _ByValue:
+    """A small tensor, as an array: copied where others become shared memory."""
+
+    def __init__(self, array: AnyArray) -> None:
+        self._array = array
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Unpickled, the tensor itself."""
+        import torch
+
+        return torch.from_numpy, (self._array,)
+
+
+def _sent(value: Any) -> Any:
+    """A part of an item or a batch, as a worker hands it over."""
+    import torch
+
+    if type(value) in (list, tuple):
+        return type(value)(map(_sent, value))
+    if isinstance(value, dict):
+        return {key: _sent(each) for key, each in value.items()}
+    if isinstance(value, torch.Tensor) and value.nbytes <= 1 << 16:  # shared memory takes 1 ms to set up
+        with suppress(TypeError, RuntimeError):  # numpy lacks its type, or it is on a GPU, or has a gradient
+            return _ByValue(value.numpy())
+    return value
+
+
+ForkingPickler.register(V2XItem, lambda item: (V2XItem, (_sent(item),)))
+ForkingPickler.register(_WorkersBatch, lambda batch: (dict, (_sent(batch),)))
+
+
 def _check_alike(items: Sequence[dict[str, Any]]) -> None:
     if not items:
         raise ConfigError("batch: expected at least one item, found none")
@@ -150,13 +189,18 @@ def _check_alike(items: Sequence[dict[str, Any]]) -> None:
 
 
 def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
-    """Parts (n, …) one after another (N, …); raises ConfigError if other axes than the first differ."""
+    """Parts (n, …) one after another (N, …), a single one as it is; raises ConfigError if other axes differ."""
     import torch
+    from torch.utils.data import default_collate
 
     sizes = sorted({tuple(part.shape[1:]) for part in parts})
     if len(sizes) > 1:
         remedy = "choose resize=" if key == "images" else "batch items of one V2XConfig at a time"
         raise ConfigError(f"{key}: items of shapes {sizes[0]} and {sizes[-1]} make no batch; {remedy}")
+    if len(parts) == 1:
+        return parts[0]
+    if len({len(part) for part in parts}) == 1:
+        return default_collate(list(parts)).flatten(0, 1)  # in a worker, straight into shared memory
     return torch.cat(list(parts))
 
 

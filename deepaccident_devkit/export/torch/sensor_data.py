@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.torch.config import V2XConfig, augmented_points, augmented_pose
 from deepaccident_devkit.motion import Augmentation
+from deepaccident_devkit.parallel.executors import own_threads
 from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.tables.tokens import sample_token
@@ -21,6 +22,7 @@ from deepaccident_devkit.taxonomy import LIDAR, AgentName
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
 from deepaccident_devkit.v2x.messages import Message, messages
 
+np.empty(31 << 20, dtype=np.uint8)  # freed at once: from then on glibc keeps freed blocks of up to this size for reuse
 _NO_POINTS: Final = np.zeros((0, 4), dtype=np.float32)
 Received = Sequence[Mapping[AgentName, Message]]
 """For each past frame, the present last: sender → its message, for messages that arrived."""
@@ -156,15 +158,19 @@ def camera_arrays(
     `ego_from_camera` (A, P, C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), with the senders' own augmented ego frames.
     Raises ConfigError if images have different sizes, or the crop reaches beyond them.
     """
-    load = config.load if cache is None else partial(cache.load, config)
+    from torch.utils.data import get_worker_info
+
+    load = partial(config.load, dataset) if cache is None else partial(cache.load, config, dataset)
+    mapped = map if cache is not None or get_worker_info() is not None else _by_threads
     shape = (len(names), len(arrived), len(config.cameras))
     images: ByteArray = np.zeros((*shape, 3, 0, 0), dtype=np.uint8)  # until the first one tells the size
     result = {key: np.tile(np.eye(size, dtype=np.float32), (*shape, 1, 1)) for key, size in _MATRICES.items()}
     for p, moment in enumerate(arrived):
         for name, message in moment.items():
             a, intrinsics = names.index(name), []
-            for c, channel in enumerate(config.cameras):
-                pixels, intrinsic = load(dataset, f"{message.sample}/{channel}")
+            for c, (pixels, intrinsic) in enumerate(
+                mapped(load, [f"{message.sample}/{each}" for each in config.cameras])
+            ):
                 if not images.size:
                     images = np.zeros((*shape, 3, *pixels.shape[:2]), dtype=np.uint8)
                 if images.shape[4:] != pixels.shape[:2]:
@@ -177,6 +183,12 @@ def camera_arrays(
             for key, each in matrices.items():
                 result[key][a, p] = each
     return {"images": config.values(images, valid_mask(names, arrived)), **result}
+
+
+def _by_threads(function: Callable[[str], Any], values: Iterable[str]) -> list[Any]:
+    """As `map`, for decoding where no workers share the cores: it is done outside of the interpreter's lock."""
+    with own_threads() as pool:
+        return list(pool.map(function, values))
 
 
 def _matrices(
