@@ -40,7 +40,7 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import predict_instances
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing, replacing_folder
-from deepaccident_devkit.support.reading import file_checksum
+from deepaccident_devkit.support.reading import file_checksum, open_file, read_bytes
 from deepaccident_devkit.support.text import choice, differing_text, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
@@ -230,7 +230,7 @@ class EntryWriter:
 
     def add_part(self, part: Results) -> None:
         """Write the entries of a file that another of this class wrote."""
-        body = part.path.read_text(encoding="utf-8").partition(_BODY)[2].removesuffix(_END)
+        body = read_bytes(part.path, "results").decode().partition(_BODY)[2].removesuffix(_END)
         self._file.write(f"{',' if self._count else ''}{body}")
         self._count += len(part)
 
@@ -360,7 +360,8 @@ class ShardWriter:
         self._grid, self._frames = contents.form.grid, contents.form.frames
         self._predictions = max(self._predictions, contents.form.predictions)
         for shard in contents.shards:
-            shutil.copyfile(part.path / shard.file, self._folder / self._file)
+            with open_file(part.path / shard.file) as source, (self._folder / self._file).open("xb") as target:
+                shutil.copyfileobj(source, target)
             self._shards.append(msgspec.structs.replace(shard, file=self._file))
 
     def finish(self) -> None:
