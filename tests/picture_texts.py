@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.figures import settled
+from deepaccident_devkit.render.figures import laid_out
 
 TOUCHING = 1.5
 """Pixels that count as nothing: letters do not fill the boxes of their texts."""
@@ -18,7 +18,8 @@ def text_faults(figure: Any) -> list[str]:
 
     A token may be small, and is in the room that its title has for it.
     """
-    FigureCanvasAgg(settled(figure, passes=3)).draw()  # as it is saved
+    with laid_out(figure, figure.dpi):
+        FigureCanvasAgg(figure).draw()  # as it is saved
     texts = [text for text in _drawn(figure) if text.get_visible() and text.get_text().strip()]
     page = figure.bbox.padded(TOUCHING)
     boxes = [(text, text.get_window_extent().padded(-TOUCHING)) for text in texts if text.get_gid() != "token"]

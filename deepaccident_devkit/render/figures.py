@@ -111,13 +111,13 @@ def settled(fig: Figure) -> Figure:
 
 
 @contextmanager
-def _laid_out(fig: Figure, dpi: float) -> Iterator[None]:
+def laid_out(fig: Figure, dpi: float) -> Iterator[None]:
     """Lay a figure out until its panels move no more, a few times at most; in the block, matplotlib does not do it."""
     engine, usual, places = fig.get_layout_engine(), fig.dpi, np.zeros(0)
     fig.set_dpi(dpi)  # letters are measured in pixels
-    for _ in range(_PASSES):
+    for number in range(_PASSES):
         before, places = places, np.array([ax.get_position(original=False).bounds for ax in settled(fig).axes])
-        if before.shape == places.shape and np.abs(places - before).max(initial=0) < _STILL:
+        if number > 1 and np.abs(places - before).max(initial=0) < _STILL:  # the first two may be equal by chance
             break
     fig.set_layout_engine(None)
     try:
@@ -164,7 +164,7 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
     `words` are the text entries of a PNG file. The figure is one from `detached_figure`; others stay open in pyplot.
     """
     kind = path.suffix[1:].lower()
-    with replacing(path) as temporary, _laid_out(figure, dpi):
+    with replacing(path) as temporary, laid_out(figure, dpi):
         figure.savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
     return path
 
@@ -172,6 +172,6 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
 def figure_png(figure: Figure, *, dpi: float) -> bytes:
     """A figure from `detached_figure` as the bytes of a PNG file."""
     written = io.BytesIO()
-    with _laid_out(figure, dpi):
+    with laid_out(figure, dpi):
         figure.savefig(written, format="png", dpi=dpi)
     return written.getvalue()

@@ -163,8 +163,9 @@ def _fine(scene: Scene, camera: Camera, ground_from_camera: SE3, outline: IntArr
     still = scene.setting.caster.cast(ground_from_camera.translation, rays)
     near = np.flatnonzero(np.tile(movers[row, column], len(_SUBPIXELS)) < still[0])
     depth, face = scene.with_movers(ground_from_camera.translation, rays, still, near)
-    right, down, face, depth = (each.reshape(-1, _COLUMNS) for each in (right, down, face, depth))
-    return Rays(right, down, face, depth.astype(np.float32), spacing)
+    shape = -1, _COLUMNS
+    depth = depth.reshape(shape).astype(np.float32)
+    return Rays(right.reshape(shape), down.reshape(shape), face.reshape(shape), depth, spacing)
 
 
 def _spacing(right: Float32Array) -> float:

@@ -210,16 +210,16 @@ class PassingGround:
 
     def at(self, scene: Scene, light: Light) -> Ground:
         """The ground at a moment; it is correct until the next call."""
-        for now, still, cells in zip(self._now, self._still, self._changed, strict=True):
-            now.reshape(-1, 3)[cells] = still.reshape(-1, 3).take(cells, axis=0)
+        for now, still, changed in zip(self._now, self._still, self._changed, strict=True):
+            now.reshape(-1, 3)[changed] = still.reshape(-1, 3).take(changed, axis=0)
         finest, coarser = self._now
         corners = above_ground(scene.movers.corners[scene.movers.solids.main], scene.setting.terrain)
         cells = [add_shadows(finest, corners, light.to_sun, light.in_shadow)]
         upwards = np.array([0.0, 0.0, 1.0])
         for beyond, brightness in _CLOSE_BY:
             cells.append(add_shadows(finest, _slabs(scene, beyond), upwards, brightness))
-        changed = np.concatenate(cells)
-        self._changed = changed, _follow(coarser, finest, changed)
+        fine = np.concatenate(cells)
+        self._changed = fine, _follow(coarser, finest, fine)
         return _with_coarser(finest, coarser)
 
 
