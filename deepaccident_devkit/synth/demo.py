@@ -71,7 +71,7 @@ background: {vehicles: [6, 12], two_wheelers: [2, 6], parked: [3, 9], walking: [
 weather: Clear
 time_of_day: Noon
 """
-RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1)
+RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1, sensors="accidents")
 _MARK: Final = ".deepaccident_demo"
 """The file by which the demo knows a folder as its own."""
 _SCENARIO_FILE: Final = "accident.yaml"
@@ -92,7 +92,7 @@ _NUMBERS: Final[Mapping[ResultsTask, tuple[str, Mapping[str, str]]]] = {
 }
 """Task → the protocol, and the heading of each number of the table with its name in the result."""
 _STEPS: Final = {
-    "recording": 32.0,
+    "recording": 15.0,
     "indexing": 1.0,
     "pictures": 5.0,
     "model": 5.0,
@@ -123,7 +123,7 @@ class NextStep:
 def demo(out: Path, workers: int | None) -> None:
     """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does with it.
 
-    The release has an accident and its normal twin. The page OUT/index.html has pictures, motion labels, a table of
+    The release has an accident, and of its normal twin the labels. The page OUT/index.html has pictures, motion labels, a table of
     what one car and five agents predict, a replay, the report of an evaluation, and six next steps. Where PyTorch is
     installed, it also shows what a small trained model foresees.
 

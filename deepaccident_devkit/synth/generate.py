@@ -10,7 +10,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -248,6 +248,8 @@ class _Part:
 
 def _parts(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, _Part]:
     """The parts of a scenario by their names."""
+    if config.sensors == "accidents":
+        config = replace(config, sensors="all" if plan.accident else "none")
     parts = parts_of(config)
     names = {first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)}
     return {

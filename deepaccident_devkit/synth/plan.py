@@ -24,8 +24,8 @@ from deepaccident_devkit.synth.traffic.lifelike import MISFILED, Kind, as_kind, 
 from deepaccident_devkit.tables.records import ScenarioRecord
 from deepaccident_devkit.taxonomy import META_AGENTS, ROAD_TYPES, SPLITS, TOWNS, Layout
 
-Sensors = Literal["all", "cameras", "none"]
-"""Which sensors' files a release has: of all, the images alone, or of none."""
+Sensors = Literal["all", "accidents", "cameras", "none"]
+"""Which sensors' files a release has: of all, those of accidents alone, the images alone, or of none."""
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
 IMAGE_SIZE: Final = (480, 270)
@@ -62,9 +62,9 @@ class SynthConfig:
             one it computes wrong camera geometry.
         layout: `A`, all splits in one folder, or `B`, one folder for each split.
         seed: the same seed gives the same bytes (on the same machine with the same package versions).
-        sensors: what to write besides labels, calib and meta: `all` sensors' files, with `cameras` the images alone (no
-            point clouds, no BEV arrays), or `none`. Files that two of them write are the same. True and False mean
-            `all` and `none`.
+        sensors: what to write besides labels, calib and meta: `all` sensors' files, with `accidents` those of
+            accidents and none of their normal twins, with `cameras` the images alone (no point clouds, no BEV arrays),
+            or `none`. Files that two of them write are the same. True and False mean `all` and `none`.
         view: `hidden` puts a house on the kerb of the corner between ego and other, who drive a little faster than
             with the view `open`. They see each other only about a second before they meet; the infrastructure sees
             both all the time. With None the scenario files decide.

@@ -203,7 +203,7 @@ def test_kept_workers_do_what_comes_next_until_one_is_killed_or_the_block_ends()
         second = run_batch(workers.process, range(6), workers=2)
         assert all(map(is_running, first + second))
         assert len({*first, *second}) <= 2
-        with pytest.raises(WorkerError):
+        with pytest.raises(WorkerError, match="was killed"):
             run_batch(workers.killed, range(6), workers=2)
         third = run_batch(workers.process, range(6), workers=2)
         assert {*first, *second}.isdisjoint(third)
