@@ -360,7 +360,7 @@ class ShardWriter:
         self._grid, self._frames = contents.form.grid, contents.form.frames
         self._predictions = max(self._predictions, contents.form.predictions)
         for shard in contents.shards:
-            with open_file(part.path / shard.file) as source, (self._folder / self._file).open("xb") as target:
+            with open_file(part.path / shard.file) as source, (self._folder / self._file).open("wb") as target:
                 shutil.copyfileobj(source, target)
             self._shards.append(msgspec.structs.replace(shard, file=self._file))
 

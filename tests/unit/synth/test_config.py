@@ -20,7 +20,7 @@ RELEASED = ("for_released_code: the released code needs ", "leave one of")
         ({"image_size": (16, 8)}, ("height: 8",)),
         ({"image_size": (16,)}, ("expected (width, height)",)),
         ({"layout": "C"}, ("layout: expected one of A, B, found 'C'",)),
-        ({"sensors": "lidar"}, ("sensors: expected one of all, cameras, none, found 'lidar'",)),
+        ({"sensors": "lidar"}, ("sensors: expected one of all, accidents, cameras, none, found 'lidar'",)),
         ({"view": "close"}, ("view: expected one of open, hidden, or None, found 'close'",)),
         ({"designs": (1, 13)}, ("designs: 13 is not possible", "from 1 to 12")),
         ({"unplanned": 1.5}, ("unplanned: 1.5 is not a share", "from 0 to 1")),
