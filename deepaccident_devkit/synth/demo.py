@@ -123,9 +123,9 @@ class NextStep:
 def demo(out: Path, workers: int | None) -> None:
     """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does with it.
 
-    The release has an accident, and of its normal twin the labels. The page OUT/index.html has pictures, motion labels, a table of
-    what one car and five agents predict, a replay, the report of an evaluation, and six next steps. Where PyTorch is
-    installed, it also shows what a small trained model foresees.
+    The release has an accident, and of its normal twin the labels. The page OUT/index.html has pictures, motion labels,
+    a table of what one car and five agents predict, a replay, the report of an evaluation, and six next steps. Where
+    PyTorch is installed, it also shows what a small trained model foresees.
 
     OUT must be missing, empty, or the folder of an earlier demo, which then keeps its release.
     """
