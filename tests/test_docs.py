@@ -415,7 +415,7 @@ def test_the_functions_on_a_labels_way_are_where_architecture_says() -> None:
         found: Any = import_module(module.removesuffix(".py").replace("/", "."))
         for part in name.split("."):
             found = getattr(found, part)
-        assert Path(inspect.getfile(found)).as_posix().endswith(module)
+        assert Path(inspect.getfile(inspect.unwrap(found))).as_posix().endswith(module)
 
 
 def test_the_picture_of_the_layers_is_that_of_the_contract() -> None:

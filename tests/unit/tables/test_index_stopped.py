@@ -26,7 +26,6 @@ from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.support.files import temporary_path
 from deepaccident_devkit.tables import Index, Tables, clear_index, open_index
-from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables.index import MANIFEST_FILE
 
 pytestmark = pytest.mark.slow
@@ -129,12 +128,13 @@ def test_a_full_disk_while_indexing(own_release: Path, tmp_path: Path, job: Job,
     assert contents(index_dir) == contents(tmp_path / "fresh")
 
 
-@pytest.mark.parametrize("step", ["join_tables", "write_bytes"])
+@pytest.mark.parametrize("step", ["indexing.join_tables", "index.write_bytes"])
 def test_a_disk_that_is_full_at_the_end(root: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     opened(root)
     before = index_alone(root / INDEX.parent)
     tiny.write_tiny_release(root, name=THIRD)
-    monkeypatch.setattr(index_module, step, Mock(side_effect=OSError(28, "No space left on device")))
+    path = f"deepaccident_devkit.tables.{step}"
+    monkeypatch.setattr(path, Mock(side_effect=OSError(28, "No space left on device")))
     assert_refused(
         (lambda: opened(root), IndexStoreError, ("v1: cannot be written", "No space left", "make room there"))
     )
