@@ -37,6 +37,7 @@ TEAMS: dict[str, tuple[str, ...]] = {
 }
 BOUNDS = {("scaled", "one"): 40.0, ("scaled", "five"): 160.0, ("cached_raw", "five"): 25.0}
 """Milliseconds of an item on one core."""
+CODECS = ("raw", "jpeg")
 REPEATS = 2
 
 
@@ -63,7 +64,7 @@ def measure() -> list[Figure]:
         root = Path(folder)
         made = make_release(root / "made", RELEASE, workers=2)
         dataset = DeepAccident(dataroot=copied_release(made, root / "release", scenarios=SCENARIOS), verbose=False)
-        for codec in ("raw", "jpeg"):
+        for codec in CODECS:
             form = CachedImages(images=SCALED, codec=codec, where=("length>=1",))  # type: ignore[arg-type]
             export_release(dataset, root / codec, form, workers=2)
         figures = [*differences(dataset), *sizes(dataset, root)]
@@ -73,8 +74,8 @@ def measure() -> list[Figure]:
         return figures
 
 
-def ways(dataset: DeepAccident, root: Path, agents: tuple[str, ...]) -> dict[str, Any]:
-    """Each way to make the items, of the first agent's samples."""
+def ways(dataset: DeepAccident, caches: Path | None, agents: tuple[str, ...]) -> dict[str, Any]:
+    """Each way to make the items, of the first agent's samples; out of caches only if there are any."""
     from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
 
     tokens = [record["token"] for record in dataset.sample if record["agent"] == agents[0]]
@@ -82,8 +83,7 @@ def ways(dataset: DeepAccident, root: Path, agents: tuple[str, ...]) -> dict[str
     configs = {
         "full": replace(base, images=IMAGES),
         "scaled": base,
-        "cached_raw": replace(base, images_cache=root / "raw"),
-        "cached_jpeg": replace(base, images_cache=root / "jpeg"),
+        **({} if caches is None else {f"cached_{each}": replace(base, images_cache=caches / each) for each in CODECS}),
     }
     found: dict[str, Any] = {way: V2XDataset(dataset, tokens, config) for way, config in configs.items()}
     if len(agents) == 1:

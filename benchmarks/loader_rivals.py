@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +52,19 @@ class Rival:
 
 
 def rivals() -> dict[str, Rival]:
-    """Name → those whose libraries are here."""
+    """Name → those whose libraries are here, and run: torchvision needs the very torch that it was made for."""
     modules = {"pillow": "PIL", "opencv-python-headless": "cv2"}
     return {
-        name: rival
-        for name, rival in _RIVALS.items()
-        if all(find_spec(modules.get(need, need)) is not None for need in rival.needs)
+        name: rival for name, rival in _RIVALS.items() if all(_runs(modules.get(need, need)) for need in rival.needs)
     }
+
+
+def _runs(module: str) -> bool:
+    try:
+        import_module(module)
+    except (ImportError, OSError, RuntimeError):
+        return False
+    return True
 
 
 def _pillow(path: Path) -> Any:
