@@ -200,7 +200,8 @@ def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
     if len(parts) == 1:
         return parts[0]
     if len({len(part) for part in parts}) == 1:
-        return default_collate(list(parts)).flatten(0, 1)  # in a worker, straight into shared memory
+        stacked: Tensor = default_collate(list(parts))  # in a worker, straight into shared memory
+        return stacked.flatten(0, 1)
     return torch.cat(list(parts))
 
 
