@@ -195,9 +195,10 @@ def remove_in(folder: Path, path: str | PurePath) -> None:
     Raises what `place_in` does, and OSError.
     """
     place = place_in(folder, path)
-    if os.path.isdir(place) and not os.path.islink(place):  # noqa: PTH112, PTH114 - as above
-        shutil.rmtree(place)
-    elif os.path.lexists(place):
+    while os.path.isdir(place) and not os.path.islink(place):  # noqa: PTH112, PTH114 - as above
+        with suppress(FileNotFoundError):  # another process removes it, too
+            shutil.rmtree(place)
+    if os.path.lexists(place):
         place.unlink(missing_ok=True)
 
 
