@@ -159,7 +159,8 @@ def numbers_of_draws(evaluator: Evaluator[Any], parts: Clusters, times: IntArray
     """(D, M) the numbers of these M names in each of D draws, as `Evaluator.resampled` makes them; NaN for none."""
     listed = list(names)
     drawn = (numbers_of(result) for result in evaluator.resampled(parts, times))
-    return np.array([[numbers.get(name, math.nan) for name in listed] for numbers in drawn]).reshape(-1, len(listed))
+    rows = [[numbers.get(name, math.nan) for name in listed] for numbers in drawn]
+    return np.array(rows).reshape(len(rows), len(listed))  # of no names, too
 
 
 def standard_errors(values: FloatArray, left_out: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -23,6 +23,7 @@ from deepaccident_devkit.evaluation.intervals import (
     interval_ends,
     intervals_of,
     numbers_of,
+    numbers_of_draws,
     parts_of,
     range_of,
 )
@@ -296,3 +297,7 @@ def test_every_number_of_the_devkits_own_has_a_unit(task: str) -> None:
         for path in numbers_of(EvaluationSetup(task=task, protocol=protocol).evaluator().compute()):  # type: ignore[arg-type]
             guesses = {range_of(path, np.array(alone)) for alone in ([0.5], [2.0], [-1.0])}
             assert len(guesses) == 1 or not has_interval(path), path
+
+
+def test_draws_of_no_numbers_are_rows_without_any() -> None:
+    assert numbers_of_draws(Ratios(), [[]] * 6, np.eye(6, dtype=np.int64), []).shape == (6, 0)
