@@ -11,14 +11,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import click
-
 from benchmarks.loader import RELEASE, SCENARIOS, ways
 from benchmarks.loader_rivals import rivals
-from benchmarks.measure import Figure
+from benchmarks.measure import Figure, has_torch
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import MissingExtraError
 from deepaccident_devkit.synth import make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -26,10 +23,7 @@ EPOCHS = 5
 
 
 def measure() -> list[Figure]:
-    try:
-        import deepaccident_devkit.export.torch  # noqa: F401
-    except MissingExtraError as error:
-        click.echo(f"beside: training images are not measured; {error}", err=True)
+    if not has_torch("beside"):
         return []
     with tempfile.TemporaryDirectory() as folder:
         made = make_release(Path(folder) / "made", RELEASE, workers=2)

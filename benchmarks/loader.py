@@ -11,14 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 
 from benchmarks.loader_rivals import CROP, MEAN, SIZE, STD, Rival, rivals
-from benchmarks.measure import Figure, best_of, one_core
+from benchmarks.measure import Figure, best_of, has_torch, one_core
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import MissingExtraError
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.image_cache import CachedImages
 from deepaccident_devkit.export.images import ImageConfig
@@ -55,10 +53,7 @@ class PlainItems:
 
 
 def measure() -> list[Figure]:
-    try:
-        import deepaccident_devkit.export.torch  # noqa: F401
-    except MissingExtraError as error:
-        click.echo(f"loader: not measured; {error}", err=True)
+    if not has_torch("loader"):
         return []
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)

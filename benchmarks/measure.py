@@ -6,6 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import click
+
+from deepaccident_devkit.errors import MissingExtraError
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figure:
@@ -33,6 +37,16 @@ class Figure:
         if self.bound is None:
             return None
         return self.value / self.bound if self.higher_is_better else self.bound / self.value
+
+
+def has_torch(benchmark: str) -> bool:
+    """Whether what needs PyTorch can be measured; else says that it is not."""
+    try:
+        import deepaccident_devkit.export.torch  # noqa: F401
+    except MissingExtraError as error:
+        click.echo(f"{benchmark}: training images are not measured; {error}", err=True)
+        return False
+    return True
 
 
 def best_of(repeats: int, work: Callable[[], object]) -> float:

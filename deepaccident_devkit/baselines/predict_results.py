@@ -7,8 +7,9 @@ alone, and several processes share the scenarios.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -119,10 +120,9 @@ def predict_results(
     task, path = choice("task", task, get_args(ResultsTask)), path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
     work = _Work(dataset, task, baseline or Baseline(), tuple(scenarios))
-    tokens = [token for own in scenarios.values() for token in own]
-    name = work.digest(tokens)
+    name = work.digest(scenarios)
     store = Store(unfinished_folder(path), path, "predicts for it", ResultsError, name)
-    if work.is_done(path, tokens):
+    if work.is_done(path, scenarios):
         store.remove()  # of a process that was killed just before
         return path
     work.writer(path)  # refuses what stands there
@@ -134,9 +134,9 @@ def predict_results(
     }
     places = Places(reads=dataset.places, writes=(store.folder,))
     with store.shared() as turn:
-        if not work.is_done(path, tokens):  # by another process meanwhile
+        if not work.is_done(path, scenarios):  # by another process meanwhile
             store.run(_predict, jobs, label=work.task, places=places, **how)
-        if turn.alone() and not work.is_done(path, tokens):
+        if turn.alone() and not work.is_done(path, scenarios):
             with work.writer(path) as whole:
                 for job in jobs.values():
                     whole.add_part(read_results(job.path))
@@ -151,11 +151,11 @@ def is_predicted(
     out: str | os.PathLike[str],
     baseline: Baseline | None = None,
 ) -> bool:
-    """Whether `predict_results` has written its results with these arguments before."""
+    """Whether `predict_results` has written its results with these arguments before; raises ResultsError as it."""
     path = path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
     work = _Work(dataset, task, baseline or Baseline(), tuple(scenarios))
-    return work.is_done(path, [token for own in scenarios.values() for token in own])
+    return work.is_done(path, scenarios)
 
 
 def samples_by_scenario(path: Path, tokens: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -183,19 +183,19 @@ class _Work:
         """The notes in its results."""
         return {**self.baseline.meta(), "release": release_note(self.dataset, self.scenarios), "devkit": __version__}
 
-    def digest(self, tokens: Sequence[str]) -> str:
+    def digest(self, scenarios: Mapping[str, tuple[str, ...]]) -> str:
         """Of all that decides the results of these samples."""
-        return digest_of(
-            {"baseline": repr(self.baseline), "task": self.task, "tokens": list(tokens), "meta": self.meta}
-        )
+        tokens = list(chain(*scenarios.values()))
+        return digest_of({"baseline": repr(self.baseline), "task": self.task, "tokens": tokens, "meta": self.meta})
 
-    def is_done(self, path: Path, tokens: Sequence[str]) -> bool:
+    def is_done(self, path: Path, scenarios: Mapping[str, tuple[str, ...]]) -> bool:
         """Whether its results of these samples are there."""
         try:
             results = read_results(path)
         except ResultsError:  # nothing, or something else
             return False
-        return (results.task, results.meta, results.tokens) == (self.task, self.meta, tuple(tokens))
+        wanted = self.task, self.meta, tuple(chain(*scenarios.values()))
+        return (results.task, results.meta, results.tokens) == wanted
 
     def writer(self, path: Path) -> ResultsWriter:
         """A writer of its results; raises ResultsError if something stands there."""

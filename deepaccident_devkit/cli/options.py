@@ -86,9 +86,10 @@ def engine_parameters(run_verb: Function) -> Function:
         from deepaccident_devkit.parallel import cluster_executor  # here: most verbs start without it
 
         refuse_unused("with a scheduler, which has workers of its own", "workers")
+        # workers have working folders of their own
         options = {name: each.absolute() if isinstance(each, Path) else each for name, each in options.items()}
         file = Path(scheduler) if scheduler.endswith(".json") else None
-        with cluster_executor(None if file else scheduler, file) as executor:  # workers have folders of their own
+        with cluster_executor(None if file else scheduler, file) as executor:
             return run_verb(*arguments, executor=executor, **options)
 
     return cast("Function", workers_parameter(_SCHEDULER(run)))

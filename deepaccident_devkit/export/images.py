@@ -40,7 +40,8 @@ class ImageConfig:
         decode: how images are resized: `full`, or `scaled` in two thirds of the time, with slightly other pixels
             (docs/training.md). `full` decodes whole images and resizes as Pillow's bilinear filter; `scaled` decodes
             JPEG at the smallest of 1/1, 1/2, 1/4 and 1/8 that is no smaller than `resize` and resizes as OpenCV's area
-            filter. A pixel is at most 1 of 255 from what these libraries make.
+            filter. A pixel is at most 1 of 255 from what these libraries make, but where `scaled` shrinks one axis and
+            grows the other, for which OpenCV has another filter.
     """
 
     resize: tuple[int, int] | None = None
@@ -137,7 +138,7 @@ def resized_part(
             as of OpenCV's area filter.
 
     Returns:
-        (height, width, 3), the view of an array (3, height, width): at most 1 of 255 from what these libraries make.
+        (height, width, 3), the view of an array (3, height, width): as `ImageConfig.decode` says.
     """
     import cv2
 

@@ -35,6 +35,7 @@ from deepaccident_devkit.support.arrays import (
     checked,
     checked_count,
     checked_whole,
+    keep_freed,
 )
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
@@ -42,8 +43,6 @@ _MOST_IDS: Final = 2**24
 """The largest id: float32 holds all whole numbers up to here."""
 _VANISHED: Final = 104.0
 """exp(−x) is 0 in float32 from here on."""
-_MOST_KEPT: Final = 31 * 2**20
-"""In bytes: a larger piece does not change what the allocator returns to the system."""
 _MARGIN: Final = 0.75
 """In cells, around a footprint: half a cell for the nearest sampling, and some for the rounding of the points."""
 _FARTHEST: Final = 2.0**16
@@ -130,17 +129,7 @@ def labels_of(
         first, last = sample * frames, (sample + 1) * frames
         shown = covered.between(first, last)
         maps = label_maps(shown, centers[first:last], following[first:last], ~valid[sample, past:], config)
-        yield MotionLabels(
-            config=config,
-            segmentation=maps.segmentation,
-            instance=maps.instance,
-            centerness=maps.centerness,
-            offset=maps.offset,
-            flow=maps.flow,
-            future_egomotion=egomotion[sample],
-            valid=valid[sample],
-            id_map=own_ids,
-        )
+        yield maps.labels(config, egomotion[sample], valid[sample], own_ids)
 
 
 def _checked_ids(id_map: Mapping[int, int], config: MotionLabelConfig) -> dict[int, int]:
@@ -259,13 +248,11 @@ class LabelMaps:
     def empty(cls, config: MotionLabelConfig) -> LabelMaps:
         """Maps of frames without any actor.
 
-        They share one piece of memory. Five pieces of a megabyte each would be returned to the system after every
-        sample, and to get them again takes as long as all the rasterising. Nor are pieces of several samples returned
-        after the allocator (of Linux) has once freed a larger one, which is never touched.
+        They share one piece of memory, which is kept for the next sample, as those of five samples are.
         """
         frames, (height, width) = config.label_frames, config.grid.shape
         count = frames * height * width
-        np.empty(min(5 * count * 25, _MOST_KEPT), dtype=np.uint8)
+        keep_freed(5 * count * 25)
         memory = np.empty(count * 25, dtype=np.uint8)
         memory[: 16 * count].view(np.float32)[:] = config.ignore_index
         memory[16 * count :] = 0
@@ -276,6 +263,22 @@ class LabelMaps:
             centerness=memory[16 * count : 20 * count].view(np.float32).reshape(frames, 1, height, width),
             instance=memory[20 * count : 24 * count].view(np.int32).reshape(one),
             segmentation=memory[24 * count :].reshape(one),
+        )
+
+    def labels(
+        self, config: MotionLabelConfig, egomotion: Float32Array, valid: BoolArray, id_map: dict[int, int]
+    ) -> MotionLabels:
+        """The labels with these maps."""
+        return MotionLabels(
+            config=config,
+            segmentation=self.segmentation,
+            instance=self.instance,
+            centerness=self.centerness,
+            offset=self.offset,
+            flow=self.flow,
+            future_egomotion=egomotion,
+            valid=valid,
+            id_map=id_map,
         )
 
 

@@ -110,17 +110,8 @@ class StoredLabels(ShortRepr):
         missing = ~self.valid[config.receptive_field - 1 :]
         maps = label_maps(covered, center, center + flow, missing, config)
         known = np.flatnonzero(self.actor != NOBODY)
-        return MotionLabels(
-            config=config,
-            segmentation=maps.segmentation,
-            instance=maps.instance,
-            centerness=maps.centerness,
-            offset=maps.offset,
-            flow=maps.flow,
-            future_egomotion=self.future_egomotion,
-            valid=self.valid,
-            id_map=dict(zip(self.actor[known].tolist(), known.tolist(), strict=True)),
-        )
+        id_map = dict(zip(self.actor[known].tolist(), known.tolist(), strict=True))
+        return maps.labels(config, self.future_egomotion, self.valid, id_map)
 
     def _check(self, config: MotionLabelConfig) -> None:
         frames, ids = config.label_frames, len(self.actor)

@@ -104,8 +104,8 @@ def read_calibs(paths: Sequence[ReleasePath]) -> Calibs:
     """The calibrations of several files as stacked arrays; raises as `read_calib` does."""
     contents = [read_content(path, "calib", CalibError) for path in paths]
     files = [_loaded(path, content) for path, content in zip(paths[:1], contents[:1], strict=True)]
-    arrays = load_stacked(contents)
-    if arrays is None:  # of several layouts
+    arrays = load_stacked(contents)  # of the first one's layout, whose keys and shapes are checked
+    if arrays is None:
         files += [_loaded(path, content) for path, content in zip(paths[1:], contents[1:], strict=True)]
         arrays = _stacked(files)
     return _converted(paths, arrays)

@@ -71,9 +71,9 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
         DatarootError: the release's folder is gone, or one of its folders cannot be listed.
         ReleaseError: a file cannot be read.
     """
-    folders = scenario_folders(dataset, scenarios)
     from deepaccident_devkit.parallel import Places, run_batch  # here: opening a release waits for this module
 
+    folders = scenario_folders(dataset, scenarios)
     places = Places(reads=places_of(dataset.dataroot))
     found = run_batch(folder_hashes, list(folders.values()), places=places, **how)
     return dict(zip(folders, found, strict=True))

@@ -31,6 +31,15 @@ _FEW: Final = 4
 """In texts of records: characters of all fields and of one, and entries of a collection that are shown."""
 
 
+def keep_freed(size: int = 31 * 2**20) -> None:
+    """Have the allocator (of Linux) keep freed blocks of up to `size` bytes, 31 MiB at most, for what is made next.
+
+    Else it returns them to the system each time, and to get their pages again takes as long as much of the work. It
+    does so after it has once freed a block as large, which is never touched.
+    """
+    np.empty(min(size, 31 * 2**20), dtype=np.uint8)
+
+
 class ShortRepr:
     """Base of dataclasses that hold arrays: their text is one line of fewer than 200 characters, with shapes of arrays.
 

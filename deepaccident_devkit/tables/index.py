@@ -295,6 +295,8 @@ def _written_tables(
 
     The name is empty if there is nothing to join. Whole tables of that name are left as they are.
     """
+    from deepaccident_devkit.tables.indexing import join_tables
+
     if not outcomes:
         return "", {}
     assigned = [splits.split_of.get(each.token) for each in outcomes]
@@ -307,8 +309,6 @@ def _written_tables(
     else:
         remove_in(store.folder, name)  # damaged, or of a process that was stopped before its manifest
         with replacing_folder(folder) as temporary:
-            from deepaccident_devkit.tables.indexing import join_tables
-
             join_tables(temporary, [store.path(each.token) for each in outcomes], assigned)
             files = table_files(temporary)
     return name, files

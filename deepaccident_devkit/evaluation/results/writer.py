@@ -148,13 +148,12 @@ class ResultsWriter:
             ResultsError: the prediction is of another kind, grid or frame, the sample was added before, or nothing can
                 be written; the message begins with path and token.
         """
-        if self._body is None:
-            raise ResultsError(f"{self.path}: is not open; add predictions inside `with ResultsWriter(…) as writer:`")
+        body = self._opened()
         try:
             check_token(token)
             if token in self._tokens:
                 raise ResultsError("was added before; give each sample one prediction")
-            self._body.add(token, prediction)
+            body.add(token, prediction)
         except (ContentError, ResultsError) as error:
             raise ResultsError(f"{self.path}: {token}: {error}") from error
         except OSError as error:
@@ -168,11 +167,16 @@ class ResultsWriter:
         Raises:
             ResultsError: nothing can be read or written.
         """
-        if self._body is None:
-            raise ResultsError(f"{self.path}: is not open; add parts inside `with ResultsWriter(…) as writer:`")
+        body, self._body = self._opened(), None  # as `add` leaves it after an error of the system
         with _told(self.path):
-            self._body.add_part(part)
+            body.add_part(part)
+        self._body = body
         self._tokens.update(part.tokens)
+
+    def _opened(self) -> EntryWriter | ShardWriter:
+        if self._body is None:
+            raise ResultsError(f"{self.path}: is not open; add predictions inside `with ResultsWriter(…) as writer:`")
+        return self._body
 
     def _check_free(self) -> None:
         with _told(self.path):

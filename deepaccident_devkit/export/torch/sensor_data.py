@@ -16,13 +16,12 @@ from deepaccident_devkit.export.torch.config import V2XConfig, augmented_points,
 from deepaccident_devkit.motion import Augmentation
 from deepaccident_devkit.parallel.executors import own_threads
 from deepaccident_devkit.release.layout import MissingFiles
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray, keep_freed
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import LIDAR, AgentName
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
 from deepaccident_devkit.v2x.messages import Message, messages
 
-np.empty(31 << 20, dtype=np.uint8)  # freed at once: from then on glibc keeps freed blocks of up to this size for reuse
 _NO_POINTS: Final = np.zeros((0, 4), dtype=np.float32)
 Received = Sequence[Mapping[AgentName, Message]]
 """For each past frame, the present last: sender → its message, for messages that arrived."""
@@ -163,6 +162,7 @@ def camera_arrays(
     load = partial(config.load, dataset) if cache is None else partial(cache.load, config, dataset)
     mapped = map if cache is not None or get_worker_info() is not None else _by_threads
     shape = (len(names), len(arrived), len(config.cameras))
+    keep_freed()
     images: ByteArray = np.zeros((*shape, 3, 0, 0), dtype=np.uint8)  # until the first one tells the size
     result = {key: np.tile(np.eye(size, dtype=np.float32), (*shape, 1, 1)) for key, size in _MATRICES.items()}
     for p, moment in enumerate(arrived):
