@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of
 from deepaccident_devkit.evaluation.task import FrozenMappings
 from deepaccident_devkit.selection.fields import FIELDS, full_name, group_texts
@@ -227,12 +228,10 @@ def _group(
     attributes: Mapping[str, SampleAttributes],
     resampling: Resampling,
 ) -> Group[Result]:
-    clusters: dict[str, list[Counts]] = {}
-    counts = evaluator.counts
-    for token in tokens:
-        clusters.setdefault(cluster_of(attributes[token].scenario), []).append(counts[token])
+    names = {token: cluster_of(attributes[token].scenario) for token in tokens}
+    clusters = evaluator.clustered(dict(sorted(names.items(), key=itemgetter(1))))
     result = evaluator.compute(tokens)
-    made = intervals_of(evaluator, [clusters[name] for name in sorted(clusters)], result, resampling)
+    made = intervals_of(evaluator, clusters, result, resampling)
     return Group(
         value=value,
         result=result,

@@ -96,8 +96,8 @@ def intervals_of(
         return Intervals(ends={}, notes=(f"no intervals: {few_clusters(len(clusters))}",))
     numbers = {name: each for name, each in numbers_of(result).items() if math.isfinite(each) and has_interval(name)}
     names, parts = list(numbers), parts_of(clusters, chosen)
-    alone = numbers_of_draws(evaluator, parts, np.eye(len(parts), dtype=np.int64), names)
-    left_out = numbers_of_draws(evaluator, parts, leaving_out(len(parts)), names)
+    others = leaving_out(len(parts))
+    alone, left_out = np.split(numbers_of_draws(evaluator, parts, np.vstack([1 - others, others]), names), 2)
     ranges = np.array([range_of(*each) for each in zip(names, alone.T, strict=True)]).reshape(-1, 2)
     having = np.isfinite(alone).sum(axis=0)
     values = np.array(list(numbers.values()))

@@ -19,7 +19,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError, shortened
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.intervals import (
     Clusters,
     Resampling,
@@ -214,7 +214,8 @@ def compare_bundles(
     first, second = (numbers_of(result) for result in results)
     names = list(dict.fromkeys([*(name for name in shown if name in {**first, **second}), *first, *second]))
     values = np.array([[numbers.get(name, math.nan) for name in names] for numbers in (first, second)])
-    clusters = _clusters(evaluators[0], tokens), _clusters(evaluators[1], tokens)
+    cluster_names = {token: cluster_of(scenario_of(token)) for token in tokens}
+    clusters = evaluators[0].clustered(cluster_names), evaluators[1].clustered(cluster_names)
     test = paired_test(evaluators[0], clusters, dict(zip(names, values[1] - values[0], strict=True)), chosen)
     partial = [bundle.summary["partial"] for bundle in bundles]
     return Comparison(
@@ -274,14 +275,6 @@ def _better(difference: float, headline: Headline | None) -> str | None:
     if headline is None or headline.higher_is_better is None:
         return None
     return "b" if (difference > 0) == headline.higher_is_better else "a"
-
-
-def _clusters(evaluator: Evaluator[Any], tokens: list[str]) -> Clusters:
-    """The counts of each cluster's samples (an accident and its twin are one)."""
-    clusters: dict[str, list[Counts]] = {}
-    for token in tokens:
-        clusters.setdefault(cluster_of(scenario_of(token)), []).append(evaluator.counts[token])
-    return list(clusters.values())
 
 
 def _check_rules(one: Bundle, other: Bundle) -> None:
