@@ -126,6 +126,8 @@ def test_one_frame_that_is_missing_is_not_called_a_missing_download(release_root
     da.get_sample_data_path(sample, "Camera_Front").unlink()
     figure = da.render_sample(sample)
     assert missing_words(figure) == ["ego_vehicle Camera_Front: no file of this frame"]
+    frames = da.sensor_frames(da.scenario[0])
+    assert {*frames["ego_vehicle", "lidar01"]} - {*frames["ego_vehicle", "Camera_Front"]} == {3}
 
 
 @pytest.mark.parametrize(("view", "grey", "words"), VIEWS)
