@@ -90,7 +90,7 @@ VIEWS: list[tuple[Callable[[DeepAccident, str], Any], int, list[str]]] = [
     (
         lambda da, scenario: da.render_calibration(f"{scenario}/ego_vehicle/003", agents=["infrastructure"]),
         1,
-        [POLE, FRONT],
+        [FRONT, POLE],
     ),
     (lambda da, scenario: da.render_visibility(f"{scenario}/003", layers=["points"]), 0, [POLE]),
     (lambda da, scenario: da.render_sample_data(f"{scenario}/ego_vehicle/003/Camera_Front"), 1, [FRONT]),
@@ -136,6 +136,9 @@ def test_a_picture_names_what_is_not_there(
 ) -> None:
     figure = view(da_partial, scenario).figure
     assert (grey_panels(figure), missing_words(figure)) == (grey, words)
+    titles = [title_of(figure), *(ax.get_title() for ax in figure.axes)]
+    assert any(POLE in title.replace("\n", " ") for title in titles) == (POLE in words)  # not over the data
+    assert lacking(" ".join(text.get_text() for ax in figure.axes for text in ax.texts), "LiDAR") == ["LiDAR"]
 
 
 def test_a_whole_release_lacks_nothing(da: DeepAccident, scenario: str) -> None:
