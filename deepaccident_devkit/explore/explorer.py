@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from urllib.parse import quote
 
 import numpy as np
 
@@ -110,6 +111,12 @@ class Explorer:
             if model.bundle is not None:
                 _ = model.job
         self.scenarios.begin()
+
+    @property
+    def first_page(self) -> str:
+        """What a reader sees first: the page of the model or of several models, or without any the scenarios."""
+        pages = [f"model/{quote(name, safe='')}/" for name in self.models] or [""]
+        return pages[0] if len(pages) == 1 else "models/"
 
     @property
     def scores(self) -> dict[str, Model]:
