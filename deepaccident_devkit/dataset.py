@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError, ReleaseError, TokenError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.conventions import stored_transforms
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
 from deepaccident_devkit.release.fingerprints import digest_of
+from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.support import nuscenes_names
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
@@ -27,6 +29,7 @@ from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
     CAMERAS,
+    CHANNEL_FORMAT,
     CHANNELS,
     INFRASTRUCTURE,
     LIDAR,
@@ -220,6 +223,26 @@ class Dataset(OpenTables):
             TokenError: no such sensor file.
         """
         return self._path(self._sensor(sample_data, channel)[0])
+
+    def sensor_frames(self, scenario: RowArgument) -> dict[tuple[str, str], tuple[int, ...]]:
+        """Which files of a scenario are here: agent and channel → frame numbers, ascending, without opening any.
+
+        Of each agent that is here and each of `taxonomy.CHANNELS` a folder is listed: `sensor_path` of every file is
+        slower. A folder that is not there, or cannot be listed, has none.
+
+        Raises:
+            TokenError: no such scenario.
+        """
+        row = self.getind("scenario", scenario)
+        record = self.scenario[row]
+        folder = ScenarioFolder(self.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS)
+        found: dict[tuple[str, str], tuple[int, ...]] = {}
+        for agent, channel in product(self._tables.resolver.agents_of(row), CHANNELS):
+            found[agent, channel] = ()
+            with suppress(ReleaseError):
+                here, _ = frame_numbers(folder.kind_folder(agent, channel), CHANNEL_FORMAT[channel])
+                found[agent, channel] = tuple(frame for frame in here if frame <= record["num_frames"])
+        return found
 
     @nuscenes_names.with_keywords_named
     def get_sample_data(

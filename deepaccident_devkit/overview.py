@@ -8,14 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
-from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.text import columns_text, natural_order
 from deepaccident_devkit.taxonomy import (
     AGENTS,
-    CHANNEL_FORMAT,
     CHANNELS,
     EXPECTED_MINI_SCENARIOS,
     EXPECTED_SCENARIOS,
@@ -24,7 +20,7 @@ from deepaccident_devkit.taxonomy import (
 )
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.tables.records import AgentRecord, ScenarioRecord
+    from deepaccident_devkit.tables.records import ScenarioRecord
 
 _UNKNOWN = "unknown"
 
@@ -112,7 +108,7 @@ def overview(dataset: Dataset) -> Overview:
     samples = {agent["token"]: dataset.get("sample", agent["first_sample_token"]) for agent in agents}
     split_counts = Counter(scenario["split"] or _UNKNOWN for scenario in scenarios)
     mini = dataset.version == "v1-mini"
-    files = _channel_files(dataset, scenarios, agents)
+    files = _channel_files(dataset, scenarios)
     return Overview(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
@@ -187,27 +183,10 @@ def _counts(values: Iterable[object]) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda item: natural_order(item[0])))
 
 
-def _channel_files(
-    dataset: Dataset, scenarios: Sequence[ScenarioRecord], agents: Sequence[AgentRecord]
-) -> dict[str, list[int]]:
+def _channel_files(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> dict[str, list[int]]:
     """Channel → number of files of each recording, by their names; what is in them `validate` tells."""
     counts: dict[str, list[int]] = {channel: [] for channel in CHANNELS}
-    folders = {
-        scenario["token"]: ScenarioFolder(
-            dataset.dataroot, scenario["folder"], scenario["scenario_type"], scenario["name"], AGENTS
-        )
-        for scenario in scenarios
-    }
-    for agent in agents:
-        folder = folders[agent["scenario_token"]]
-        for channel in CHANNELS:
-            counts[channel].append(_file_count(folder.kind_folder(agent["name"], channel), CHANNEL_FORMAT[channel]))
+    for scenario in scenarios:
+        for (_, channel), frames in dataset.sensor_frames(scenario).items():
+            counts[channel].append(len(frames))
     return counts
-
-
-def _file_count(folder: ReleasePath, suffix: str) -> int:
-    """How many frames a sensor's folder has; 0 if it is not there or cannot be listed."""
-    try:
-        return len(frame_numbers(folder, suffix)[0])
-    except ReleaseError:
-        return 0

@@ -49,18 +49,19 @@ def test_the_page_shows_all_that_was_made(made_demo: tuple[Path, str]) -> None:
 @pytest.mark.slow
 def test_the_next_steps_run_as_they_are_printed(made_demo: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
     served: list[object] = []
-    monkeypatch.setattr("deepaccident_devkit.explore.serving.serve", lambda app, **_: served.append(app))
+    monkeypatch.setattr("deepaccident_devkit.explore.serving.serve", lambda _, **how: served.append(how["page"]))
     out, printed = made_demo
     assert printed.rstrip().endswith(str(out / "index.html"))
-    steps = re.findall(r"^(\w+), which takes some \d+ s$", printed, re.MULTILINE)
-    assert steps[::3] == ["recording", "model", "replay"]
+    steps = re.findall(r"^(\d of 7: \w+), which takes some \d+ s$", printed, re.MULTILINE)
+    assert steps[::3] == ["1 of 7: recording", "4 of 7: model", "7 of 7: replay"]
+    assert ("\r" in printed, "  100 % recorded\n2 of 7: " in printed) == (False, True)
     commands = re.findall(r"^ +deepaccident (.+)$", printed, re.MULTILINE)
     assert len(commands) == 6
     page = page_of(out / "index.html").text
     for command in commands:
         assert f"deepaccident {command}" in page
         run(*shlex.split(command))
-    assert len(served) == 1
+    assert served == ["model/single_vehicle/"]  # with its verdicts
 
 
 @pytest.mark.slow

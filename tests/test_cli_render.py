@@ -19,7 +19,7 @@ from deepaccident_devkit.cli.render_targets import rows_to_draw
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.render import detached_figure, render_bev, render_sample_data
 from deepaccident_devkit.render.figures import figure_of_pixels, save_picture
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR, OWN_ACTOR_ID
 
 SIZE = (480, 480)
 VIEWS = sorted(set(render.commands) - {"evaluation", "video", "replay"})
@@ -111,6 +111,31 @@ def test_what_is_drawn_without_a_token(da_motion: DeepAccident) -> None:
         [f"{token}/ego_vehicle/025/Camera_Front"],
         [token],
     ]
+
+
+def test_a_partial_download_stands_for_the_moment_agent_and_camera_with_most_files(
+    motion_root: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(motion_root, tmp_path / "release")
+    da = DeepAccident(dataroot=root, verbose=False)
+    token = next(record["token"] for record in da.scenario if record["collision"])
+    files = {("infrastructure", "Camera_Back"): (5, 20), ("infrastructure", "Camera_BackRight"): (5, 20)}
+    for (agent, channel), frames in (files | {(agent, LIDAR): (8, 12, 14) for agent in AGENTS}).items():
+        for frame in frames:
+            path = da.get_sample_data_path(f"{token}/{agent}/{frame:03d}/{channel}")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+    front, points, later = (CAMERAS[0], LIDAR), (LIDAR,), range(6, 8)
+    rows = (
+        (rows_to_draw(da, "sample", [], None), "infrastructure/020"),
+        (rows_to_draw(da, "sample_data", [token], None), "infrastructure/020/Camera_Back"),
+        (rows_to_draw(da, "frame", [], None, front), "014"),
+        (rows_to_draw(da, "sample", [], None, points), "ego_vehicle/014"),
+        (rows_to_draw(da, "sample", [], None, points, latency=0.4), "ego_vehicle/012"),
+        (rows_to_draw(da, "sample", [], None, ()), "ego_vehicle/025"),
+        (rows_to_draw(da, "sample_data", [], later), "ego_vehicle/006/Camera_Front"),  # as it is named
+    )
+    assert [found[0] for found, _ in rows] == [f"{token}/{expected}" for _, expected in rows]
 
 
 def test_a_scenario_without_a_collision_has_rows_too(da_motion: DeepAccident) -> None:

@@ -38,12 +38,13 @@ from deepaccident_devkit.render.samples import render_calibration, render_frame,
 from deepaccident_devkit.render.styles import StyleName, current_style, style
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, check_target, render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
-from deepaccident_devkit.taxonomy import Frame
+from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR, Frame
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 _RELEASE = ("dataroot", "version", "index_dir", "workers", "executor", "on_error")
 _VISIBILITY_STYLES = ("map", "table")
+_FRONT_AND_POINTS = (CAMERAS[0], LIDAR)
 _logger = logging.getLogger(__name__)
 _OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
 
@@ -111,6 +112,7 @@ class _Picture:
         help: the first line of the verb's help.
         default: what is rendered without a token.
         styles: of its own, the default first.
+        channels: what it shows: of a partial download, a scenario stands for the moment with most files of these.
     """
 
     draw: Callable[..., Any]
@@ -120,6 +122,7 @@ class _Picture:
     options: tuple[Any, ...] = (_LAYERS,)
     default: str = "the first accident, or if there is none, the first scenario"
     styles: tuple[str, ...] = ()
+    channels: tuple[str, ...] = (*CAMERAS, LIDAR)
 
     def drawn(
         self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
@@ -170,11 +173,13 @@ _PICTURES = {
         of="frame",
         help="Render one moment of all agents side by side: front cameras, and boxes and LiDAR from above.",
         options=(_AGENTS, _LAYERS),
+        channels=_FRONT_AND_POINTS,
     ),
     "bev": _Picture(
         draw=_linked(render_bev),
         of="sample",
         canvas="ax",
+        channels=(LIDAR, BEV_CAMERA),
         options=(
             _AGENTS,
             _VIEW_RANGE,
@@ -191,6 +196,7 @@ _PICTURES = {
         of="sample",
         help="Render the motion labels of one sample: one column per frame; instances, centerness, offset and flow.",
         styles=get_args(MotionStyle),
+        channels=(),
     ),
     "visibility": _Picture(
         draw=_visibility,
@@ -198,6 +204,7 @@ _PICTURES = {
         help="Render who sees whom: from above, an actor with one dot for each agent that sees it, or as a table.",
         canvas="ax",
         styles=_VISIBILITY_STYLES,
+        channels=(),
         options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _LAYERS),
     ),
     "accident": _Picture(
@@ -238,6 +245,7 @@ _PICTURES = {
     "link": _Picture(
         draw=_linked(render_link),
         of="sample",
+        channels=(LIDAR,),
         options=(_AGENTS, _VIEW_RANGE, link_parameters(0.2, 0.3), seed_parameter, _LAYERS),
         help="Render how latency and pose noise change the data that partners share with the sample's agent.",
     ),
@@ -246,6 +254,7 @@ _PICTURES = {
         of="frame",
         help="Render LiDAR points and boxes of all agents in camera images, to check the calibration.",
         options=(_AGENTS, _LAYERS),
+        channels=_FRONT_AND_POINTS,
     ),
 }
 
@@ -257,8 +266,9 @@ def render() -> None:
 
 def _verb(name: str, picture: _Picture) -> click.Command:
     text = f"{picture.help}\n\nTOKEN is a row of the table {picture.of}."
-    if picture.of != "scenario":
-        text += " A scenario's token stands for the moment one second before its end."
+    if picture.of not in ("scenario", "instance"):
+        most = ", or of a partial download the nearest one with most files" if picture.channels else ""
+        text += f" A scenario's token stands for the moment one second before its end{most}."
     own = f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}]; " if picture.styles else ""
     text += f" Without TOKEN the command renders {picture.default}."
 
@@ -301,7 +311,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         if not tokens and "results" in choices:
             tokens = read_results(choices["results"]).tokens[:1]
         dataset = DeepAccident(**release)
-        rows = rows_to_draw(dataset, picture.of, tokens, frames)
+        rows = rows_to_draw(dataset, picture.of, tokens, frames, picture.channels, latency=choices.get("latency", 0.0))
         looks = [word for word in styles if word in picture.styles]
         if looks:
             choices["style"] = looks[-1]

@@ -57,7 +57,8 @@ def explore(
     app = make_app(explorer)
     explorer.begin()
     try:
-        serve(app, host=host, port=port, root_path=root_path, open_browser=open_browser, say=say)
+        page = explorer.first_page
+        serve(app, host=host, port=port, root_path=root_path, page=page, open_browser=open_browser, say=say)
     finally:
         explorer.jobs.end()
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from urllib.parse import quote
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from deepaccident_devkit.render.replay.entries import Recording
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR
 from deepaccident_devkit.support.arrays import as_floats
 from deepaccident_devkit.support.files import is_writable_folder, place_in
+from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -48,7 +50,6 @@ VERSION: Final = 1
 _QUALITY: Final = 75
 _REACH: Final = 40.0
 """Metres from the middle of a picture from above to its left edge."""
-_FRONT: Final = "Camera_Front"
 _MOST_PICTURES, _MOST_REPLAYS = 64_000_000, 6
 """Bytes of pictures in memory; and scenarios whose replay is in memory, some megabytes each."""
 DPI: Final = 80
@@ -112,6 +113,12 @@ class Explorer:
         self.scenarios.begin()
 
     @property
+    def first_page(self) -> str:
+        """What a reader sees first: the page of the model or of several models, or without any the scenarios."""
+        pages = [f"model/{quote(name, safe='')}/" for name in self.models] or [""]
+        return pages[0] if len(pages) == 1 else "models/"
+
+    @property
     def scores(self) -> dict[str, Model]:
         """Columns `score:MODEL`, of models that have scores."""
         return {f"{SCORE}{name}": model for name, model in self.models.items() if model.bundle is not None}
@@ -119,9 +126,7 @@ class Explorer:
     def thumbnail(self, token: str) -> bytes:
         """A scenario's thumbnail as JPEG; raises TokenError."""
         record = self.dataset.scenario.get(token)
-        last = [f"{token}/{agent}/{record['num_frames']:03d}" for agent in agents_of(self.dataset, record)]
-        there = [is_there(self.dataset, f"{sample}/{channel}") for sample in last for channel in CAMERAS]
-        identity = repr((VERSION, SIZE, token, str(self.dataset.dataroot), record["num_frames"], there))
+        identity = repr((VERSION, SIZE, token, str(self.dataset.dataroot), _last_images(self.dataset, record)))
         return self.thumbnails.get(identity, "thumbnail.jpg", lambda: thumbnail(self.dataset, record))
 
     def recording(self, token: str) -> Recording:
@@ -213,14 +218,15 @@ class KeptFiles:
 
 
 def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
-    """A scenario's last moment as JPEG: the colliding pair in the best camera with red boxes; of others, the front one.
+    """A scenario's last moment with an image as JPEG: the pair in the best camera with red boxes; of others, the front.
 
     Where no image was downloaded it is the actors from above; without labels a grey panel.
     """
-    boxes = scenario_tracks(dataset, record).at(record["num_frames"])
+    moment, _ = _last_images(dataset, record)
+    boxes = scenario_tracks(dataset, record).at(moment)
     told = record["collision"]
     pair = boxes.select(np.isin(boxes.actor_id, [] if told is None else told["ids"]))
-    samples = [f"{record['token']}/{agent}/{record['num_frames']:03d}" for agent in agents_of(dataset, record)]
+    samples = [sample_token(record["token"], agent, moment) for agent in agents_of(dataset, record)]
     camera = _camera(dataset, samples, pair)
     image: Any = None
     if camera is not None:
@@ -232,13 +238,20 @@ def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
     return written.getvalue()
 
 
+def _last_images(dataset: Dataset, record: ScenarioRecord) -> tuple[int, list[tuple[str, str]]]:
+    """The number of the last frame with an image, or without any the last one, and the agents and cameras of those."""
+    cameras = {key: frames for key, frames in dataset.sensor_frames(record).items() if key[1] in CAMERAS}
+    last = max((frames[-1] for frames in cameras.values() if frames), default=record["num_frames"])
+    return last, [key for key, frames in cameras.items() if last in frames[-1:]]
+
+
 def _camera(dataset: Dataset, samples: list[str], pair: Boxes) -> str | None:
-    """The camera (token) that is shown; None where no image is there."""
+    """The camera (token) that is shown, of no pair a front one if there is any; None where no image is there."""
     view = best_view(dataset, samples, pair) if len(pair) else None
     if view is not None and is_there(dataset, view.camera):
         return view.camera
-    front = (f"{sample}/{_FRONT}" for sample in samples)
-    return next((camera for camera in front if is_there(dataset, camera)), None)
+    cameras = (f"{sample}/{channel}" for channel in CAMERAS for sample in samples)
+    return next((camera for camera in cameras if is_there(dataset, camera)), None)
 
 
 def _photo(dataset: Dataset, camera: str, pair: Boxes) -> Any:

@@ -45,16 +45,18 @@ def serve(
     host: str = LOOPBACK,
     port: int | None = None,
     root_path: str = "",
+    page: str = "",
     open_browser: bool = True,
     say: Callable[[str], object],
 ) -> None:
     """Show the pages on a host and port of this machine until an exception, such as that of Ctrl-C, ends it.
 
     The port is by default the first free one from 8765 on; the root path is the path or URL at which a proxy shows the
-    pages. A browser is opened if there is a display and no proxy; `say` gets the addresses, line by line. Raises
-    MissingExtraError, and ConfigError if the server cannot listen there or the root path is neither.
+    pages; the addresses lead to a `page`, by default the first. A browser is opened if there is a display and no proxy;
+    `say` gets the addresses, line by line. Raises MissingExtraError, and ConfigError if the server cannot listen there
+    or the root path is neither.
     """
-    with serving(app, host=host, port=port, root_path=root_path) as served:
+    with serving(app, host=host, port=port, root_path=root_path, page=page) as served:
         for line in served.lines():
             say(line)
         if open_browser and not root_path and _is_display_likely(os.environ):
@@ -63,7 +65,9 @@ def serve(
 
 
 @contextmanager
-def serving(app: App, *, host: str = LOOPBACK, port: int | None = None, root_path: str = "") -> Iterator[Served]:
+def serving(
+    app: App, *, host: str = LOOPBACK, port: int | None = None, root_path: str = "", page: str = ""
+) -> Iterator[Served]:
     """As `serve`, but the pages are shown while the block runs; port 0 is any free one."""
     need_extra()
     host = host.removeprefix("[").removesuffix("]")
@@ -76,7 +80,7 @@ def serving(app: App, *, host: str = LOOPBACK, port: int | None = None, root_pat
     running = _Running(gate, listening)
     try:
         running.start()
-        yield Served(host, bound, access, gate, running)
+        yield Served(host, bound, access, gate, running, page)
     finally:
         running.stop()
 
@@ -89,6 +93,7 @@ class Served:
         host: name or address that was asked for.
         bound: address on which the server listens.
         access: what is let in.
+        page: to which the addresses lead.
     """
 
     host: str
@@ -96,6 +101,7 @@ class Served:
     access: Access
     _gate: Gate = field(repr=False)
     _running: _Running = field(repr=False)
+    page: str = ""
 
     @property
     def port(self) -> int:
@@ -117,11 +123,11 @@ class Served:
     @property
     def url(self) -> str:
         """The address that opens the pages."""
-        return f"{self.origin}/?token={self.token}"
+        return f"{self.origin}/{self.page}?token={self.token}"
 
     def lines(self) -> list[str]:
         """All addresses for the reader, and what to know about them."""
-        here, query = socket.gethostname(), f"/?token={self.token}"
+        here, query = socket.gethostname(), f"/{self.page}?token={self.token}"
         lines = [] if self.bound.is_loopback else [_EXPOSED]
         lines.append(f"the explorer runs until Ctrl-C; open {self.url}")
         if self.bound.is_unspecified:
@@ -139,7 +145,10 @@ class Served:
     def open_browser(self) -> None:
         """Open the pages in a browser, as far as there is one; the token is not in its command line."""
         threading.Thread(
-            target=_open, args=(f"{self.origin}/?token={self._gate.ticket()}",), name="browser", daemon=True
+            target=_open,
+            args=(f"{self.origin}/{self.page}?token={self._gate.ticket()}",),
+            name="browser",
+            daemon=True,
         ).start()
 
     def wait(self) -> None:

@@ -30,7 +30,7 @@ from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
-from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, OWN_ACTOR_ID, frame_timestamp, short_name
+from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, FRAME_PERIOD, OWN_ACTOR_ID, frame_timestamp, short_name
 from deepaccident_devkit.v2x import Agents, cooperating_agents
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.poses import camera_of
@@ -293,8 +293,11 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
 def _draw_crops(
     dataset: Dataset, actor: _Actor, known: Sequence[Sightings], layers: frozenset[Layer], axes: Sequence[Axes]
 ) -> None:
-    """The largest views at several of the moments at which some camera sees the actor."""
-    moments = np.unique(np.concatenate([one.index[one.camera] for one in known]))
+    """The largest views at several of the moments at which some camera sees the actor, preferably with its image."""
+    seen, files = [one.index[one.camera] for one in known], dataset.sensor_frames(actor.scenario)
+    images = [[frame for camera in CAMERAS for frame in files[one.agent, camera]] for one in known]
+    shown = [index[np.isin(index, there)] for index, there in zip(seen, images, strict=True)]
+    moments = np.unique(np.concatenate(shown if any(map(len, shown)) else seen))
     picked = moments[np.unique(np.linspace(0, len(moments) - 1, len(axes)).round().astype(int))] if len(moments) else []
     for ax in axes[len(picked) :]:
         ax.set_axis_off()

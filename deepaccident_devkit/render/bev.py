@@ -143,9 +143,9 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
         layers: some of `map` (the ground of the town as all its recordings saw it, `town_map`; made if none is kept,
             which takes a while), `bev` (the agent's BEV camera, in pale colours, over the map), `points`, `boxes`,
             `ids`, `velocities` (arrows for one second), `trajectories` (past thin, future thick, fading) and `grid`; by
-            default bev, points, boxes, grid. Points and the BEV camera are left out if their files are missing; words
-            in a corner say so (of the BEV camera only if there are no points). A town map that is kept takes the place
-            of a BEV camera's picture that is missing.
+            default bev, points, boxes, grid. Points and the BEV camera are left out if their files are missing; the
+            title says so (of the BEV camera only if there are no points). A town map that is kept takes the place of a
+            BEV camera's picture that is missing.
         link: what happens to the partners' data; None for nothing.
         sweeps: how many frames of points, the present included.
         seconds: how far trajectories reach back and ahead.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-import textwrap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -48,10 +47,9 @@ INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "fram
 _HANDLE: Final = 0.4
 """Inches of a sign and the blanks around it."""
 _SPACING: Final[Mapping[str, Any]] = {"handlelength": 1.2, "columnspacing": 1.0}
-_MISSING: Final = "missing"
-"""Marks the words in a figure, so that `missing_words` finds them."""
-_CORNER_LETTERS: Final = 50
-"""In a line of a corner."""
+_MISSING, _LACKS = "missing", "lacks"
+"""Mark the words of a grey panel, and those for a title, so that `missing_words` finds them."""
+_NO_CLOUD: Final = "no LiDAR file of "
 
 
 def scene_words(dataset: Dataset, scenario: str) -> str:
@@ -77,7 +75,7 @@ def set_scene_title(
     """Title axes or a figure `Night, hard rain, Town10HD: 1.0 s to the impact, ego vehicle`, and a token small beneath.
 
     The token is that of a scenario, frame, sample, sensor file, box or actor; `words` follow on the same line, `below`
-    on another one.
+    on another one, and on a last one what `write_missing` was given of these axes, or of a figure's.
     """
     from matplotlib.axes import Axes
 
@@ -87,7 +85,9 @@ def set_scene_title(
     if isinstance(where, Axes):
         style.setdefault("fontsize", "medium")
     first = ": ".join(filter(None, [scene_words(dataset, f"{kind}/{name}"), said]))
-    set_title(where, "\n".join(filter(None, [first, below])), token=token, **style)
+    axes: Any = [where] if isinstance(where, Axes) else where.axes
+    absent = "; ".join(_parts(text for ax in axes for text in ax.texts if text.get_gid() == _LACKS))
+    set_title(where, "\n".join(filter(None, [first, below, absent])), token=token, **style)
 
 
 def set_title(
@@ -252,11 +252,12 @@ def has_cloud(dataset: Dataset, sample: str) -> bool:
 
 
 def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
-    """Make axes a grey panel that names the agent and the camera of an image (a token) that is not there."""
+    """Make axes a grey panel that says, at its top and beneath all data, why an image (a token) is not there."""
     agent, _, channel = sample_data.rsplit("/", 3)[1:]
     ax.set_facecolor(MISSING_COLOR)
-    words = f"{agent}\n{channel}:\n{absence_text(dataset, sample_data)}"
-    ax.text(0.5, 0.95, words, ha="center", va="top", fontsize=SMALLEST_TEXT, transform=ax.transAxes, gid=_MISSING)
+    words = absence_text(dataset, sample_data)
+    style: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": SMALLEST_TEXT, "transform": ax.transAxes}
+    ax.text(0.5, 0.97, words, label=f"{agent} {channel}: {words}", gid=_MISSING, zorder=0, **style)
 
 
 def absence_text(dataset: Dataset, sample_data: str) -> str:
@@ -266,22 +267,25 @@ def absence_text(dataset: Dataset, sample_data: str) -> str:
 
 
 def write_missing(ax: Axes, words: str) -> None:
-    """Write into the lower left corner of axes what is not in the picture; nothing if there are no words."""
+    """Have the title of axes or of their figure, which is set later, say what is not in the picture; or nothing."""
     if words:
-        paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
-        text = textwrap.fill(words, _CORNER_LETTERS)
-        style: dict[str, Any] = {"fontsize": SMALLEST_TEXT, "bbox": paper, "zorder": 8, "gid": _MISSING}
-        ax.annotate(text, (0, 0), (4, 4), xycoords="axes fraction", textcoords="offset points", **style)
+        ax.text(0, 0, "", label=words, gid=_LACKS, visible=False)
 
 
 def missing_clouds_text(agents: Collection[str]) -> str:
     """`no LiDAR file of ego_vehicle, infrastructure`; empty if it is nobody."""
-    return f"no LiDAR file of {', '.join(in_drawing_order(agents))}" if agents else ""
+    return f"{_NO_CLOUD}{', '.join(in_drawing_order(agents))}" if agents else ""
 
 
 def missing_words(drawn: Axes | Figure) -> list[str]:
-    """What a picture, or the picture of these axes, says of files that are not there, each once."""
+    """What a picture, or the picture of these axes, lacks because files are not there, each once."""
     figure: Any = drawn.figure
-    texts = figure.findobj(lambda artist: artist.get_gid() == _MISSING)
-    words = (" ".join(text.get_text().split()) for text in texts)
-    return list(dict.fromkeys(part for text in words for part in text.split("; ")))
+    return _parts(figure.findobj(lambda artist: artist.get_gid() in (_MISSING, _LACKS)))
+
+
+def _parts(texts: Iterable[Any]) -> list[str]:
+    """What texts say of files that are not there, each once; whose clouds in one part."""
+    parts = list(dict.fromkeys(part for text in texts for part in text.get_label().split("; ") if part))
+    clouds = [part.removeprefix(_NO_CLOUD) for part in parts if part.startswith(_NO_CLOUD)]
+    others = [part for part in parts if not part.startswith(_NO_CLOUD)]
+    return [*others, *filter(None, [missing_clouds_text({*filter(None, ", ".join(clouds).split(", "))})])]

@@ -243,8 +243,8 @@ def render_calibration(
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure, three panels in a row. An image that was not downloaded is a grey panel; words in the first panel
-        name the agents whose points were not.
+        The figure, three panels in a row. An image that was not downloaded is a grey panel; the title names the agents
+        whose points were not.
 
     Raises:
         TokenError: no such sample or frame.
@@ -275,10 +275,10 @@ def render_calibration(
         if is_frame:
             set_title(ax, f"{camera.rsplit('/', 3)[1]}, Camera_Front")
     draw_legend(fig, agent_handles(clouds))
+    write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
     whose = "each agent" if len(names) > 1 else names[0]
     where = record["frame_token"] if is_frame else record["token"]
     set_scene_title(fig, dataset, where, f"LiDAR of {whose}")
-    write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
     return fig
 
 

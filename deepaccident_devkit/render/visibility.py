@@ -226,9 +226,9 @@ def render_visibility(
     words = axis_words(frame)
     ax.set(xlabel=words[0], ylabel=words[1])
     ax.locator_params(nbins=6)  # each tick costs time
-    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], "who sees whom")
     if "points" in shown:
         _draw_points(dataset, known, frame, ax)
+    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], "who sees whom")
     colors = role_colors(dataset, known.sample, known.boxes)
     hidden = known.hidden_from(known.ego)
     if "boxes" in shown:

@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 import click
+import numpy as np
 from tqdm import tqdm
 
 from deepaccident_devkit._version import __version__
@@ -23,20 +24,24 @@ from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError, MissingRoomError
 from deepaccident_devkit.evaluation.results import ResultsTask, read_results
-from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
+from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.task import headlines
+from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.render import detached_figure, render_replay
+from deepaccident_devkit.render.boxes import collider_ids, draw_boxes_from_above, recorders_of, write_beside
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
 from deepaccident_devkit.render.figures import save_picture
-from deepaccident_devkit.render.styles import page_style
+from deepaccident_devkit.render.ground import draw_underlay
+from deepaccident_devkit.render.styles import COLLIDER_COLOR, page_style
 from deepaccident_devkit.rooms import need_room
 from deepaccident_devkit.support.files import place_in, remove_leftovers, write_bytes
 from deepaccident_devkit.support.pages import document
 from deepaccident_devkit.support.text import columns_text
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, short_name
+from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import FrameRecord, ScenarioRecord
@@ -75,10 +80,13 @@ RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1, sensors="accidents"
 _MARK: Final = ".deepaccident_demo"
 """The file by which the demo knows a folder as its own."""
 _SCENARIO_FILE: Final = "accident.yaml"
-_RESULTS: Final = "single_vehicle.json"
+_RUN: Final = "single_vehicle"
+_RESULTS: Final = f"{_RUN}.json"
 _COUNTDOWN: Final = (3.0, 2.0, 1.0, 0.5, 0.0)
 """Seconds before the impact; at the first the house hides the other car from ego."""
 _SECONDS_BEFORE: Final = 1.0
+_REACH: Final = 35.0
+"""Metres from ego to the edge of the model's picture."""
 _LABELS: Final = MotionLabelConfig(future_frames=2)
 """The released labels, but they end at the impact."""
 _SELECTION: Final = SampleSelection(split="train", scope="all")
@@ -196,6 +204,8 @@ def draw_accident(release: DeepAccident, out: Path) -> None:
 def draw_model(release: DeepAccident, out: Path) -> bool:
     """Render what the shipped model foresees a second before, by ego's cameras and by all agents', beside the truth.
 
+    Beneath is the road, and above it the pair as it truly is at each of the two moments.
+
     Returns:
         Whether PyTorch is installed; without it there is no picture.
     """
@@ -208,18 +218,33 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
         model = load_model("tiny")
     except (MissingExtraError, MissingRoomError):
         return False
-    token = release.samples_of(_accident_and_before(release)[1])[0]["token"]
-    label = motion_labels(release, token, model.config.labels)
-    fig = detached_figure((13.0, 13.0))
+    accident, before = _accident_and_before(release)
+    token = release.samples_of(before)[0]["token"]
+    label, road = motion_labels(release, token, model.config.labels), release.load_bev(token)
+    fig = detached_figure((11.0, 11.0))
     for column, agents, title in zip(
         fig.subplots(2, 2).T, ("single", "all"), ("ego alone", "five agents"), strict=True
     ):
         [found] = predictions(model, release, [token], PredictConfig(agents=agents))
-        for ax, frame in zip(column, (0, None), strict=True):
+        for ax, frame, moment in zip(column, (0, None), (before["index"], accident["num_frames"]), strict=True):
             draw_motion_outcome(found.motion, label, frame=frame, ax=ax)
-            ax.set_title(f"{title}: {ax.get_title()}")
+            ax.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), title=f"{title}: {ax.get_title()}")
+            draw_underlay(road, ax, target_from_ego=SE3.identity(), view_range=_REACH)
+            _draw_pair(release, token, moment, ax)
     save_picture(fig, out / MODEL_PICTURE, dpi=80)
     return True
+
+
+def _draw_pair(release: DeepAccident, sample: str, moment: int, ax: Any) -> None:
+    """Render the true outlines of a sample's colliding pair at a frame, in the sample's ego frame, with names."""
+    scenario, _, _ = sample.rsplit("/", 2)
+    boxes = scenario_tracks(release, scenario).at(moment)
+    boxes = boxes.select(np.isin(boxes.actor_id, [*collider_ids(release, sample)]))
+    boxes = boxes.transform(release.world_from(sample, "ego").inverse(), "ego")
+    draw_boxes_from_above(boxes, ax, [COLLIDER_COLOR] * len(boxes), fill=0, linewidths=2)
+    recorders = recorders_of(release, scenario)
+    for (x, y, _), actor in zip(boxes.center.tolist(), boxes.actor_id.tolist(), strict=True):
+        write_beside(ax, short_name(recorders[actor]), (x, y), COLLIDER_COLOR)
 
 
 def _accident_and_before(release: DeepAccident) -> tuple[ScenarioRecord, FrameRecord]:
@@ -233,11 +258,16 @@ def _accident_and_before(release: DeepAccident) -> tuple[ScenarioRecord, FrameRe
 def _step(bar: tqdm[Any], name: str) -> Iterator[None]:
     """Name a step on the bar, and move the bar to its end; a log gets a line at its beginning."""
     bar.set_description_str(name)
-    if bar.disable or not sys.stdout.isatty():
-        click.echo(f"{name}, which takes some {_STEPS[name]:.0f} s")
+    if _is_log(bar):
+        click.echo(f"{[*_STEPS].index(name) + 1} of {len(_STEPS)}: {name}, which takes some {_STEPS[name]:.0f} s")
     end = sum(list(_STEPS.values())[: list(_STEPS).index(name) + 1])
     yield
     bar.update(end - bar.n)
+
+
+def _is_log(bar: tqdm[Any]) -> bool:
+    """Whether what is printed goes elsewhere than to a terminal, so that lines say how far it is."""
+    return bar.disable or not sys.stdout.isatty()
 
 
 def _claim(out: Path) -> None:
@@ -265,8 +295,16 @@ def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
         return
     if not scenario.exists():
         write_bytes(scenario, SCENARIO.encode())
-    config = replace(RELEASE, spec=scenario)
-    make_release(root, config, workers=workers or 2, progress=lambda share: bar.update(share * _STEPS["recording"]))
+    recorded = 0.0
+
+    def moved(share: float) -> None:
+        nonlocal recorded
+        before, recorded = recorded, recorded + share
+        bar.update(share * _STEPS["recording"])
+        if _is_log(bar) and int(10 * recorded) > int(10 * before):
+            click.echo(f"  {100 * recorded:.0f} % recorded")
+
+    make_release(root, replace(RELEASE, spec=scenario), workers=workers or 2, progress=moved)
 
 
 def demo_table(release: DeepAccident) -> list[list[str]]:
@@ -287,24 +325,26 @@ def demo_table(release: DeepAccident) -> list[list[str]]:
 
 
 def _evaluate(release: DeepAccident, out: Path) -> None:
-    """Evaluate what the baseline of a single vehicle predicts, and write a report."""
+    """Evaluate what the baseline of a single vehicle predicts, and write a report and a bundle."""
     path = out / _RESULTS
     path.unlink(missing_ok=True)  # of an earlier demo
     results = read_results(predict_results(release, "accident", _SELECTION.tokens(release), path, workers=1))
     setup = EvaluationSetup(task="accident", protocol="boxes")
     run = evaluate_results(release, results, setup, _SELECTION, workers=1).broken_down()
-    save_report(run, place_in(out, REPORT_FOLDER, opened=True), dataset=release, results=results)
+    folder = place_in(out, REPORT_FOLDER, opened=True)
+    save_report(run, folder, dataset=release, results=results)
+    save_run(run, place_in(folder, _RUN, opened=True), include_results=True, overwrite=True)
 
 
 def _next_steps(out: Path) -> tuple[NextStep, ...]:
-    names = ("release", "five_agents", "own", _SCENARIO_FILE, _RESULTS)
-    root, five, own, scenario, results = (shlex.quote(str(out / name)) for name in names)
+    names = ("release", "five_agents", "own", _SCENARIO_FILE, f"{REPORT_FOLDER}/{_RUN}")
+    root, five, own, scenario, bundle = (shlex.quote(str(out / name)) for name in names)
     of_both = f"--split {_SELECTION.split} --scope {_SELECTION.scope}"
     return (
         NextStep("See what the release holds:", f"deepaccident info {root} --where collision=true"),
         NextStep(
-            "Look around in it with your browser; this needs the extra: pip install '.[explore]'",
-            f"deepaccident explore {root} --results {results}",
+            "See in your browser which predictions were right; this needs the extra: pip install '.[explore]'",
+            f"deepaccident explore {root} --results {bundle}",
         ),
         NextStep("Check its files, as you would check your download:", f"deepaccident validate {root} --deep"),
         NextStep(

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 
 HOSTILE = "Town05_type001_subtype0001_scenario00077<img src=x onerror=window.hit=1>\"'&#x41;"
-WIDTHS = ((1280, 720), (400, 800))
+WIDTHS = ((1280, 720), (1400, 900), (700, 900), (390, 800))
 
 
 class Pages(Browser):
@@ -63,7 +63,10 @@ class Pages(Browser):
 
 @pytest.fixture(scope="module")
 def root(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The session's release with a hostile name, a broken scenario, and an agent whose images were not downloaded."""
+    """The session's release with a hostile name, a broken scenario, and some images that were not downloaded.
+
+    They are all of an agent, and of the scenario with the hostile name all but those of the frames 3 and 6.
+    """
     copy = tmp_path_factory.mktemp("explored") / "a release"
     shutil.copytree(release_root, copy, ignore=shutil.ignore_patterns(".deepaccident"))
     normal = min(copy.glob("type1_*_normal/ego_vehicle/calib/*"))
@@ -79,6 +82,8 @@ def root(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     next(broken.iterdir()).write_bytes(b"no label\n")
     for folder in copy.glob("*/other_vehicle_behind/Camera_*"):
         shutil.rmtree(folder)
+    for path in (*kind.glob("*/Camera_*/*img*/*_00[12].jpg"), *kind.glob("*/Camera_*/*img*/*_00[45].jpg")):
+        path.unlink()
     return copy
 
 
@@ -205,11 +210,30 @@ def test_a_scenario_shows_all(pages: Pages, dataset: DeepAccident) -> None:
     pages.wait(PARTS_THERE)
     names = ("story", "pairs", "ledger", "twins", "findings")
     parts = {name: pages.value(f"document.querySelector('[data-part$={name}]').innerText") for name in names}
-    assert (dataset.describe(token).text, parts["findings"][:6]) == (parts["story"], "None: ")
+    missing = "36 of 240 sensor files are missing; 6 of 6 frames have any."
+    assert (dataset.describe(token).text, parts["findings"][: len(missing)]) == (parts["story"], missing)
     assert ("least TTC" in parts["pairs"], "Shapley" in parts["ledger"]) == (True, True)
     pages.click("[data-part$=pairs] button")
     number = pages.value("document.querySelector('[data-part$=pairs] button').dataset.frame")
     assert pages.frame() == int(number) - 1
+
+
+def test_a_picture_of_another_moment_is_veiled(pages: Pages, dataset: DeepAccident) -> None:
+    (token,) = [each["token"] for each in dataset.scenario if each["name"] == HOSTILE]
+    pages.go(scenario_page(token, "?cameras=all"))
+    pages.wait("everyCamera && location.search.includes('frame=3')")  # the first with pictures
+    told = {}
+    for frame in (3, 5, 1, 6):
+        pages.script(f"go({frame - 1})")
+        where = "(each) => [each.figure.classList.contains('veiled'), each.where.textContent]"
+        told[frame] = pages.value(f"[cards[0], everyCamera[0]].map({where})")
+    veiled = {
+        3: [False, "Front"],
+        5: [True, "Front, 0.2 s earlier"],
+        1: [True, "Front, 0.2 s later"],
+        6: [False, "Front"],
+    }
+    assert told == {frame: [each, each] for frame, each in veiled.items()}
 
 
 def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) -> None:

@@ -236,7 +236,7 @@ def test_where_a_frame_has_no_picture_the_one_before_is_shown_with_its_boxes(
         scrub(browser, frame)
         parts = (figure.format(part) for part in (".where').textContent", "svg').innerHTML"))
         shown.append([browser.value(part) for part in parts])
-    assert shown == [["FrontLeft", shown[0][1]], ["FrontLeft, frame 5", shown[0][1]]]
+    assert shown == [["FrontLeft", shown[0][1]], ["FrontLeft, 0.1 s earlier", shown[0][1]]]
 
 
 LARGE = "return document.querySelector('.agent.large').dataset.agent"

@@ -206,12 +206,22 @@ def _twins(dataset: Dataset, token: str) -> dict[str, Any]:
     return {"told": told, "actors": actors, "is_accident": told["accident"] == token}
 
 
+def _findings(dataset: Dataset, token: str) -> dict[str, Any]:
+    """What `validate` finds, how many sensor files there are of how many, and at how many frames any."""
+    files, frames = dataset.sensor_frames(token), dataset.get("scenario", token)["num_frames"]
+    return {
+        "findings": findings(dataset, token),
+        "files": {"here": sum(map(len, files.values())), "whole": frames * len(files)},
+        "frames": {"here": len(set().union(*files.values())), "whole": frames},
+    }
+
+
 _CONTEXTS: Final[Mapping[str, Callable[[Dataset, str], dict[str, Any]]]] = {
     "story": lambda dataset, token: {"text": describe(dataset, token).text},
     "pairs": _pairs,
     "ledger": _ledger,
     "twins": _twins,
-    "findings": lambda dataset, token: {"findings": findings(dataset, token)},
+    "findings": _findings,
 }
 
 
@@ -225,13 +235,17 @@ def _moment(request: Request) -> Response:
     boxes = explorer.dataset.get_boxes(record, "ego")
     scenario = explorer.dataset.get("scenario", token)
     agents = [each["agent"] for each in explorer.dataset.samples_of(record["frame_token"])]
+    agent, frame = request.path_params["agent"], request.path_params["frame"]
+    files = explorer.dataset.sensor_frames(token).items()
+    filed = {number for (name, _), frames in files if name == agent for number in frames}
     return page(
         request,
         "moment.html",
         token=token,
         sample=sample,
-        agent=request.path_params["agent"],
-        frame=request.path_params["frame"],
+        agent=agent,
+        frame=frame,
+        nearest=min(filed, key=lambda number: abs(number - frame), default=frame),
         frames=scenario["num_frames"],
         agents=agents,
         labelled=record["labelled"],

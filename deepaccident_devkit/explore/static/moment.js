@@ -18,7 +18,9 @@ function set(control, value) {
 // from the address
 
 const frameGiven = Number(given.get("frame"));
+const pictured = data.countdown.map((_, frame) => data.cameras.flat().filter((each) => each.pictures[frame] !== null).length);
 if (Number.isInteger(frameGiven) && frameGiven > 0) go(frameGiven - 1);
+else if (!pictured[0]) go(pictured.indexOf(Math.max(...pictured))); // of a partial download where most pictures are
 const large = data.agents.findIndex((agent) => agent.name === given.get("large"));
 if (large >= 0) enlarge(String(large));
 for (const select of selects) if (given.has(select.id)) set(select, given.get(select.id));

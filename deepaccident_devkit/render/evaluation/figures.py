@@ -274,16 +274,16 @@ def draw_motion_outcome(
     Raises:
         EvaluationError: the present is not recorded.
     """
-    from matplotlib.colors import to_rgb
+    from matplotlib.colors import to_rgba
 
     ax, truth, grid = axes_or_new(ax, PANEL), labels_at_present(label), label.config.grid
     frame = frames_there(label) - 1 if frame is None else frame
     there = prediction.grid.reorient(_actors(prediction, frame), "devkit")
     true = grid.reorient(truth.segmentation[frame] == 1, "devkit")
-    picture = np.ones((*true.shape, 3))
+    picture = np.zeros((*true.shape, 4))  # transparent where nobody is
     for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
-        picture[cells] = to_rgb(OUTCOME_COLORS[kind])
-    ax.imshow(picture, origin="lower", extent=(*grid.x[:2], *grid.y[:2]), interpolation="nearest")
+        picture[cells] = to_rgba(OUTCOME_COLORS[kind])
+    ax.imshow(picture, origin="lower", extent=(*grid.x[:2], *grid.y[:2]), interpolation="nearest", zorder=0.5)
     draw_legend_of_fills(ax, OUTCOME_COLORS)
     seconds = frame * label.config.step * FRAME_PERIOD
     return titled_from_above(ax, f"actors {seconds:g} s ahead" if frame else "actors now", grid=True)

@@ -189,6 +189,18 @@ function pictureFrame(camera, frame) {
   return camera.pictures.findIndex((each) => each !== null);
 }
 
+// A picture of another moment says how far that is; where the release has none of this moment, it is veiled. A page
+// without a server has some of the pictures alone: one of up to half a second ago may stand for now.
+function sayWhen(card, camera, frame) {
+  const seconds = (frames) => Math.abs(frames) * data.period;
+  const away = state.frame - frame;
+  const words = `${seconds(away).toFixed(1)} s ${away > 0 ? "earlier" : "later"}`;
+  card.where.textContent = away ? `${camera.title}, ${words}` : camera.title;
+  card.where.classList.toggle("earlier", away !== 0);
+  const nearest = seconds(state.frame - pictureFrame(camera, state.frame));
+  card.figure.classList.toggle("veiled", nearest > (data.served ? 0 : 0.5));
+}
+
 function cameraOf(card) {
   const wanted = card.chosen || data.automatic.cameras[card.bit][state.frame];
   return card.available.find((camera) => camera.title === wanted) || card.available[0];
@@ -208,8 +220,7 @@ function showCamera(card) {
   if (camera) {
     const frame = showPicture(card, camera, card.figure.classList.contains("large"));
     card.picture.alt = `${card.agent.title}, camera ${camera.title}, frame ${frame + 1}`;
-    card.where.textContent = frame === state.frame ? camera.title : `${camera.title}, frame ${frame + 1}`;
-    card.where.classList.toggle("earlier", frame !== state.frame);
+    sayWhen(card, camera, frame);
     card.select.options[0].textContent = card.chosen ? "automatic" : `auto: ${camera.title}`;
     if (state.boxes) drawBoxes(card, camera, frame);
   }
@@ -278,7 +289,8 @@ function showEvery() {
   for (const card of everyCamera) {
     const frame = card.there ? showPicture(card, card.shown, false) : state.frame;
     card.picture.alt = `${card.agent.title}, camera ${card.shown.title}, frame ${frame + 1}`;
-    card.where.textContent = frame === state.frame ? card.shown.title : `${card.shown.title}, frame ${frame + 1}`;
+    if (card.there) sayWhen(card, card.shown, frame);
+    else card.where.textContent = card.shown.title;
     card.boxes.replaceChildren();
     if (state.boxes) drawBoxes(card, card.shown, frame);
   }

@@ -106,6 +106,11 @@ def test_without_images_it_is_seen_from_above(da_b: DeepAccident) -> None:
     assert near(shown, "#ffffff", 10) > shown[..., 0].size / 2
 
 
+def test_a_partial_download_shows_its_last_image(da: DeepAccident, tmp_path: Path) -> None:
+    shown = shown_of(reopened(da, tmp_path / "r", "*_006.jpg"), accident(da))
+    assert (near(shown, COLLIDER_COLOR) > 20, near(shown, "#ffffff", 10) < 200) == (True, True)
+
+
 def test_without_labels_it_is_grey(da_b: DeepAccident, tmp_path: Path) -> None:
     dataset = reopened(da_b, tmp_path / "r", "label")
     shown = shown_of(dataset, dataset.scenario[0]["token"])

@@ -230,9 +230,9 @@ def test_the_addresses_are_said(monkeypatch: pytest.MonkeyPatch, where: dict[str
 
 
 def test_a_browser_is_opened_with_a_token_for_one_use(monkeypatch: pytest.MonkeyPatch) -> None:
-    [said, _], [address] = opened(monkeypatch)
+    [said, _], [address] = opened(monkeypatch, page="models/")
     origin, _, token = said.split()[-1].partition("=")
-    assert (address.partition("=")[0], token not in address) == (origin, True)
+    assert (address.partition("=")[0], token not in address, origin[-14:]) == (origin, True, "/models/?token")
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ VIEWS: list[tuple[Callable[[DeepAccident, str], Any], int, list[str]]] = [
     (
         lambda da, scenario: da.render_calibration(f"{scenario}/ego_vehicle/003", agents=["infrastructure"]),
         1,
-        [POLE, FRONT],
+        [FRONT, POLE],
     ),
     (lambda da, scenario: da.render_visibility(f"{scenario}/003", layers=["points"]), 0, [POLE]),
     (lambda da, scenario: da.render_sample_data(f"{scenario}/ego_vehicle/003/Camera_Front"), 1, [FRONT]),
@@ -126,6 +126,8 @@ def test_one_frame_that_is_missing_is_not_called_a_missing_download(release_root
     da.get_sample_data_path(sample, "Camera_Front").unlink()
     figure = da.render_sample(sample)
     assert missing_words(figure) == ["ego_vehicle Camera_Front: no file of this frame"]
+    frames = da.sensor_frames(da.scenario[0])
+    assert {*frames["ego_vehicle", "lidar01"]} - {*frames["ego_vehicle", "Camera_Front"]} == {3}
 
 
 @pytest.mark.parametrize(("view", "grey", "words"), VIEWS)
@@ -134,6 +136,9 @@ def test_a_picture_names_what_is_not_there(
 ) -> None:
     figure = view(da_partial, scenario).figure
     assert (grey_panels(figure), missing_words(figure)) == (grey, words)
+    titles = [title_of(figure), *(ax.get_title() for ax in figure.axes)]
+    assert any(POLE in title.replace("\n", " ") for title in titles) == (POLE in words)  # not over the data
+    assert lacking(" ".join(text.get_text() for ax in figure.axes for text in ax.texts), "LiDAR") == ["LiDAR"]
 
 
 def test_a_whole_release_lacks_nothing(da: DeepAccident, scenario: str) -> None:

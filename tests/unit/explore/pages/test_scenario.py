@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+import shutil
 import threading
 from collections.abc import Iterator
 from inspect import iscoroutinefunction
@@ -179,6 +180,19 @@ def test_a_partial_download_is_told(da_partial: DeepAccident) -> None:
     assert any("6 of 144 camera files are missing" in note for note in data["notes"])
     statuses = status(app, f"{here}images/ego_vehicle/Camera_Front/1"), status(app, f"{here}points/infrastructure/1")
     assert statuses == (500, 404)
+    assert "12 of 192 sensor files are missing; 6 of 6 frames have any." in get(app, f"{here}parts/findings").text
+
+
+def test_a_moment_without_files_leads_to_the_nearest_with_any(da: DeepAccident, tmp_path: Path) -> None:
+    gone = shutil.ignore_patterns(".deepaccident", "*_005.jpg", "*_005.npz", "*_006.jpg", "*_006.npz")
+    root = shutil.copytree(da.dataroot, tmp_path / "r", ignore=gone)
+    app, here = (
+        make_app(Explorer(DeepAccident("v1", root, verbose=False))),
+        f"/scenario/{accident(da)}/moment/ego_vehicle",
+    )
+    pages = {frame: get(app, f"{here}/{frame}").text for frame in (4, 6)}
+    told = {frame: re.findall(r'moment/ego_vehicle/(\d)">([\d.]+ s \w+), frame', page) for frame, page in pages.items()}
+    assert told == {4: [], 6: [("4", "0.2 s earlier")]}
 
 
 def test_labels_alone_are_enough(da_b: DeepAccident) -> None:

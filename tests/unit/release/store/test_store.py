@@ -46,6 +46,7 @@ def test_every_sensor_file_has_the_same_bytes(opened: dict[str, DeepAccident], k
     tokens = [f"{record['token']}/{channel}" for record in folder.sample for channel in CHANNELS][::7]
     for token in tokens:
         assert other.local_path(token).read_bytes() == folder.get_sample_data_path(token).read_bytes()
+    assert other.sensor_frames(tokens[0].rsplit("/", 3)[0]) == folder.sensor_frames(folder.scenario[0])
     sample = folder.sample[3]["token"]
     for read in (
         lambda da: da.load_image(sample, "Camera_Back"),
@@ -95,6 +96,20 @@ def test_local_path_of_a_folder_is_the_file_itself(da_partial: DeepAccident, da:
         if not da_partial.get_sample_data_path(f"{record['token']}/{channel}").exists()
     )
     assert_refused((lambda: da_partial.local_path(absent), MissingFileError, "no such file"))
+
+
+def test_the_frames_that_have_files_are_known_without_opening_one(da_partial: DeepAccident) -> None:
+    for scenario in da_partial.scenario:
+        assert da_partial.sensor_frames(scenario) == {
+            (agent["name"], channel): tuple(
+                frame
+                for frame in range(1, scenario["num_frames"] + 1)
+                if da_partial.sensor_path(f"{agent['token']}/{frame:03d}/{channel}").exists()
+            )
+            for agent in da_partial.agent
+            if agent["scenario_token"] == scenario["token"]
+            for channel in CHANNELS
+        }
 
 
 def test_a_file_that_no_archive_holds_is_missing(release_root: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from drawing import new_axes, picture, title_of, tokens_of
 from evaluation_runs import META, PARTIAL, evaluation_run, stored_run
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_rgb, to_rgba
 from picture_texts import text_faults
 from PIL import Image
 from refusals import assert_refused
@@ -157,7 +157,7 @@ def test_outcomes_of_cells_are_coloured(da_motion: DeepAccident, tokens: list[st
             there, true = (own.reorient(each[drawn] > 0, "devkit") for each in (shifted, truth.segmentation == 1))
             for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
                 assert cells.any()
-                assert np.array_equal((picture(ax) == to_rgb(OUTCOME_COLORS[kind])).all(axis=-1), cells), kind
+                assert np.array_equal((picture(ax) == to_rgba(OUTCOME_COLORS[kind])).all(axis=-1), cells), kind
 
 
 def test_none_is_the_worst_where_all_are_alike(da_motion: DeepAccident, tmp_path: Path) -> None:
