@@ -199,9 +199,8 @@ def test_a_scenario_shows_all(pages: Pages, dataset: DeepAccident) -> None:
     assert pages.value("document.querySelectorAll('#every g').length") > 20
     drawn = "document.getElementById('ground').toDataURL()"
     before = pages.value(drawn)
-    pages.click("#cloud-infrastructure")
+    pages.click("#layer-points")
     pages.wait(f"{drawn} !== {json.dumps(before)}")
-    assert pages.value("document.getElementById('layer-points').checked") is True
     pages.wait(PARTS_THERE)
     names = ("story", "pairs", "ledger", "twins", "findings")
     parts = {name: pages.value(f"document.querySelector('[data-part$={name}]').innerText") for name in names}
@@ -222,7 +221,7 @@ def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) 
     looks = """[state.frame, state.large, state.follow, state.clouds, state.layers, cards[0].chosen,
         [ground.x, ground.y, ground.scale].map((each) => each.toFixed(1)), location.search]"""
     seen = pages.value(looks)
-    assert seen[:4] == [2, "2", "", [0, 4]]
+    assert seen[:4] == [2, "2", "", [0, 1, 2, 3]]
     pages.go(pages.here()[1:])
     pages.wait("document.getElementById('scrubber').value === '2'")
     assert pages.value(looks) == seen

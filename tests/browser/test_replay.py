@@ -1,5 +1,6 @@
 """Replays, opened as a reader opens them: they play, scrub, show the impact, and ask for nothing."""
 
+import io
 import re
 import time
 from pathlib import Path
@@ -8,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Browser
+from PIL import Image
 from processes import wait_for
 from replay_page import data_of
 from selenium.webdriver import ActionChains
+from selenium.webdriver.common.actions.action_builder import ActionBuilder
 from selenium.webdriver.common.keys import Keys
 from wording import holding, lacking
 
@@ -47,6 +50,7 @@ def page(da_motion: DeepAccident, scenario: str, tmp_path_factory: pytest.TempPa
 def opened(browser: Browser, page: Path) -> Browser:
     """The page with the whole scene, in which nobody is marked but by their boxes."""
     browser.open(page, 1280)
+    choose(browser, "#scene", "map")
     click(browser, "whole", "layer-trails", "layer-dots", "layer-agents")
     return browser
 
@@ -239,6 +243,168 @@ def test_where_a_frame_has_no_picture_the_one_before_is_shown_with_its_boxes(
     assert shown == [["FrontLeft", shown[0][1]], ["FrontLeft, frame 5", shown[0][1]]]
 
 
+def photo(browser: Browser) -> Image.Image:
+    """The scene in three dimensions as the reader sees it."""
+    frames = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()))"
+    browser.driver.execute_async_script(frames)
+    return Image.open(io.BytesIO(browser.driver.find_element("id", "space").screenshot_as_png)).convert("RGB")
+
+
+def red(image: Image.Image) -> int:
+    """The number of pixels of the pair's colour."""
+    return int((np.abs(np.asarray(image, dtype=int) - mixed(COLLIDER_COLOR, 1.0)).max(axis=2) < 12).sum())
+
+
+def test_the_scene_is_turned(browser: Browser, recorded: Path, da: DeepAccident) -> None:
+    """With the mouse and keys: other pixels, and always the pair; it follows whom the reader says."""
+    data = data_of(recorded)
+    browser.open(recorded, 1280)
+    canvas, photos = browser.driver.find_element("id", "space"), [photo(browser)]
+    for act in (
+        lambda: ActionChains(browser.driver).drag_and_drop_by_offset(canvas, 90, 30).perform(),
+        lambda: browser.press(Keys.SHIFT + Keys.ARROW_LEFT),
+        lambda: browser.press("+"),
+        lambda: choose(browser, "#points-by", "height"),
+        lambda: browser.press("t"),
+    ):
+        act()
+        photos.append(photo(browser))
+        assert photos[-1].tobytes() != photos[-2].tobytes()
+    assert min(map(red, photos)) > 60
+    choose(browser, "#follow", "0")
+    scrub(browser, 3)
+    photo(browser)
+    x, y, _, turn, rise, _ = map(float, browser.value("document.getElementById('space').dataset.view").split())
+    assert [x, y] == pytest.approx([each / 100 for each in data["agents"][0]["poses"][3][:2]])
+    assert [turn, rise] == pytest.approx([-np.pi / 2, np.pi / 2])  # from above, north is up
+    assert (browser.faults(), len(browser.requests())) == ({}, 1)
+
+
+PLACES = """
+const [actor, view] = [data.actors.find((each) => each.id === arguments[0]), arguments[1]];
+const now = actor.states[state.frame];
+const large = document.querySelector('.agent.large');
+const row = rows.find((each) => each.actor === actor).row;
+const element = { space: space.canvas, ground: ground.canvas, camera: large, seen: row }[view];
+element.scrollIntoView({ block: 'center' });
+const box = element.getBoundingClientRect();
+const inside = { space: () => space.orbit.pixel([now[0] / 100, now[1] / 100, now[4] / 100], box.width, box.height),
+  ground: () => ground.at(now) }[view];
+if (inside) return [box.left, box.top].map((each, axis) => Math.round(each + element.clientLeft + inside()[axis]));
+const marked = view === 'seen' ? row : document.querySelector(`.large g[data-actor="${actor.id}"] path`);
+const place = marked.getBoundingClientRect();
+return [place.left + place.width / 2, place.top + place.height / 2].map(Math.round);
+"""
+SHOWN = """
+return [[...document.querySelectorAll('.large g.lit')].map((each) => Number(each.dataset.actor)),
+  [...document.querySelectorAll('#seen tr.lit th')].map((each) => each.textContent),
+  [...document.querySelectorAll('#space-names .lit')].map((each) => each.textContent), byId('lit').textContent];
+"""
+
+
+@pytest.mark.parametrize("view", ["space", "ground", "camera", "seen"])
+def test_an_actor_that_is_chosen_lights_up_in_all_views(view: str, browser: Browser, recorded: Path) -> None:
+    data = data_of(recorded)
+    browser.open(recorded, 1280)
+    scrub(browser, 2)
+    browser.press("0")
+    large = data["automatic"]["agents"][2]
+    actor = next(a for a in data["actors"] if a["role"] == "pair" and a["id"] != data["agents"][large]["actor"])
+    dark = photo(browser).tobytes(), drawn(browser)
+    for clicks in (False, True):  # pointed at, chosen
+        mouse = ActionBuilder(browser.driver)
+        mouse.pointer_action.move_to_location(*browser.driver.execute_script(PLACES, actor["id"], view))
+        if clicks:
+            mouse.pointer_action.click().move_to_location(2, 2)
+        mouse.perform()
+        browser.wait("state.lit !== null", 5)
+        told = photo(browser).tobytes(), drawn(browser)
+        boxes, listed, named, words = browser.script(SHOWN)
+        assert (boxes, listed, named) == ([actor["id"]], [actor["title"]], [actor["title"]])
+        names = [a["title"] for bit, a in enumerate(data["agents"]) if actor["seen"][2] >> bit & 1]
+        speed = f"{actor['states'][2][3] / 10:.1f} m/s"
+        assert words == f"{actor['title']}: {speed}, seen by {', '.join(names)}."
+        assert [one != other for one, other in zip(dark, told, strict=True)] == [True, True]
+    browser.press(Keys.ESCAPE)
+    assert browser.script(SHOWN)[:3] == [[], [], []]
+    browser.press(".", ".", ",")
+    assert browser.script(SHOWN)[3].startswith(f"{data['actors'][0]['title']}: ")
+    assert browser.complaints() == []
+
+
+def test_the_strip_tells_of_the_pair_and_leads_there(browser: Browser, judged: Path) -> None:
+    data = data_of(judged)
+    browser.open(judged, 1280)
+    rows = browser.value("[...document.querySelectorAll('.strip .row')].map((each) => each.textContent)")
+    letters = [a["tag"] or a["id"] for a in data["actors"] if a["role"] == "pair"]
+    assert rows == ["speeds", "gap", "time to collision", *(f"{each} seen by" for each in letters), "verdicts"]
+    for row in range(len(rows)):
+        plot = browser.driver.find_elements("css selector", ".strip .plot")[row]
+        wide = plot.size["width"]
+        across = round((20 / (FRAMES - 1) - 0.5) * wide)
+        scrub(browser, 3)
+        ActionChains(browser.driver).move_to_element_with_offset(plot, across, 0).click().perform()
+        assert browser.frame() == 20
+    told = browser.value("[...document.querySelectorAll('.strip .told')].map((each) => each.textContent)")
+    assert told[1:3] == [f"{data['pair']['gap'][20] / 100:.1f} m", f"{data['pair']['ttc'][20] / 10:.1f} s"]
+    assert told[-1] == "E TP"
+
+
+WITHOUT = "HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.getContext, {apply: "
+WITHOUT += "(real, canvas, given) => given[0] === '2d' ? Reflect.apply(real, canvas, given) : null})"
+
+
+def test_without_webgl_there_is_the_map(browser: Browser, recorded: Path) -> None:
+    added = browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WITHOUT})
+    try:
+        browser.open(recorded, 1280)
+        click(browser, "closer", "whole", "layer-points")
+        scrub(browser, 4)
+    finally:
+        browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+    assert browser.value("['space-box', 'scene-tools', 'ground'].map((name) => byId(name).offsetHeight > 0)") == [
+        False,
+        False,
+        True,
+    ]
+    assert browser.faults() == {}
+
+
+PLAY = """
+const done = arguments[0];
+const counts = { made: 0 };
+for (const kind of ['createBuffer', 'createTexture', 'createVertexArray', 'createProgram']) {
+  const real = WebGL2RenderingContext.prototype[kind];
+  WebGL2RenderingContext.prototype[kind] = function (...given) { counts.made += 1; return real.apply(this, given); };
+}
+let left = 600;
+const next = () => {
+  go((state.frame + 1) % (last + 1));
+  left -= 1;
+  if (left) requestAnimationFrame(next);
+  else done(counts.made);
+};
+next();
+"""
+
+
+def test_a_minute_of_play_needs_no_more_memory(browser: Browser, recorded: Path) -> None:
+    """600 frames, as quickly as they are drawn: nothing is made on the graphics processor, and the heap stays."""
+
+    def heap() -> float:
+        browser.driver.execute_cdp_cmd("HeapProfiler.collectGarbage", {})
+        return float(browser.driver.execute_cdp_cmd("Runtime.getHeapUsage", {})["usedSize"])
+
+    browser.open(recorded, 700)
+    scrub(browser, 5)
+    before = heap()
+    browser.driver.set_script_timeout(120)
+    assert browser.driver.execute_async_script(PLAY) == 0
+    assert heap() - before < 1_000_000
+    choose(browser, "#scene", "map")
+    assert browser.value("space.gpu === null") is True
+
+
 LARGE = "return document.querySelector('.agent.large').dataset.agent"
 
 
@@ -336,11 +502,12 @@ return [...document.querySelectorAll('.name, .badge, .where, th, td, button, p, 
 """
 
 
-@pytest.mark.parametrize("width", [1400, 1100, 700, 390])
+@pytest.mark.parametrize("width", [1400, 1280, 700, 390])
 def test_nothing_is_cut(width: int, browser: Browser, recorded: Path, judged: Path) -> None:
     for page_, at in ((recorded, 0), (recorded, 5), (judged, 0), (judged, 34)):
         browser.open(page_, width)
         scrub(browser, at)
+        browser.script("openStrip(true)")
         assert (browser.faults(), browser.script(CUT), browser.script(CHOSEN_CUT)) == ({}, [], [])
     table = "const box = document.getElementById('samples'); return box.scrollWidth - box.clientWidth"
     assert browser.script(table) <= 0
@@ -363,11 +530,13 @@ return [...document.querySelectorAll('button, select, input')]
 """
 
 
-@pytest.mark.parametrize("width", [1280, 700, 390])
-def test_it_fits_its_window_and_asks_for_nothing(width: int, browser: Browser, judged: Path) -> None:
+@pytest.mark.parametrize("width", [1400, 1280, 700, 390])
+def test_it_fits_its_window_and_asks_for_nothing(width: int, scheme: str, browser: Browser, judged: Path) -> None:
     browser.open(judged, width)
     scrub(browser, 25)
     assert (browser.faults(), browser.requests()) == ({}, [judged.resolve().as_uri()])
+    (paper,) = {photo(browser).getpixel(at) for at in ((8, 8), (-8, 8))}  # where the sky is
+    assert (browser.scheme(), "dark" if sum(paper) < 3 * 128 else "light") == (scheme, scheme)
     assert (browser.script(SMALL), browser.script(NAMELESS)) == ([], [])
 
 

@@ -33,8 +33,8 @@ _MOST: Final = 200_000
 def road_picture(recording: Recording) -> dict[str, Any] | None:
     """The road as the page has it: a PNG in base64, and its left, top, width and height (cm, y up).
 
-    White is nothing, or not seen. If the release has no BEV camera file of these moments, as of the test split, it is
-    the town's map, where one is kept; None if there is neither, or if they give no small picture.
+    Transparent is nothing, or not seen. If the release has no BEV camera file of these moments, as of the test split,
+    it is the town's map, where one is kept; None if there is neither, or if they give no small picture.
 
     Raises:
         SensorFileError: a file cannot be read.
@@ -115,5 +115,5 @@ def _png(cells: ByteArray) -> bytes:
     picture = Image.fromarray(cells)
     picture.putpalette([255, 255, 255, *(part for name in _GROUND for part in ImageColor.getrgb(BEV_COLORS[name]))])
     written = io.BytesIO()
-    picture.save(written, "PNG", optimize=True, bits=2)
+    picture.save(written, "PNG", optimize=True, bits=2, transparency=0)
     return written.getvalue()
