@@ -45,7 +45,7 @@ _CELL: Final = 0.3
 """Metres: side of a cube; of the points in it one is kept."""
 _MIXED: Final = as_floats([73_856_093, 19_349_669, 83_492_791])
 _SLOTS: Final = 1 << 16
-"""Cubes are numbered by the sum of their places times `_MIXED`, modulo this: quicker than sorting, and well mixed."""
+"""Cubes are numbered by a remainder of the sum of their places times `_MIXED`: quicker than sorting, and mixed."""
 _MOST: Final = 4000
 """Points of a cloud."""
 POINT_BYTES: Final = 8
