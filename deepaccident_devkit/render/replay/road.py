@@ -87,12 +87,16 @@ def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatAr
     merged = np.zeros((len(y), len(x)), dtype=np.uint8)
     for image, pose in seen:
         yaw = np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])
-        right, up = x[None] - pose.translation[0], y[:, None] - pose.translation[1]
+        reach = image.resolution * len(image.semantic) * np.array([-1.0, 1.0])  # farther than its corners
+        columns = slice(*x.searchsorted(pose.translation[0] + reach))
+        rows = slice(*(-y).searchsorted(reach - pose.translation[1]))
+        own = merged[rows, columns]
+        right, up = x[None, columns] - pose.translation[0], y[rows, None] - pose.translation[1]
         middle = (len(image.semantic) - 1) / 2
         row = np.rint(middle - (right * np.cos(yaw) + up * np.sin(yaw)) / image.resolution).astype(np.int64)
         column = np.rint(middle - (up * np.cos(yaw) - right * np.sin(yaw)) / image.resolution).astype(np.int64)
-        free = (merged == 0) & (row >= 0) & (row <= 2 * middle) & (column >= 0) & (column <= 2 * middle)
-        merged[free] = kinds[image.semantic[row[free], column[free]]]
+        free = (own == 0) & (row >= 0) & (row <= 2 * middle) & (column >= 0) & (column <= 2 * middle)
+        own[free] = kinds[image.semantic[row[free], column[free]]]
     return merged
 
 
