@@ -197,6 +197,8 @@ def test_a_scenario_shows_all(pages: Pages, dataset: DeepAccident) -> None:
     grey = "[...document.querySelectorAll('#every .none')].filter((each) => !each.hidden).length"
     assert (pages.value(f"{loaded}.length"), pages.value(grey)) == (24, 6)  # an agent's images were not downloaded
     assert pages.value("document.querySelectorAll('#every g').length") > 20
+    marks = "[...document.querySelectorAll('#files rect')].map((each) => each.getAttribute('fill-opacity'))"
+    assert pages.value(marks) == ["0.5"]  # at no frame all files are there
     drawn = "document.getElementById('ground').toDataURL()"
     before = pages.value(drawn)
     pages.click("#layer-points")
