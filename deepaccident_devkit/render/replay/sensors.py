@@ -43,9 +43,10 @@ _PROBED: Final = 12
 """The number of pictures from which the size of all is estimated."""
 _CELL: Final = 0.3
 """Metres: side of a cube; of the points in it one is kept."""
-_MIXED: Final = as_floats([73_856_093, 19_349_669, 83_492_791])
+_NUMBERED: Final = as_floats([73_856_093, 19_349_669, 83_492_791])
+_MIXED: Final = 0x9E3779B1
 _SLOTS: Final = 1 << 16
-"""Cubes are numbered by a remainder of the sum of their places times `_MIXED`: quicker than sorting, and mixed."""
+"""A cube's number is the sum of its places times `_NUMBERED`, mixed: quicker than sorting, and neighbours lie apart."""
 _MOST: Final = 4000
 """Points of a cloud."""
 POINT_BYTES: Final = 8
@@ -324,8 +325,8 @@ def cloud_text(recording: Recording, agent: str, frame: int, most: int | None = 
     ground = np.percentile(height[::_SOME], _GROUND) if len(height) else 0.0
     raised = cloud.xyz[height > ground + _LEAST_HEIGHT]
     world = dataset.world_from(sample, "ego").apply(raised) - np.append(recording.origin, 0.0)
-    chosen = np.full(_SLOTS, -1)
-    chosen[(np.floor(world / _CELL) @ _MIXED).astype(np.int64) % _SLOTS] = np.arange(len(world))
+    cubes, chosen = (np.floor(world / _CELL) @ _NUMBERED).astype(np.int64), np.full(_SLOTS, -1)
+    chosen[((cubes ^ (cubes >> 15)) * _MIXED >> 16) % _SLOTS] = np.arange(len(world))
     kept = world[chosen[chosen >= 0][: most_points(recording, SERVED_POINTS) if most is None else most]]
     decimetres = np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1)
     return base64.b64encode(decimetres.astype("<i2").tobytes()).decode("ascii")

@@ -186,7 +186,7 @@ choice(byId("points-by"), [["agent", "agent"], ["height", "height"]], state.poin
 });
 byId("top").addEventListener("click", () => space.fromAbove());
 showScene(state.scene);
-byId("scene-tools").hidden = state.scene === "map";
+for (const name of ["scene-tools", "space-key"]) byId(name).hidden = state.scene === "map";
 addEventListener("pagehide", () => space.end());
 addEventListener("pageshow", (event) => event.persisted && showScene(state.scene));
 

@@ -5,6 +5,7 @@ const SHOWN_DEPTH = { large: 9, small: 4 }; // metres: how long a camera's frust
 // corners as SIGNS has them; the first face is the front
 const FACES = [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]];
 const HEIGHTS = [-1, 6]; // metres above the ground, from the first to the last of the colours
+const SHADE = 0.85; // yellow on white would be too pale
 const POINT_NEAR = 60; // a point so many metres away is a pixel wide, nearer ones more
 
 class Space {
@@ -59,7 +60,7 @@ class Space {
   whole() {
     const [x, y] = [ground.x, ground.y];
     this.orbit.target = [x, y, this.heightAt(x, y)];
-    this.orbit.distance = 0.9 * ground.span;
+    this.orbit.distance = 0.65 * ground.span;
   }
 
   heightAt(x, y) {
@@ -160,8 +161,8 @@ class Space {
     const color = channelsOf(this.data.colors.grid);
     const at = (across, along) => [across, along, this.heightAt(across, along) + 0.03];
     for (let step = -GRID_REACH; step <= GRID_REACH; step += GRID_METRES) {
-      this.line(at(x + step, y - GRID_REACH), at(x + step, y + GRID_REACH), color, 1, 0.35);
-      this.line(at(x - GRID_REACH, y + step), at(x + GRID_REACH, y + step), color, 1, 0.35);
+      this.line(at(x + step, y - GRID_REACH), at(x + step, y + GRID_REACH), color, 1, 0.25);
+      this.line(at(x - GRID_REACH, y + step), at(x + GRID_REACH, y + step), color, 1, 0.25);
     }
   }
 
@@ -169,7 +170,7 @@ class Space {
   addPoints() {
     const { points } = this.kinds;
     const missing = [];
-    const heights = this.data.colors.heights.map(this.thin);
+    const heights = this.data.colors.heights.map((color) => this.thin(color).map((each) => SHADE * each));
     for (const bit of this.state.clouds) {
       const cloud = this.cloud(bit);
       const agent = this.data.agents[bit];
