@@ -170,14 +170,19 @@ onPointers(space.canvas, {
   click: (x, y) => choose(space.actorAt(x, y)),
 });
 
+function layOut(scene) {
+  state.scene = scene;
+  byId("space-box").hidden = scene === "map";
+  ground.canvas.hidden = scene === "space";
+  document.querySelector(".above").classList.toggle("both", scene === "both");
+}
+
 // Where the browser has no WebGL there is the map.
 function showScene(scene) {
-  const there = scene !== "map" && (space.gpu !== null || space.begin());
   if (scene === "map") space.end();
-  state.scene = there ? scene : "map";
-  byId("space-box").hidden = !there;
-  ground.canvas.hidden = there && scene === "space";
-  document.querySelector(".above").classList.toggle("both", there && scene === "both");
+  const isWithout = scene !== "map" && space.gpu === null && !space.begin();
+  layOut(isWithout ? "map" : scene);
+  if (isWithout) for (const name of ["scene-tools", "space-key"]) byId(name).hidden = true;
 }
 const SCENES = [["both", "3D and map"], ["space", "3D"], ["map", "map"]];
 choice(byId("scene"), SCENES, state.scene, showScene);
@@ -185,10 +190,9 @@ choice(byId("points-by"), [["agent", "agent"], ["height", "height"]], state.poin
   state.pointsBy = value;
 });
 byId("top").addEventListener("click", () => space.fromAbove());
-showScene(state.scene);
-for (const name of ["scene-tools", "space-key"]) byId(name).hidden = state.scene === "map";
+layOut(state.scene);
+addEventListener("pageshow", () => showScene(state.scene)); // after the rest of the page: it takes a moment to begin
 addEventListener("pagehide", () => space.end());
-addEventListener("pageshow", (event) => event.persisted && showScene(state.scene));
 
 const keys = {
   " ": () => play(!state.playing),
