@@ -218,12 +218,14 @@ def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) 
     pages.go(scenario_page(accident(dataset)))
     pages.script("go(2); document.getElementById('layer-trails').click(); enlarge('2')")
     pages.script("document.getElementById('cloud-infrastructure').click(); zoom(2)")
-    pages.script("const s = cards[0].select; s.value = 'Back'; s.dispatchEvent(new Event('change'))")
-    pages.wait("['changed=', 'pictures=', 'view='].every((each) => location.search.includes(each))")
-    looks = """[state.frame, state.large, state.follow, state.clouds, state.layers, cards[0].chosen,
+    for select, value in (("cards[0].select", "Back"), ("byId('scene')", "space"), ("byId('points-by')", "height")):
+        pages.script(f"const s = {select}; s.value = '{value}'; s.dispatchEvent(new Event('change'))")
+    pages.wait("['changed=', 'pictures=', 'view=', 'points-by='].every((each) => location.search.includes(each))")
+    looks = """[state.frame, state.large, state.follow, state.clouds, state.scene, state.pointsBy,
+        state.layers, cards[0].chosen,
         [ground.x, ground.y, ground.scale].map((each) => each.toFixed(1)), location.search]"""
     seen = pages.value(looks)
-    assert seen[:4] == [2, "2", "", [0, 1, 2, 3]]
+    assert seen[:6] == [2, "2", "", [0, 1, 2, 3], "space", "height"]
     pages.go(pages.here()[1:])
     pages.wait("document.getElementById('scrubber').value === '2'")
     assert pages.value(looks) == seen
