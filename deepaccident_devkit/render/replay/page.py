@@ -29,7 +29,6 @@ from deepaccident_devkit.render.replay.entries import (
 from deepaccident_devkit.render.replay.road import road_picture
 from deepaccident_devkit.render.replay.sensors import (
     PAGE_POINTS,
-    SERVED_POINTS,
     CameraFiles,
     Followed,
     Jpegs,
@@ -39,6 +38,7 @@ from deepaccident_devkit.render.replay.sensors import (
     follow_pair,
     lidar_points,
     most_points,
+    served_points,
 )
 from deepaccident_devkit.render.styles import (
     CATEGORY_MARKERS,
@@ -123,11 +123,12 @@ def render_replay(
     recording = recording_of(dataset, scenario, agents)
     files, clouds = camera_files(recording), lidar_files(recording)
     data, followed = _data(recording, prediction, files, clouds)
-    data["points"] = lidar_points(recording)
+    most = most_points(sum(map(sum, clouds)), PAGE_POINTS)
+    data["points"] = lidar_points(recording, most)
     free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
     free -= _BESIDE * len(recording.frames) * len(files)
     settings, jpegs = camera_pictures(files, followed, free, progress=progress)
-    said = notes(recording, files, clouds, settings)
+    said = notes(recording, files, settings, clouds, most)
     data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], jpegs)}
     title = f"Accident replay: {recording.scenario['name']}"
     write_bytes(target, replay_page(title, data).encode())
@@ -271,16 +272,19 @@ def facts(recording: Recording) -> list[list[str]]:
 
 
 def notes(
-    recording: Recording, files: CameraFiles, clouds: list[list[bool]], settings: PictureSettings | None
+    recording: Recording, files: CameraFiles, settings: PictureSettings | None, clouds: list[list[bool]], most: int
 ) -> list[str]:
-    """Sentences on what is missing in the release or was left out; the settings are None if there is no picture."""
-    missing = [*_missing_pictures(files), *_pictures(files, settings), *_clouds(recording, clouds, PAGE_POINTS)]
+    """Sentences on what is missing in the release or was left out.
+
+    The settings are None if there is no picture; `most` is how many points a cloud may have.
+    """
+    missing = [*_missing_pictures(files), *_pictures(files, settings), *_clouds(clouds, most)]
     return [*_labels(recording), *missing]
 
 
 def served_notes(recording: Recording, files: CameraFiles, clouds: list[list[bool]]) -> list[str]:
     """Sentences on what is missing in the release, for a page that has no pictures itself."""
-    return [*_labels(recording), *_missing_pictures(files), *_clouds(recording, clouds, SERVED_POINTS)]
+    return [*_labels(recording), *_missing_pictures(files), *_clouds(clouds, served_points(recording))]
 
 
 def _setting(recording: Recording) -> Iterator[tuple[str, str]]:
@@ -353,14 +357,14 @@ def _pictures(files: CameraFiles, settings: PictureSettings | None) -> Iterator[
         )
 
 
-def _clouds(recording: Recording, clouds: list[list[bool]], limit: float) -> Iterator[str]:
+def _clouds(clouds: list[list[bool]], most: int) -> Iterator[str]:
     found, wanted = sum(map(sum, clouds)), sum(map(len, clouds))
     if not found:
         yield f"No LiDAR points: none of the {wanted} files is here; unpack the archives of lidar01."
         return
     if found < wanted:
         yield f"{wanted - found} of {wanted} LiDAR files are missing in the release; unpack the archives of lidar01."
-    yield f"LiDAR clouds are thinned to at most {most_points(recording, limit)} points; those of the road are left out."
+    yield f"LiDAR clouds are thinned to at most {most} points; those of the road are left out."
 
 
 def _missing_pictures(files: CameraFiles) -> Iterator[str]:

@@ -294,26 +294,31 @@ def _jpeg(image: ByteArray, settings: PictureSettings, *, large: bool) -> bytes:
     return written.getvalue()
 
 
-def most_points(recording: Recording, limit: float) -> int:
-    """How many points a cloud may have so that those of all agents and frames keep a limit of bytes."""
-    return min(_MOST, int(limit / (POINT_BYTES * len(recording.agents) * len(recording.frames))))
+def most_points(clouds: int, limit: float) -> int:
+    """How many points each of so many clouds may have so that all keep a limit of bytes."""
+    return min(_MOST, int(limit / (POINT_BYTES * max(1, clouds))))
 
 
-def lidar_points(recording: Recording) -> list[list[str | None] | None] | None:
-    """For each agent a cloud for each frame, as `cloud_text` has it, thinned until all keep `PAGE_POINTS`.
+def lidar_points(recording: Recording, most: int) -> list[list[str | None] | None] | None:
+    """For each agent a cloud for each frame, as `cloud_text` has it, of at most so many points.
 
     None stands for a missing file; an agent of which all are missing has no list, and without any there is none.
     Raises SensorFileError.
     """
-    most = most_points(recording, PAGE_POINTS)
     clouds = [[cloud_text(recording, agent, frame, most) for frame in recording.frames] for agent in recording.agents]
-    return [each if any(each) else None for each in clouds] if any(map(any, clouds)) else None
+    shown = [each if set(each) != {None} else None for each in clouds]
+    return shown if any(shown) else None
+
+
+def served_points(recording: Recording) -> int:
+    """How many points a cloud may have that a server gives, if all files are there."""
+    return most_points(len(recording.agents) * len(recording.frames), SERVED_POINTS)
 
 
 def cloud_text(recording: Recording, agent: str, frame: int, most: int | None = None) -> str | None:
     """A cloud above the road: int16 x, y, z, x, y, z, …, little-endian, decimetres from the origin, as base64.
 
-    z is that of world. At most so many points, by default as many as keep `SERVED_POINTS`, spread evenly over the
+    z is that of world. At most so many points, by default `served_points`, spread evenly over the
     cubes that have any. None if there is no file; raises SensorFileError.
     """
     dataset, sample = recording.dataset, recording.sample(agent, frame)
@@ -327,6 +332,6 @@ def cloud_text(recording: Recording, agent: str, frame: int, most: int | None = 
     world = dataset.world_from(sample, "ego").apply(raised) - np.append(recording.origin, 0.0)
     cubes, chosen = (np.floor(world / _CELL) @ _NUMBERED).astype(np.int64), np.full(_SLOTS, -1)
     chosen[((cubes ^ (cubes >> 15)) * _MIXED >> 16) % _SLOTS] = np.arange(len(world))
-    kept = world[chosen[chosen >= 0][: most_points(recording, SERVED_POINTS) if most is None else most]]
+    kept = world[chosen[chosen >= 0][: served_points(recording) if most is None else most]]
     decimetres = np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1)
     return base64.b64encode(decimetres.astype("<i2").tobytes()).decode("ascii")

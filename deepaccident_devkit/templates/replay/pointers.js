@@ -3,8 +3,8 @@
 const STILL = 4; // pixels: a pointer that moves less has clicked
 
 /**
- * Call `drag(right, down, moves)` with pixels (`moves`: two fingers, the right button or the shift key), `zoom(factor)`,
- * `point(x, y)` where the mouse is and `point(null)` where it has gone, and `click(x, y)`.
+ * Call `drag(right, down, moves)` with pixels (`moves`: two fingers, the right button or the shift key),
+ * `zoom(factor)`, `point(x, y)` where the mouse is and `point(null)` where it has gone, and `click(x, y)`.
  */
 function onPointers(canvas, { drag, zoom, point, click }) {
   const fingers = new Map();

@@ -36,10 +36,11 @@ class Sources {
 
   get(key, bit, frame) {
     const there = (this.served ? this.served : this.data).points[bit][frame];
-    if (!this.served || !there) {
-      this.clouds.set(key, there ? decodedCloud(there) : null);
-      return;
-    }
+    if (there === true) this.ask(key, bit, frame);
+    else this.clouds.set(key, typeof there === "string" ? decodedCloud(there) : null);
+  }
+
+  ask(key, bit, frame) {
     this.clouds.set(key, undefined);
     if (this.clouds.size > KEPT_CLOUDS) this.clouds.delete(this.clouds.keys().next().value);
     fetch(`${this.served.folder}points/${this.data.agents[bit].name}/${frame + 1}`)
