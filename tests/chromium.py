@@ -30,8 +30,12 @@ class Browser:
         self.driver.get(page if isinstance(page, str) else page.resolve().as_uri())
 
     def complaints(self) -> list[str]:
-        """What the console says since the page was opened, warnings too."""
-        return [entry["message"] for entry in self.driver.get_log("browser")]
+        """What the console says since the page was opened, warnings too.
+
+        Not that a processor without a graphics card waits for its WebGL pictures.
+        """
+        told = [entry["message"] for entry in self.driver.get_log("browser")]
+        return [each for each in told if "GPU stall due to ReadPixels" not in each]
 
     def requests(self) -> list[str]:
         """The addresses asked for since the page was opened, its own first.

@@ -28,10 +28,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     options = ChromeOptions()
     options.binary_location = str(shutil.which("chromium"))
     profile = tmp_path_factory.mktemp("chromium")
-    for word in ("headless=new", "no-sandbox", "disable-gpu", "disable-dev-shm-usage", f"user-data-dir={profile}"):
+    quiet = ("headless=new", "no-sandbox", "disable-gpu", "disable-dev-shm-usage")
+    for word in (*quiet, "enable-unsafe-swiftshader", f"user-data-dir={profile}"):
         options.add_argument(f"--{word}")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     driver = Chrome(options=options, service=Service(shutil.which("chromedriver")))
+    driver.set_script_timeout(120)
     yield Browser(driver)
     driver.quit()
 

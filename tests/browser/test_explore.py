@@ -202,11 +202,12 @@ def test_a_scenario_shows_all(pages: Pages, dataset: DeepAccident) -> None:
     grey = "[...document.querySelectorAll('#every .none')].filter((each) => !each.hidden).length"
     assert (pages.value(f"{loaded}.length"), pages.value(grey)) == (24, 6)  # an agent's images were not downloaded
     assert pages.value("document.querySelectorAll('#every g').length") > 20
+    marks = "[...document.querySelectorAll('#files rect')].map((each) => each.getAttribute('fill-opacity'))"
+    assert pages.value(marks) == ["0.5"]  # at no frame all files are there
     drawn = "document.getElementById('ground').toDataURL()"
     before = pages.value(drawn)
-    pages.click("#cloud-infrastructure")
+    pages.click("#layer-points")
     pages.wait(f"{drawn} !== {json.dumps(before)}")
-    assert pages.value("document.getElementById('layer-points').checked") is True
     pages.wait(PARTS_THERE)
     names = ("story", "pairs", "ledger", "twins", "findings")
     parts = {name: pages.value(f"document.querySelector('[data-part$={name}]').innerText") for name in names}
@@ -241,12 +242,14 @@ def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) 
     pages.go(scenario_page(accident(dataset)))
     pages.script("go(2); document.getElementById('layer-trails').click(); enlarge('2')")
     pages.script("document.getElementById('cloud-infrastructure').click(); zoom(2)")
-    pages.script("const s = cards[0].select; s.value = 'Back'; s.dispatchEvent(new Event('change'))")
-    pages.wait("['changed=', 'pictures=', 'view='].every((each) => location.search.includes(each))")
-    looks = """[state.frame, state.large, state.follow, state.clouds, state.layers, cards[0].chosen,
+    for select, value in (("cards[0].select", "Back"), ("byId('scene')", "space"), ("byId('points-by')", "height")):
+        pages.script(f"const s = {select}; s.value = '{value}'; s.dispatchEvent(new Event('change'))")
+    pages.wait("['changed=', 'pictures=', 'view=', 'points-by='].every((each) => location.search.includes(each))")
+    looks = """[state.frame, state.large, state.follow, state.clouds, state.scene, state.pointsBy,
+        state.layers, cards[0].chosen,
         [ground.x, ground.y, ground.scale].map((each) => each.toFixed(1)), location.search]"""
     seen = pages.value(looks)
-    assert seen[:4] == [2, "2", "", [0, 4]]
+    assert seen[:6] == [2, "2", "", [0, 1, 2, 3], "space", "height"]
     pages.go(pages.here()[1:])
     pages.wait("document.getElementById('scrubber').value === '2'")
     assert pages.value(looks) == seen

@@ -1,5 +1,6 @@
 """Replays, opened as a reader opens them: they play, scrub, show the impact, and ask for nothing."""
 
+import io
 import re
 import time
 from pathlib import Path
@@ -8,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Browser
+from PIL import Image
 from processes import wait_for
 from replay_page import data_of
 from selenium.webdriver import ActionChains
+from selenium.webdriver.common.actions.action_builder import ActionBuilder
 from selenium.webdriver.common.keys import Keys
 from wording import holding, lacking
 
@@ -47,6 +50,7 @@ def page(da_motion: DeepAccident, scenario: str, tmp_path_factory: pytest.TempPa
 def opened(browser: Browser, page: Path) -> Browser:
     """The page with the whole scene, in which nobody is marked but by their boxes."""
     browser.open(page, 1280)
+    choose(browser, "#scene", "map")
     click(browser, "whole", "layer-trails", "layer-dots", "layer-agents")
     return browser
 
@@ -239,6 +243,147 @@ def test_where_a_frame_has_no_picture_the_one_before_is_shown_with_its_boxes(
     assert shown == [["FrontLeft", shown[0][1]], ["FrontLeft, 0.1 s earlier", shown[0][1]]]
 
 
+STILL = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()))"
+
+
+def photo(browser: Browser) -> Image.Image:
+    """The scene in three dimensions as the reader sees it."""
+    browser.driver.execute_async_script(STILL)
+    return Image.open(io.BytesIO(browser.driver.find_element("id", "space").screenshot_as_png)).convert("RGB")
+
+
+def test_the_scene_is_turned(browser: Browser, recorded: Path) -> None:
+    """With the mouse and keys: other pixels, and always the pair; it follows whom the reader says."""
+    browser.open(recorded, 1280)
+    photos, canvas = [photo(browser)], browser.driver.find_element("id", "space")
+    for act in (
+        lambda: ActionChains(browser.driver).drag_and_drop_by_offset(canvas, 90, 30).perform(),
+        lambda: browser.press(Keys.SHIFT + Keys.ARROW_LEFT),
+        lambda: browser.press("+"),
+        lambda: choose(browser, "#points-by", "height"),
+        lambda: browser.press("t"),
+    ):
+        act()
+        photos.append(photo(browser))
+        off = np.abs(np.asarray(photos[-1], dtype=int) - mixed(COLLIDER_COLOR, 1.0)).max(axis=2)
+        assert (photos[-1].tobytes() != photos[-2].tobytes(), (off < 12).sum() > 60) == (True, True)
+    choose(browser, "#follow", "0")
+    scrub(browser, 3)
+    browser.driver.execute_async_script(STILL)
+    x, y, _, turn, rise, _ = map(float, browser.value("document.getElementById('space').dataset.view").split())
+    pose = data_of(recorded)["agents"][0]["poses"][3]
+    assert [x * 100, y * 100, turn, rise] == pytest.approx([*pose[:2], -np.pi / 2, np.pi / 2])  # north is up
+    assert browser.faults() == {}
+
+
+PLACE = """
+const [actor, view] = [data.actors.find((each) => each.id === arguments[0]), arguments[1]];
+const now = actor.states[state.frame];
+const row = rows.find((each) => each.actor === actor).row;
+const large = document.querySelector('.agent.large');
+const element = { space: space.canvas, ground: ground.canvas, camera: large, seen: row }[view];
+element.scrollIntoView({ block: 'center' });
+const box = element.getBoundingClientRect();
+const inside = { space: () => space.orbit.pixel([now[0] / 100, now[1] / 100, now[4] / 100], box.width, box.height),
+  ground: () => ground.at(now) }[view];
+if (inside) return [box.left, box.top].map((each, axis) => Math.round(each + element.clientLeft + inside()[axis]));
+const marked = view === 'seen' ? row : document.querySelector(`.large g[data-actor="${actor.id}"] path`);
+const place = marked.getBoundingClientRect();
+return [place.left + place.width / 2, place.top + place.height / 2].map(Math.round);
+"""
+LIT = """
+return [[...document.querySelectorAll('.large g.lit')].map((each) => Number(each.dataset.actor)),
+  [...document.querySelectorAll('#seen tr.lit th')].map((each) => each.textContent),
+  [...document.querySelectorAll('#space-names .lit')].map((each) => each.textContent), byId('lit').textContent];
+"""
+
+
+@pytest.mark.parametrize("view", ["space", "ground", "camera", "seen"])
+def test_an_actor_that_is_chosen_lights_up_in_all_views(view: str, browser: Browser, recorded: Path) -> None:
+    data = data_of(recorded)
+    browser.open(recorded, 1280)
+    scrub(browser, 2)
+    own = data["agents"][data["automatic"]["agents"][2]]["actor"]
+    actor = next(each for each in data["actors"] if each["role"] == "pair" and each["id"] != own)
+    names = ", ".join(agent["title"] for bit, agent in enumerate(data["agents"]) if actor["seen"][2] >> bit & 1)
+    words = f"{actor['title']}: {actor['states'][2][3] / 10:.1f} m/s, seen by {names}."
+    dark = {photo(browser).tobytes(), drawn(browser)}
+    for is_chosen in (False, True):  # else pointed at
+        mouse = ActionBuilder(browser.driver)
+        mouse.pointer_action.move_to_location(*browser.driver.execute_script(PLACE, actor["id"], view))
+        if is_chosen:
+            mouse.pointer_action.click().move_to_location(2, 2)
+        mouse.perform()
+        browser.driver.execute_async_script(STILL)
+        assert browser.script(LIT) == [[actor["id"]], [actor["title"]], [actor["title"]], words]
+    assert not dark & {photo(browser).tobytes(), drawn(browser)}
+    browser.press(Keys.ESCAPE, ".", ".", ",")  # nobody, the first, the second, the first
+    assert browser.script(LIT)[3].startswith(f"{data['actors'][0]['title']}: ")
+
+
+TEXTS = "[...document.querySelectorAll('.strip {}')].map((each) => each.textContent)"
+
+
+def test_the_strip_tells_of_the_pair_and_leads_there(browser: Browser, judged: Path) -> None:
+    data = data_of(judged)
+    browser.open(judged, 1280)
+    told = browser.value(TEXTS.format(".row"))
+    assert told == ["speeds", "gap", "time to collision", "O seen by", "E seen by", "verdicts"]
+    for plot in browser.driver.find_elements("css selector", ".strip .plot"):
+        scrub(browser, 3)
+        across = round((20 / (FRAMES - 1) - 0.5) * plot.size["width"])
+        ActionChains(browser.driver).move_to_element_with_offset(plot, across, 0).click().perform()
+        assert browser.frame() == 20
+    gap, ttc = (data["pair"][name][20] for name in ("gap", "ttc"))
+    assert not lacking(browser.value(TEXTS.format(".told")), f"{gap / 100:.1f} m", f"{ttc / 10:.1f} s", "E TP")
+
+
+WITHOUT = """
+const real = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind) { return kind === '2d' ? real.call(this, kind) : null; };
+"""
+
+
+def test_without_webgl_there_is_the_map(browser: Browser, recorded: Path) -> None:
+    added = browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WITHOUT})
+    browser.open(recorded, 1280)
+    browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+    click(browser, "closer", "whole", "layer-points")
+    shown = browser.value("['space-box', 'scene-tools', 'ground'].map((name) => byId(name).offsetHeight > 0)")
+    assert (shown, browser.faults()) == ([False, False, True], {})
+
+
+PLAY = """
+const done = arguments[1];
+let [made, left] = [0, arguments[0]];
+for (const kind of ['createBuffer', 'createTexture', 'createVertexArray', 'createProgram']) {
+  const real = WebGL2RenderingContext.prototype[kind];
+  WebGL2RenderingContext.prototype[kind] = function (...given) { made += 1; return real.apply(this, given); };
+}
+const next = () => {
+  for (let each = 0; each < 12; each += 1) {
+    go((state.frame + 1) % (last + 1));
+    space.render();
+  }
+  left -= 12;
+  if (left) requestAnimationFrame(next);
+  else done(made);
+};
+next();
+"""
+
+
+def test_a_minute_of_play_needs_no_more_memory(browser: Browser, recorded: Path) -> None:
+    """600 frames, as quickly as can be: nothing is made on the graphics processor, and the heap stays."""
+    browser.open(recorded, 390, 300)
+    sizes = []
+    for frames in (12, 600):
+        assert browser.driver.execute_async_script(PLAY, frames) == 0
+        browser.driver.execute_cdp_cmd("HeapProfiler.collectGarbage", {})
+        sizes.append(browser.driver.execute_cdp_cmd("Runtime.getHeapUsage", {})["usedSize"])
+    assert sizes[1] - sizes[0] < 1_000_000
+
+
 LARGE = "return document.querySelector('.agent.large').dataset.agent"
 
 
@@ -334,20 +479,6 @@ return [...document.querySelectorAll('.name, .badge, .where, th, td, button, p, 
   .filter((each) => each.offsetParent && each.scrollWidth > each.clientWidth + 1 && each.clientWidth)
   .map((each) => each.outerHTML.slice(0, 200));
 """
-
-
-@pytest.mark.parametrize("width", [1400, 1100, 700, 390])
-def test_nothing_is_cut(width: int, browser: Browser, recorded: Path, judged: Path) -> None:
-    for page_, at in ((recorded, 0), (recorded, 5), (judged, 0), (judged, 34)):
-        browser.open(page_, width)
-        scrub(browser, at)
-        assert (browser.faults(), browser.script(CUT), browser.script(CHOSEN_CUT)) == ({}, [], [])
-    table = "const box = document.getElementById('samples'); return box.scrollWidth - box.clientWidth"
-    assert browser.script(table) <= 0
-    lines = "[...document.querySelectorAll('.name')].map((each) => each.getClientRects().length)"
-    assert browser.value(lines) == [1] * 5
-
-
 SMALL = """
 return [...document.querySelectorAll('body *')]
   .filter((each) => each.childNodes.length && each.innerText)
@@ -363,12 +494,21 @@ return [...document.querySelectorAll('button, select, input')]
 """
 
 
-@pytest.mark.parametrize("width", [1280, 700, 390])
-def test_it_fits_its_window_and_asks_for_nothing(width: int, browser: Browser, judged: Path) -> None:
-    browser.open(judged, width)
-    scrub(browser, 25)
-    assert (browser.faults(), browser.requests()) == ({}, [judged.resolve().as_uri()])
-    assert (browser.script(SMALL), browser.script(NAMELESS)) == ([], [])
+@pytest.mark.parametrize("width", [1400, 1280, 700, 390])
+def test_it_fits_its_window_and_asks_for_nothing(
+    width: int, scheme: str, browser: Browser, recorded: Path, judged: Path
+) -> None:
+    for page_, at in ((recorded, 0), (recorded, 5), (judged, 0), (judged, 34)):
+        browser.open(page_, width)
+        scrub(browser, at)
+        browser.script("openStrip(true)")
+        assert (browser.faults(), browser.requests()) == ({}, [page_.resolve().as_uri()])
+        assert [browser.script(each) for each in (CUT, CHOSEN_CUT, SMALL, NAMELESS)] == [[]] * 4
+    assert (browser.scheme(), sum(photo(browser).getpixel((8, 8))) > 384) == (scheme, scheme == "light")  # the sky
+    table = "const box = document.getElementById('samples'); return box.scrollWidth - box.clientWidth"
+    assert browser.script(table) <= 0
+    lines = "[...document.querySelectorAll('.name')].map((each) => each.getClientRects().length)"
+    assert browser.value(lines) == [1] * 5
 
 
 INTRUDERS = """

@@ -4,7 +4,7 @@
 const given = new URLSearchParams(location.search);
 const momentLink = document.getElementById("moment");
 const ticks = [...document.querySelectorAll('[id^="layer-"], [id^="cloud-"], #boxes')];
-const selects = ["follow", "sight"].map(byId);
+const selects = ["follow", "sight", "scene", "points-by"].map(byId);
 const usual = new Map([...ticks.map((box) => [box.id, box.checked]), ...selects.map((each) => [each.id, each.value])]);
 const viewOf = () => [ground.x, ground.y, ground.scale].map((each) => each.toFixed(2)).join(",");
 const usualView = viewOf();

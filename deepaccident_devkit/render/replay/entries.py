@@ -19,7 +19,8 @@ from deepaccident_devkit.evaluation.accident_truth import RELEASED_HORIZON, Pair
 from deepaccident_devkit.evaluation.predictions import checked_prediction
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
-from deepaccident_devkit.geometry import SE3, quaternions
+from deepaccident_devkit.geometry import SE3, quaternions, time_to_collision
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.boxes import actor_color, agent_letters, recorders_of
 from deepaccident_devkit.render.outcomes.above import count_words
@@ -161,6 +162,28 @@ def actor_entries(recording: Recording) -> list[dict[str, Any]]:
         range(len(ids)), key=lambda row: (ids[row] not in recording.pair, int(ids[row]) not in recorders, ids[row])
     )
     return [_actor(recording, tracks, int(ids[row]), recorders, seen[row]) for row in order]
+
+
+def pair_entries(recording: Recording) -> dict[str, list[int | None]] | None:
+    """How near the colliding pair is at each frame: its gap (cm), and its time to collision if both go on (ds).
+
+    As `interactions` has them, seen from above; null where one of the two is not annotated or has no known velocity,
+    and where they would never touch. None if nobody collides.
+    """
+    if not recording.pair:
+        return None
+    tracks = scenario_tracks(recording.dataset, recording.scenario)
+    boxes, velocity = (np.full((2, len(recording.frames), width), np.nan) for width in (5, 2))
+    for place, actor in enumerate(recording.pair):
+        rows = np.flatnonzero(tracks.actor_id == actor)
+        own, at = tracks.boxes.select(rows), tracks.index[rows] - 1
+        boxes[place, at] = np.column_stack([own.center[:, :2], own.size[:, :2], own.yaw])
+        velocity[place, at] = own.velocity[:, :2]
+    values = {"gap": gaps_of_pairs(*boxes) * 100, "ttc": time_to_collision(*boxes, *velocity) * 10}
+    return {
+        name: [round(each) if math.isfinite(each) else None for each in found.tolist()]
+        for name, found in values.items()
+    }
 
 
 def camera_entries(recording: Recording) -> list[list[dict[str, Any]]]:

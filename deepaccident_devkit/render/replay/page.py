@@ -10,9 +10,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
-from deepaccident_devkit.render.captions import is_there
+from deepaccident_devkit.render.captions import has_cloud
 from deepaccident_devkit.render.replay.entries import (
     Foreseen,
     Recording,
@@ -21,10 +23,12 @@ from deepaccident_devkit.render.replay.entries import (
     camera_entries,
     camera_title,
     foreseen_entries,
+    pair_entries,
     recording_of,
 )
 from deepaccident_devkit.render.replay.road import road_picture
 from deepaccident_devkit.render.replay.sensors import (
+    PAGE_POINTS,
     CameraFiles,
     Followed,
     Jpegs,
@@ -33,6 +37,8 @@ from deepaccident_devkit.render.replay.sensors import (
     camera_pictures,
     follow_pair,
     lidar_points,
+    most_points,
+    served_points,
 )
 from deepaccident_devkit.render.styles import (
     CATEGORY_MARKERS,
@@ -45,12 +51,27 @@ from deepaccident_devkit.render.styles import (
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.pages import document, part, source_hash
 from deepaccident_devkit.support.text import path_of
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, short_name
 from deepaccident_devkit.v2x import Agents
 from deepaccident_devkit.v2x.collisions import contact_words
 
 SIZE_LIMIT: Final = 15_000_000
 """The most bytes of a page, so that it can be sent by mail."""
+_SCRIPTS: Final = (
+    "sources",
+    "pointers",
+    "ground",
+    "panels",
+    "lit",
+    "cameras",
+    "gpu",
+    "orbit",
+    "space",
+    "strip",
+    "replay",
+)
+_HEIGHTS: Final = ("#00224e", "#434e6c", "#7d7c78", "#bcae6c", "#fee838")
+"""Colours of points from low to high: those of `styles.HEIGHT_COLORMAP`."""
 _BASE64: Final = 4 / 3
 _BESIDE: Final = 8
 """Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
@@ -68,11 +89,12 @@ def render_replay(
     """Write a scenario as one HTML file that plays in any browser: no server, no network, small enough for a mail.
 
     It shows the agents' cameras with the actors' boxes, one of them large, by default the one that shows the colliding
-    pair best; from above the road, all actors and their trails; who sees whom by the released rule, the LiDAR of the
-    first agent and the countdown to the impact. The road is what the agents' BEV cameras saw; where they have no files,
-    that of a town map (`town_map`), if one is kept. The front cameras, and the cameras while they show the pair best,
-    have the larger pictures; all are as large as the page's limit, `SIZE_LIMIT`, lets them be. What the release lacks
-    (images, points, labels) is left out, and the page says so.
+    pair best; the scene in three dimensions, which can be turned, with the agents' LiDAR, and from above with the road,
+    all actors and their trails; who sees whom by the released rule, the countdown to the impact, and how near the pair
+    is. The road is what the agents' BEV cameras saw; where they have no files, that of a town map (`town_map`), if one
+    is kept. The front cameras, and the cameras while they show the pair best, have the larger pictures; all are as
+    large as the page's limit, `SIZE_LIMIT`, lets them be. What the release lacks (images, points, labels) is left out,
+    and the page says so.
 
     Args:
         dataset: the release.
@@ -99,13 +121,14 @@ def render_replay(
     if target.is_dir():
         raise ChoiceError(f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}")
     recording = recording_of(dataset, scenario, agents)
-    files = camera_files(recording)
-    data, followed = _data(recording, prediction, files)
-    data["points"] = lidar_points(recording, recording.agents[0])
+    files, clouds = camera_files(recording), lidar_files(recording)
+    data, followed = _data(recording, prediction, files, clouds)
+    most = most_points(sum(map(sum, clouds)), PAGE_POINTS)
+    data["points"] = lidar_points(recording, most)
     free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
     free -= _BESIDE * len(recording.frames) * len(files)
     settings, jpegs = camera_pictures(files, followed, free, progress=progress)
-    said = notes(recording, files, settings, points=data["points"] is not None)
+    said = notes(recording, files, settings, clouds, most)
     data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], jpegs)}
     title = f"Accident replay: {recording.scenario['name']}"
     write_bytes(target, replay_page(title, data).encode())
@@ -130,27 +153,34 @@ def served_replay(
     `points/AGENT/FRAME`, which answers with `cloud_text`. Errors are those of `render_replay`.
     """
     recording = recording_of(dataset, scenario, None)
-    files = camera_files(recording)
-    data, _ = _data(recording, prediction, files)
-    points = [
-        [is_there(dataset, f"{recording.sample(agent, frame)}/{LIDAR}") for frame in recording.frames]
-        for agent in recording.agents
-    ]
+    files, clouds = camera_files(recording), lidar_files(recording)
+    data, _ = _data(recording, prediction, files, clouds)
     for agent, cameras in zip(recording.agents, data["cameras"], strict=True):
         for channel, camera in zip(CAMERAS, cameras, strict=True):
             camera["channel"] = channel
             camera["pictures"] = [None if path is None else 1 for path in files[agent, channel]]
     return data | {
         "points": None,
-        "notes": served_notes(recording, files),
-        "served": {"folder": folder, "points": [each if any(each) else None for each in points]},
+        "notes": served_notes(recording, files, clouds),
+        "served": {"folder": folder, "points": [each if any(each) else None for each in clouds]},
     }
 
 
-def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles) -> tuple[dict[str, Any], Followed]:
+def lidar_files(recording: Recording) -> list[list[bool]]:
+    """For each agent and frame whether the LiDAR file is there."""
+    return [
+        [has_cloud(recording.dataset, recording.sample(agent, frame)) for frame in recording.frames]
+        for agent in recording.agents
+    ]
+
+
+def _data(
+    recording: Recording, prediction: Foreseen | None, files: CameraFiles, clouds: list[list[bool]]
+) -> tuple[dict[str, Any], Followed]:
     """The page's data, except pictures and points, and the cameras that follow the pair.
 
-    `automatic` has for each frame the number of the agent that shows the pair best, and for each agent its camera.
+    `automatic` has for each frame the number of the agent that shows the pair best, and for each agent its camera;
+    `files` has for each frame how many of its sensors' files are there, of the cameras and the LiDAR.
     """
     contact = recording.contact
     moments = [
@@ -166,17 +196,21 @@ def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles)
             "pair": COLLIDER_COLOR,
             "points": POINT_COLOR,
             "grid": GRID_COLOR,
+            "heights": _HEIGHTS,
             **OUTCOME_COLORS,
         },
         "markers": dict(CATEGORY_MARKERS),
         "agents": agent_entries(recording),
         "actors": actor_entries(recording),
+        "pair": pair_entries(recording),
         "road": road_picture(recording),
         "prediction": None if prediction is None else foreseen_entries(recording, prediction),
         "cameras": camera_entries(recording),
     }
     seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
     there = {key: [path is not None for path in paths] for key, paths in files.items()}
+    data["files"] = np.sum([*there.values(), *clouds], axis=0).tolist()
+    data["sensors"] = len(there) + len(clouds)
     followed = follow_pair(recording, seen, there)
     data["automatic"] = {
         "agents": [recording.agents.index(agent) for agent in followed.agents],
@@ -229,7 +263,7 @@ def replay_style() -> str:
 
 def replay_script() -> str:
     """The scripts of a replay; each uses the ones before it."""
-    return "".join(part(f"replay/{name}.js") for name in ("sources", "ground", "panels", "cameras", "replay"))
+    return "".join(part(f"replay/{name}.js") for name in _SCRIPTS)
 
 
 def facts(recording: Recording) -> list[list[str]]:
@@ -237,16 +271,20 @@ def facts(recording: Recording) -> list[list[str]]:
     return [[name, value] for name, value in (*_setting(recording), *_ending(recording)) if value]
 
 
-def notes(recording: Recording, files: CameraFiles, settings: PictureSettings | None, *, points: bool) -> list[str]:
-    """Sentences on what is missing in the release or was left out; the settings are None if there is no picture."""
-    title = short_name(recording.agents[0])
-    absent = f"No LiDAR points: no file of {title} is here; unpack the archive of lidar01."
-    return [*_labels(recording), *_missing_pictures(files), *_pictures(files, settings), *[absent] * (not points)]
+def notes(
+    recording: Recording, files: CameraFiles, settings: PictureSettings | None, clouds: list[list[bool]], most: int
+) -> list[str]:
+    """Sentences on what is missing in the release or was left out.
+
+    The settings are None if there is no picture; `most` is how many points a cloud may have.
+    """
+    missing = [*_missing_pictures(files), *_pictures(files, settings), *_clouds(clouds, most)]
+    return [*_labels(recording), *missing]
 
 
-def served_notes(recording: Recording, files: CameraFiles) -> list[str]:
+def served_notes(recording: Recording, files: CameraFiles, clouds: list[list[bool]]) -> list[str]:
     """Sentences on what is missing in the release, for a page that has no pictures itself."""
-    return [*_labels(recording), *_missing_pictures(files)]
+    return [*_labels(recording), *_missing_pictures(files), *_clouds(clouds, served_points(recording))]
 
 
 def _setting(recording: Recording) -> Iterator[tuple[str, str]]:
@@ -317,6 +355,16 @@ def _pictures(files: CameraFiles, settings: PictureSettings | None) -> Iterator[
             "To keep the file small, cameras other than the front ones and those that follow the pair have smaller "
             f"pictures, up to {settings.other_width} pixels wide, of {each}."
         )
+
+
+def _clouds(clouds: list[list[bool]], most: int) -> Iterator[str]:
+    found, wanted = sum(map(sum, clouds)), sum(map(len, clouds))
+    if not found:
+        yield f"No LiDAR points: none of the {wanted} files is here; unpack the archives of lidar01."
+        return
+    if found < wanted:
+        yield f"{wanted - found} of {wanted} LiDAR files are missing in the release; unpack the archives of lidar01."
+    yield f"LiDAR clouds are thinned to at most {most} points; those of the road are left out."
 
 
 def _missing_pictures(files: CameraFiles) -> Iterator[str]:

@@ -33,8 +33,8 @@ _MOST: Final = 200_000
 def road_picture(recording: Recording) -> dict[str, Any] | None:
     """The road as the page has it: a PNG in base64, and its left, top, width and height (cm, y up).
 
-    White is nothing, or not seen. If the release has no BEV camera file of these moments, as of the test split, it is
-    the town's map, where one is kept; None if there is neither, or if they give no small picture.
+    Transparent is nothing, or not seen. If the release has no BEV camera file of these moments, as of the test split,
+    it is the town's map, where one is kept; None if there is neither, or if they give no small picture.
 
     Raises:
         SensorFileError: a file cannot be read.
@@ -87,12 +87,16 @@ def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatAr
     merged = np.zeros((len(y), len(x)), dtype=np.uint8)
     for image, pose in seen:
         yaw = np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])
-        right, up = x[None] - pose.translation[0], y[:, None] - pose.translation[1]
+        reach = image.resolution * len(image.semantic) * np.array([-1.0, 1.0])  # farther than its corners
+        columns = slice(*x.searchsorted(pose.translation[0] + reach))
+        rows = slice(*(-y).searchsorted(reach - pose.translation[1]))
+        own = merged[rows, columns]
+        right, up = x[None, columns] - pose.translation[0], y[rows, None] - pose.translation[1]
         middle = (len(image.semantic) - 1) / 2
         row = np.rint(middle - (right * np.cos(yaw) + up * np.sin(yaw)) / image.resolution).astype(np.int64)
         column = np.rint(middle - (up * np.cos(yaw) - right * np.sin(yaw)) / image.resolution).astype(np.int64)
-        free = (merged == 0) & (row >= 0) & (row <= 2 * middle) & (column >= 0) & (column <= 2 * middle)
-        merged[free] = kinds[image.semantic[row[free], column[free]]]
+        free = (own == 0) & (row >= 0) & (row <= 2 * middle) & (column >= 0) & (column <= 2 * middle)
+        own[free] = kinds[image.semantic[row[free], column[free]]]
     return merged
 
 
@@ -115,5 +119,5 @@ def _png(cells: ByteArray) -> bytes:
     picture = Image.fromarray(cells)
     picture.putpalette([255, 255, 255, *(part for name in _GROUND for part in ImageColor.getrgb(BEV_COLORS[name]))])
     written = io.BytesIO()
-    picture.save(written, "PNG", optimize=True, bits=2)
+    picture.save(written, "PNG", optimize=True, bits=2, transparency=0)
     return written.getvalue()

@@ -18,7 +18,7 @@ from deepaccident_devkit.parallel import own_threads, run_batch
 from deepaccident_devkit.release import read_image
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.replay.entries import Recording
-from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray, as_floats
+from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray, IntArray, as_floats
 from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
@@ -41,11 +41,24 @@ LEAST_OTHER: Final = 256
 """Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this."""
 _PROBED: Final = 12
 """The number of pictures from which the size of all is estimated."""
-_CELL: Final = 0.4
-"""Metres: side of a square; of the points in it one is kept."""
-_MOST: Final = 1500
+_CELL: Final = 0.3
+"""Metres: side of a cube; of the points in it one is kept."""
+_NUMBERED: Final = as_floats([73_856_093, 19_349_669, 83_492_791])
+_MIXED: Final = 0x9E3779B1
+_SLOTS: Final = 1 << 16
+"""A cube's number is the sum of its places times `_NUMBERED`, mixed: quicker than sorting, and neighbours lie apart."""
+_MOST: Final = 4000
+"""Points of a cloud."""
+POINT_BYTES: Final = 8
+"""Of a point in base64: three int16."""
+PAGE_POINTS: Final = 3_000_000
+"""Bytes of all clouds of a page that has its pictures too."""
+SERVED_POINTS: Final = 13_000_000
+"""Bytes of all clouds of a scenario that a server gives, so that with data and scripts it keeps to 15 MB."""
 _LEAST_HEIGHT: Final = 0.3
 """Metres above the ground: lower points are on the road."""
+_SOME: Final = 8
+"""Of so many points the height of one is looked at for the ground's."""
 _GROUND: Final = 5.0
 """Percentile of the points' heights that counts as the ground: the infrastructure's ego frame is not on the ground."""
 CameraFiles = Mapping[tuple[str, str], Sequence[ReleasePath | None]]
@@ -91,30 +104,33 @@ def _scores(
     agent = recording.agents[bit]
     tracks = scenario_tracks(recording.dataset, recording.scenario)
     others = set(recording.pair) - {recording.actor_of(agent)}
+    chosen = np.flatnonzero(np.isin(tracks.actor_id, [*others]))
+    boxes, row = tracks.boxes.select(chosen), tracks.index[chosen] - 1
+    states = zip(boxes.actor_id.tolist(), row.tolist(), strict=True)
+    weight = as_floats([1.0 if seen[actor][at] >> bit & 1 else _HIDDEN for actor, at in states])
     scores = np.zeros((len(recording.frames), len(CAMERAS)))
-    for row, frame in enumerate(recording.frames):
-        boxes = tracks.at(frame)
-        boxes = boxes.select(np.isin(boxes.actor_id, [*others]))
-        weight = [1.0 if seen[actor][row] >> bit & 1 else _HIDDEN for actor in boxes.actor_id.tolist()]
-        for column, channel in enumerate(CAMERAS):
-            if not there[agent, channel][row]:
-                scores[row, column] = -1.0
-            elif weight:
-                shown = _shown(recording, recording.sample(agent, frame), channel, boxes)
-                scores[row, column] = float(shown @ weight)
+    for column, channel in enumerate(CAMERAS):
+        np.add.at(scores[:, column], row, weight * _shown(recording, agent, channel, boxes, row))
+        scores[~np.array(there[agent, channel]), column] = -1.0
     scores[-1] *= _END
     return scores
 
 
-def _shown(recording: Recording, sample: str, channel: str, boxes: Boxes) -> FloatArray:
-    """(N,) from 0 to 1: the share of boxes, in world, that a camera's picture has, less if they are small."""
-    lens = recording.dataset.camera(sample, channel)
-    optical = boxes.transform(recording.dataset.world_from(sample, channel).inverse(), channel)
-    corners, center = optical.corners(), optical.center[:, None]
-    places = (center[:, None] + _LAYERS[:, None, None] * (corners - center)[:, None]).reshape(-1, 3)
-    inside = lens.in_image(*lens.project(places), min_depth=IN_FRONT_DEPTH).reshape(len(boxes), -1).mean(axis=1)
-    away = np.linalg.norm(optical.center, axis=1).clip(1.0)
-    size = lens.intrinsic[0, 0] / lens.width * optical.size[:, 0] / away
+def _shown(recording: Recording, agent: str, channel: str, boxes: Boxes, row: IntArray) -> FloatArray:
+    """(N,) from 0 to 1: the share of boxes, in world, that a camera's picture has, less if they are small.
+
+    `row` (N,) says at which frame, from 0, each box is. The lens is that of the first frame.
+    """
+    samples = [recording.sample(agent, frame) for frame in recording.frames]
+    lens = recording.dataset.camera(samples[0], channel)
+    poses = np.array([recording.dataset.world_from(sample, channel).matrix for sample in samples])[row]
+    center = boxes.center[:, None]
+    layers = center[:, None] + _LAYERS[:, None, None] * (boxes.corners() - center)[:, None]
+    world = layers.reshape(len(boxes), layers.shape[1] * layers.shape[2], 3) - poses[:, None, :3, 3]
+    places = (world @ poses[:, :3, :3]).reshape(-1, 3)
+    inside = lens.in_image(*lens.project(places), min_depth=IN_FRONT_DEPTH).reshape(world.shape[:2]).mean(axis=1)
+    away = np.linalg.norm(boxes.center - poses[:, :3, 3], axis=1).clip(1.0)
+    size = lens.intrinsic[0, 0] / lens.width * boxes.size[:, 0] / away
     return as_floats(inside * size / (size + _LARGE))
 
 
@@ -278,28 +294,44 @@ def _jpeg(image: ByteArray, settings: PictureSettings, *, large: bool) -> bytes:
     return written.getvalue()
 
 
-def lidar_points(recording: Recording, agent: str) -> list[str | None] | None:
-    """A cloud for each frame: int16 x, y, x, y, …, little-endian, in decimetres from the origin, as base64.
+def most_points(clouds: int, limit: float) -> int:
+    """How many points each of so many clouds may have so that all keep a limit of bytes."""
+    return min(_MOST, int(limit / (POINT_BYTES * max(1, clouds))))
 
-    None stands for a missing file; if all are missing there is no list. Raises SensorFileError.
+
+def lidar_points(recording: Recording, most: int) -> list[list[str | None] | None] | None:
+    """For each agent a cloud for each frame, as `cloud_text` has it, of at most so many points.
+
+    None stands for a missing file; an agent of which all are missing has no list, and without any there is none.
+    Raises SensorFileError.
     """
-    clouds = [cloud_text(recording, agent, frame) for frame in recording.frames]
-    return clouds if any(cloud is not None for cloud in clouds) else None
+    clouds = [[cloud_text(recording, agent, frame, most) for frame in recording.frames] for agent in recording.agents]
+    shown = [each if set(each) != {None} else None for each in clouds]
+    return shown if any(shown) else None
 
 
-def cloud_text(recording: Recording, agent: str, frame: int) -> str | None:
-    """One cloud of `lidar_points`; raises SensorFileError."""
+def served_points(recording: Recording) -> int:
+    """How many points a cloud may have that a server gives, if all files are there."""
+    return most_points(len(recording.agents) * len(recording.frames), SERVED_POINTS)
+
+
+def cloud_text(recording: Recording, agent: str, frame: int, most: int | None = None) -> str | None:
+    """A cloud above the road: int16 x, y, z, x, y, z, …, little-endian, decimetres from the origin, as base64.
+
+    z is that of world. At most so many points, by default `served_points`, spread evenly over the
+    cubes that have any. None if there is no file; raises SensorFileError.
+    """
     dataset, sample = recording.dataset, recording.sample(agent, frame)
     try:
         cloud = dataset.load_point_cloud(sample, "ego")
     except MissingFileError:
         return None
     height = cloud.xyz[:, 2]
-    ground = np.percentile(height, _GROUND) if len(height) else 0.0
+    ground = np.percentile(height[::_SOME], _GROUND) if len(height) else 0.0
     raised = cloud.xyz[height > ground + _LEAST_HEIGHT]
-    world = dataset.world_from(sample, "ego").apply(raised)[:, :2] - recording.origin
-    column, row = np.floor(world / _CELL).astype(np.int64).T
-    _, first = np.unique((column << 32) + row, return_index=True)  # one number sorts faster than two
-    kept = world[first[:: max(1, -(-len(first) // _MOST))]]
+    world = dataset.world_from(sample, "ego").apply(raised) - np.append(recording.origin, 0.0)
+    cubes, chosen = (np.floor(world / _CELL) @ _NUMBERED).astype(np.int64), np.full(_SLOTS, -1)
+    chosen[((cubes ^ (cubes >> 15)) * _MIXED >> 16) % _SLOTS] = np.arange(len(world))
+    kept = world[chosen[chosen >= 0][: served_points(recording) if most is None else most]]
     decimetres = np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1)
     return base64.b64encode(decimetres.astype("<i2").tobytes()).decode("ascii")

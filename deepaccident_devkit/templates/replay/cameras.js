@@ -88,24 +88,30 @@ function drawBoxes(card, camera, frame) {
   const taken = [];
   const shown = data.actors.filter((actor) => {
     const there = actor.states[frame] !== null && actor.id !== card.agent.actor;
-    return there && (actor.role === "pair" || sees(actor));
+    return there && (actor.role === "pair" || actor.id === state.lit || sees(actor));
   });
+  card.size = [width, height];
+  card.places = [];
   card.boxes.replaceChildren(...[...shown].reverse().flatMap((actor) => {
     const corners = cornersBefore(camera, frame, actor);
     const lines = edgesIn(camera, corners);
     if (!lines.length) return [];
-    const parts = boxOf(actor, camera, corners, lines, { large, seen: sees(actor) });
-    if (actor.role === "pair" || (large && actor.tag)) parts.push(...tagOf(actor, lines.flat(), camera, ratio, taken));
-    return [drawn("g", { "data-actor": actor.id }, ...parts)];
+    card.places.push({ actor, place: extentOf(lines.flat()), away: corners.reduce((sum, each) => sum + each[2], 0) });
+    const isLit = actor.id === state.lit;
+    const parts = boxOf(actor, camera, corners, lines, { large, seen: sees(actor), isLit });
+    if (isLit || actor.role === "pair" || (large && actor.tag)) parts.push(...tagOf(actor, lines.flat(), camera, ratio, taken));
+    return [drawn("g", { "data-actor": actor.id, class: isLit ? "lit" : "" }, ...parts)];
   }));
 }
 
 // An actor's edges with a white casing and, if the agent sees it, its front.
-function boxOf(actor, camera, corners, lines, { large, seen }) {
+function boxOf(actor, camera, corners, lines, { large, seen, isLit }) {
   const edges = { d: lines.map(pathOf).join(""), fill: "none", "vector-effect": "non-scaling-stroke" };
   const thick = (actor.role === "other" ? 1.2 : 2) * (large ? 1 : 0.75);
   const parts = [
-    drawn("path", { ...edges, stroke: "#ffffff", "stroke-width": thick + 1.5, "stroke-opacity": 0.5 }),
+    drawn("path", isLit
+      ? { ...edges, stroke: INK, "stroke-width": thick + 4 }
+      : { ...edges, stroke: "#ffffff", "stroke-width": thick + 1.5, "stroke-opacity": 0.5 }),
     drawn("path", { ...edges, stroke: actor.color, "stroke-width": thick, "stroke-dasharray": seen ? "none" : "4 3" }),
   ];
   const front = corners.slice(0, 4);
@@ -116,10 +122,16 @@ function boxOf(actor, camera, corners, lines, { large, seen }) {
   return parts;
 }
 
-// The letters of the agent that an actor is, or its id, above its box but in the picture, and not on another tag.
+// Left, top, right and bottom of pixels.
+function extentOf(pixels) {
+  const [across, down] = [0, 1].map((axis) => pixels.map((pixel) => pixel[axis]));
+  return [Math.min(...across), Math.min(...down), Math.max(...across), Math.max(...down)];
+}
+
+// The letters of the agent that an actor is, or its id, or of whom is lit all, above its box but in the picture, and not on another tag.
 function tagOf(actor, pixels, camera, ratio, taken) {
   const [width, height] = camera.lens;
-  const words = actor.tag || String(actor.id);
+  const words = actor.id === state.lit ? actor.title : actor.tag || String(actor.id);
   const [wide, tall] = [(words.length * 7 + 6) * ratio, 14 * ratio];
   const within = (low, value, high) => Math.min(Math.max(low, value), high);
   const [across, down] = [0, 1].map((axis) =>
@@ -155,7 +167,6 @@ const cards = data.agents.map((agent, bit) => {
   const pictured = made("button", { type: "button", className: "pictured" }, picture, boxes, where, judged, none);
   pictured.style.borderColor = agent.color;
   pictured.ariaLabel = `Large picture of ${agent.title}`;
-  pictured.addEventListener("click", () => enlarge(String(bit)));
   const figure = made("figure", { className: "agent" }, title, pictured);
   figure.dataset.agent = agent.name;
   const select = made("select", { ariaLabel: `Camera of ${agent.title}`, hidden: available.length < 2 });
@@ -164,6 +175,7 @@ const cards = data.agents.map((agent, bit) => {
     card.chosen = value;
   });
   figure.append(select, sees);
+  lightIn(card, pictured, () => enlarge(String(bit)));
   byId("cards").append(figure);
   return card;
 });
@@ -217,6 +229,7 @@ function showCamera(card) {
   card.none.hidden = Boolean(camera);
   card.picture.hidden = !camera;
   card.boxes.replaceChildren();
+  card.places = [];
   if (camera) {
     const frame = showPicture(card, camera, card.figure.classList.contains("large"));
     card.picture.alt = `${card.agent.title}, camera ${camera.title}, frame ${frame + 1}`;
@@ -277,7 +290,9 @@ function madeEvery() {
       pictured.style.borderColor = agent.color;
       const figure = made("figure", { className: "agent" }, pictured);
       row.append(figure);
-      return { agent, bit, there, shown: camera, picture, boxes, where, figure };
+      const card = { agent, bit, there, shown: camera, picture, boxes, where, figure };
+      lightIn(card, pictured, () => {});
+      return card;
     });
   });
 }

@@ -8,6 +8,7 @@ const LEAST_PIXELS = 5;
 const LEAST_MARK = 9;
 const SHAPES = { o: "circle", D: "diamond", "^": "triangle" }; // of the colour table's markers
 const RING = 1.2; // metres
+const TOUCH = 6; // pixels beside a box that still count
 const ZOOM_STEP = 1.25;
 const ZOOM_RANGE = [0.5, 120];
 const FONT = "600 11px system-ui, sans-serif";
@@ -152,7 +153,7 @@ class Ground {
       const cloud = this.sources.points(bit, frame);
       if (!cloud) continue;
       this.pen.fillStyle = clouds.length > 1 ? this.data.agents[bit].color : this.data.colors.points;
-      for (let index = 0; index < cloud.length; index += 2) {
+      for (let index = 0; index < cloud.length; index += 3) {
         const [x, y] = this.at([cloud[index] * 10, cloud[index + 1] * 10]);
         this.pen.fillRect(x - 0.75, y - 0.75, 1.5, 1.5);
       }
@@ -184,10 +185,11 @@ class Ground {
     pen.lineWidth = 1.2;
     pen.globalAlpha = 0.55;
     this.data.agents.forEach((agent, bit) => {
-      if (chosen !== "all" && chosen !== String(bit)) return;
+      const all = chosen === "all" || chosen === String(bit);
       pen.strokeStyle = agent.color;
       pen.beginPath();
       for (const actor of this.data.actors) {
+        if (!all && actor.id !== this.state.lit) continue;
         if (actor.states[frame] === null || !(actor.seen[frame] & (1 << bit))) continue;
         pen.moveTo(...this.at(agent.poses[frame]));
         pen.lineTo(...this.at(actor.states[frame]));
@@ -238,8 +240,9 @@ class Ground {
     pen.translate(x, y);
     pen.rotate(-state[2] / 1000);
     this.trace(actor);
-    pen.lineWidth = 4;
-    pen.strokeStyle = "#ffffff";
+    const isLit = actor.id === this.state.lit;
+    pen.lineWidth = isLit ? 7 : 4;
+    pen.strokeStyle = isLit ? INK : "#ffffff";
     pen.stroke();
     pen.fillStyle = pen.strokeStyle = actor.color;
     pen.globalAlpha = actor.role === "other" ? 0.55 : 0.75;
@@ -296,7 +299,8 @@ class Ground {
     const { agents, ids } = this.state.layers;
     for (const actor of this.data.actors) {
       const named = ids || (agents && this.pair.includes(actor) && !actor.tag);
-      const words = [agents && actor.tag, named && String(actor.id)].filter(Boolean).join(" ");
+      const short = [agents && actor.tag, named && String(actor.id)].filter(Boolean).join(" ");
+      const words = actor.id === this.state.lit ? actor.title : short;
       if (words && actor.states[this.state.frame] !== null) this.writeBeside(words, this.extent(actor), actor.color);
     }
     if (!agents) return;
@@ -304,6 +308,25 @@ class Ground {
       const [x, y] = this.at(agent.poses[this.state.frame]);
       this.writeBeside(agent.short, [x - 5, y - 5, x + 5, y + 5], agent.color);
     }
+  }
+
+  /** The actor at a pixel: the nearest of those whose outline is at most some pixels away. */
+  actorAt(x, y) {
+    let best = null;
+    for (const actor of this.data.actors) {
+      const state = actor.states[this.state.frame];
+      if (state === null) continue;
+      const [across, down] = this.at(state).map((each, axis) => [x, y][axis] - each);
+      const [cos, sin] = [Math.cos(state[2] / 1000), Math.sin(state[2] / 1000)];
+      const [length, width] = this.size(actor);
+      const beside = [
+        Math.max(0, Math.abs(across * cos - down * sin) - length / 2),
+        Math.max(0, Math.abs(across * sin + down * cos) - width / 2),
+      ];
+      const away = Math.hypot(...beside);
+      if (away <= TOUCH && (best === null || away < best.away)) best = { actor, away };
+    }
+    return best && best.actor;
   }
 
   drawImpact() {

@@ -13,11 +13,19 @@ const state = {
   boxes: true,
   layers: { road: true, trails: true, dots: true, ids: false, agents: true, points: false, prediction: true },
   clouds: [],
+  pointsBy: "agent",
+  scene: "both",
+  pointed: null,
+  chosen: null,
+  lit: null, // the id of the actor that is pointed at or chosen
   foreseen: [],
 };
 const byId = (name) => document.getElementById(name);
-const sources = new Sources(data, () => ground.draw());
-state.clouds = sources.withPoints.slice(0, 1);
+const sources = new Sources(data, () => {
+  ground.draw();
+  space.draw();
+});
+state.clouds = sources.withPoints;
 const ground = new Ground(byId("ground"), data, state, sources);
 
 function made(name, properties = {}, ...children) {
@@ -62,7 +70,7 @@ table.append(made("tbody", {}, ...rows.map((each) => each.row)));
 function showSeen() {
   for (const { actor, row, cells } of rows) {
     const there = actor.states[state.frame] !== null;
-    row.className = there ? "" : "absent";
+    row.classList.toggle("absent", !there);
     cells.forEach((cell, bit) => {
       const own = data.agents[bit].actor === actor.id;
       const text = !there ? "" : own ? "self" : actor.seen[state.frame] & (1 << bit) ? "●" : "–";
@@ -71,12 +79,7 @@ function showSeen() {
   }
   const sentences = pair
     .filter((actor) => actor.states[state.frame] !== null)
-    .map((actor) => {
-      const names = data.agents.filter((_, bit) => actor.seen[state.frame] & (1 << bit)).map((agent) => agent.title);
-      const speed = actor.states[state.frame][3];
-      const fast = speed === null ? "" : ` at ${(speed / 10).toFixed(1)} m/s`;
-      return `${actor.title}${fast}: seen by ${names.join(", ") || "nobody else"}.`;
-    });
+    .map((actor) => `${actor.title}, ${speedOf(actor.states[state.frame])}: ${seenBy(actor)}.`);
   byId("pair").textContent = sentences.join(" ");
 }
 

@@ -1,5 +1,7 @@
 // Time and controls: `show` brings the whole page up to the frame of the state.
 
+// Of the arrow keys with shift: by how much they turn the scene, to the right and up.
+const TURNS = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 const LAYERS = {
   road: "road",
@@ -40,7 +42,10 @@ function show() {
   showCameras();
   showEvery();
   showSeen();
+  showLit();
+  showStrip();
   ground.draw();
+  space.draw();
   document.dispatchEvent(new Event("moment")); // for the pages around
 }
 
@@ -109,7 +114,7 @@ for (const bit of sources.withPoints) {
   const agent = data.agents[bit];
   tickBox("clouds", `cloud-${agent.name}`, agent.title, state.clouds.includes(bit), (checked) => {
     state.clouds = sources.withPoints.filter((each) => (each === bit ? checked : state.clouds.includes(each)));
-    state.layers.points = byId("layer-points").checked = true;
+    if (state.scene === "map") state.layers.points = byId("layer-points").checked = true;
   });
 }
 
@@ -117,47 +122,77 @@ function follow(value) {
   byId("follow").value = state.follow = value;
 }
 
-function zoom(factor) {
+function zoomMap(factor) {
   if (state.follow === "pair") follow(""); // it has its own scale
   ground.zoom(factor);
   ground.draw();
+}
+
+function zoomSpace(factor) {
+  space.zoom(factor);
+  space.draw();
+}
+
+function zoom(factor) {
+  zoomSpace(factor);
+  if (state.scene !== "space") zoomMap(factor);
 }
 byId("closer").addEventListener("click", () => zoom(ZOOM_STEP));
 byId("farther").addEventListener("click", () => zoom(1 / ZOOM_STEP));
 byId("whole").addEventListener("click", () => {
   follow("");
   ground.showWhole();
+  space.setOut();
   ground.draw();
+  space.draw();
 });
 
-const fingers = new Map();
-const spread = () => {
-  const [one, other] = [...fingers.values()];
-  return Math.hypot(one.x - other.x, one.y - other.y);
-};
-ground.canvas.addEventListener("wheel", (event) => {
-  event.preventDefault();
-  zoom(event.deltaY < 0 ? ZOOM_STEP : 1 / ZOOM_STEP);
-});
-ground.canvas.addEventListener("pointerdown", (event) => {
-  ground.canvas.setPointerCapture(event.pointerId);
-  fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-});
-ground.canvas.addEventListener("pointermove", (event) => {
-  const before = fingers.get(event.pointerId);
-  if (!before) return;
-  const apart = fingers.size === 2 ? spread() : null;
-  fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-  if (apart !== null) zoom(spread() / Math.max(apart, 1));
-  else {
+onPointers(ground.canvas, {
+  zoom: zoomMap,
+  drag: (right, down) => {
     follow("");
-    ground.move(event.clientX - before.x, event.clientY - before.y);
-  }
-  ground.draw();
+    ground.move(right, down);
+    ground.draw();
+  },
+  point: (x, y) => point(x === null ? null : ground.actorAt(x, y)),
+  click: (x, y) => choose(ground.actorAt(x, y)),
 });
-for (const kind of ["pointerup", "pointercancel"]) {
-  ground.canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
+onPointers(space.canvas, {
+  zoom: zoomSpace,
+  drag: (right, down, moves) => {
+    if (moves) {
+      follow("");
+      space.orbit.move(right, down, space.canvas.clientHeight);
+    } else space.orbit.turnBy(right / 150, down / 150);
+    space.draw();
+  },
+  point: (x, y) => point(x === null ? null : space.actorAt(x, y)),
+  click: (x, y) => choose(space.actorAt(x, y)),
+});
+
+function layOut(scene) {
+  state.scene = scene;
+  byId("space-box").hidden = scene === "map";
+  ground.canvas.hidden = scene === "space";
+  document.querySelector(".above").classList.toggle("both", scene === "both");
 }
+
+// Where the browser has no WebGL there is the map.
+function showScene(scene) {
+  if (scene === "map") space.end();
+  const isWithout = scene !== "map" && space.gpu === null && !space.begin();
+  layOut(isWithout ? "map" : scene);
+  if (isWithout) for (const name of ["scene-tools", "space-key"]) byId(name).hidden = true;
+}
+const SCENES = [["both", "3D and map"], ["space", "3D"], ["map", "map"]];
+choice(byId("scene"), SCENES, state.scene, showScene);
+choice(byId("points-by"), [["agent", "agent"], ["height", "height"]], state.pointsBy, (value) => {
+  state.pointsBy = value;
+});
+byId("top").addEventListener("click", () => space.fromAbove());
+layOut(state.scene);
+addEventListener("pageshow", () => showScene(state.scene)); // after the rest of the page: it takes a moment to begin
+addEventListener("pagehide", () => space.end());
 
 const keys = {
   " ": () => play(!state.playing),
@@ -169,17 +204,27 @@ const keys = {
   "-": () => zoom(1 / ZOOM_STEP),
   0: () => enlarge(""),
   b: () => byId("boxes").click(),
+  t: () => byId("top").click(),
+  ".": () => chooseNext(1),
+  ",": () => chooseNext(-1),
+  Escape: () => choose(null),
 };
 for (const card of cards) keys[card.bit + 1] = () => enlarge(String(card.bit));
 document.addEventListener("keydown", (event) => {
   // a control that has the focus keeps the keys that it needs itself
   const control = event.target.closest("button, select, input");
   const own = control && (event.key === " " ? control !== scrubber : control.matches("select, input"));
-  if (own || event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
+  if (own || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (!keys[event.key] && !(event.shiftKey && TURNS[event.key])) return;
   event.preventDefault();
-  keys[event.key]();
+  if (event.shiftKey && TURNS[event.key] && space.gpu) {
+    space.orbit.turnBy(...TURNS[event.key]);
+    space.draw();
+  } else keys[event.key]();
 });
-new ResizeObserver(show).observe(ground.canvas);
+const resized = new ResizeObserver(show);
+resized.observe(ground.canvas);
+resized.observe(space.canvas);
 
 // what does not change with time
 

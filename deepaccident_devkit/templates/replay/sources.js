@@ -20,13 +20,14 @@ class Sources {
     return `${this.served.folder}images/${agent.name}/${camera.channel}/${frame + 1}?width=${width}`;
   }
 
-  // The agents, by number, that have points at any frame. A page without a server has the first one's.
+  // The agents, by number, that have points at any frame.
   get withPoints() {
-    if (this.served) return this.data.agents.map((_, bit) => bit).filter((bit) => this.served.points[bit] !== null);
-    return this.data.points === null ? [] : [0];
+    const clouds = this.served ? this.served.points : this.data.points || [];
+    return this.data.agents.map((_, bit) => bit).filter((bit) => clouds[bit]);
   }
 
-  // Points of an agent, x, y, x, y, … in decimetres; null where there are none, or as long as they are on their way.
+  // Points of an agent, x, y, z, x, y, z, … in decimetres; null where there are none, undefined as long as they are on
+  // their way.
   points(bit, frame) {
     const key = `${bit}/${frame}`;
     if (!this.clouds.has(key)) this.get(key, bit, frame);
@@ -34,13 +35,13 @@ class Sources {
   }
 
   get(key, bit, frame) {
-    this.clouds.set(key, null);
-    if (!this.served) {
-      const coded = this.data.points[frame];
-      if (coded !== null) this.clouds.set(key, decodedCloud(coded));
-      return;
-    }
-    if (!this.served.points[bit][frame]) return;
+    const there = (this.served ? this.served : this.data).points[bit][frame];
+    if (there === true) this.ask(key, bit, frame);
+    else this.clouds.set(key, typeof there === "string" ? decodedCloud(there) : null);
+  }
+
+  ask(key, bit, frame) {
+    this.clouds.set(key, undefined);
     if (this.clouds.size > KEPT_CLOUDS) this.clouds.delete(this.clouds.keys().next().value);
     fetch(`${this.served.folder}points/${this.data.agents[bit].name}/${frame + 1}`)
       .then((answer) => (answer.ok ? answer.text() : ""))
@@ -52,7 +53,7 @@ class Sources {
   }
 }
 
-// Little-endian int16 from base64: x, y, x, y, …, decimetres.
+// Little-endian int16 from base64: x, y, z, x, y, z, …, decimetres.
 function decodedCloud(coded) {
   const text = atob(coded);
   const view = new DataView(Uint8Array.from(text, (character) => character.charCodeAt(0)).buffer);

@@ -18,6 +18,7 @@ from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, Results, ResultsWriter, instances_of, read_results
 from deepaccident_devkit.evaluation.predictions import labels_at_present
 from deepaccident_devkit.geometry import Boxes, quaternions
+from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
 from deepaccident_devkit.render.replay import recording_of, render_replay
 from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
@@ -109,9 +110,18 @@ def test_the_countdown_ends_at_the_impact(da: DeepAccident, data: dict[str, Any]
     assert facts["Weather"].startswith(scenario["weather"])
 
 
+def test_the_pair_is_as_near_as_its_interactions_say(da: DeepAccident, data: dict[str, Any]) -> None:
+    found, pair = interactions(da, accident(da)), da.get("scenario", accident(da))["collision"]["ids"]
+    own = (found.actor_ids == sorted(pair)).all(axis=1)
+    gap, ttc = (np.array(data["pair"][name], dtype=float)[found.frame[own] - 1] for name in ("gap", "ttc"))
+    assert len(gap) == len(data["countdown"])
+    np.testing.assert_allclose(gap / 100, found.gap[own], atol=0.00501)
+    np.testing.assert_allclose(ttc / 10, np.where(np.isinf(found.ttc[own]), np.nan, found.ttc[own]), atol=0.0501)
+
+
 def test_where_nobody_collides_nothing_is_red(da_b: DeepAccident, tmp_path: Path) -> None:
     data = data_of(render_replay(da_b, normal(da_b), tmp_path / "normal.html"))
-    assert (data["countdown"], data["impact"]) == ([None] * 4, None)
+    assert (data["countdown"], data["impact"], data["pair"]) == ([None] * 4, None, None)
     assert dict(data["facts"])["Ends"] == "without a collision"
     roles, colors = ({actor[name] for actor in data["actors"]} for name in ("role", "color"))
     assert (roles, COLLIDER_COLOR in colors) == ({"agent", "other"}, False)
@@ -122,7 +132,7 @@ def test_labels_alone_are_enough(da_b: DeepAccident, tmp_path: Path) -> None:
     assert (data["scenario"], data["cameras"], data["points"]) == (accident(da_b), [[]] * 5, None)
     notes = "\n".join(data["notes"])
     pictures = "No pictures: none of the 120 camera files is here"
-    assert not lacking(notes, pictures, "No LiDAR points: no file of ego is here")
+    assert not lacking(notes, pictures, "No LiDAR points: none of the 20 files is here")
     assert all(any(state for state in actor["states"]) for actor in data["actors"])
 
 

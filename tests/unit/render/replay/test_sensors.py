@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from replay_page import accident, data_of, normal, picture
+from scipy.spatial import cKDTree
 from wording import lacking
 
 from deepaccident_devkit import DeepAccident
@@ -20,12 +21,14 @@ from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.replay import render_replay, sensors
 from deepaccident_devkit.render.replay.entries import Recording, actor_entries, recording_of
 from deepaccident_devkit.render.replay.sensors import (
+    PAGE_POINTS,
     Followed,
     Jpegs,
     PictureSettings,
     camera_files,
     camera_pictures,
     follow_pair,
+    most_points,
     steady,
 )
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
@@ -35,14 +38,16 @@ from deepaccident_devkit.v2x.tracks import scenario_tracks
 def test_points_lie_on_those_of_the_lidar(da: DeepAccident, data: dict[str, Any]) -> None:
     scenario = accident(da)
     origin = recording_of(da, scenario, None).origin
-    for frame, coded in enumerate(data["points"], 1):
-        shown = np.frombuffer(base64.b64decode(coded), dtype="<i2").reshape(-1, 2) / 10 + origin
-        sample = f"{scenario}/ego_vehicle/{frame:03d}"
-        height = da.load_point_cloud(sample, "ego").xyz[:, 2]
-        raised = da.load_point_cloud(sample, "world").xyz[height > np.percentile(height, 5) + 0.3]
-        assert 100 < len(shown) <= 1500
-        apart = np.linalg.norm(shown[::10, None] - raised[None, :, :2], axis=-1).min(axis=1)
-        assert apart.max() < 0.0708  # half a decimetre along both axes
+    most = most_points(30, PAGE_POINTS)
+    assert f"LiDAR clouds are thinned to at most {most} points; those of the road are left out." in data["notes"]
+    for agent, clouds in zip(AGENTS, data["points"], strict=True):
+        for frame, coded in enumerate(clouds, 1):
+            shown = np.frombuffer(base64.b64decode(coded), dtype="<i2").reshape(-1, 3) / 10 + [*origin, 0.0]
+            sample = f"{scenario}/{agent}/{frame:03d}"
+            height = da.load_point_cloud(sample, "ego").xyz[:, 2]
+            raised = da.load_point_cloud(sample, "world").xyz[height > np.percentile(height, 5) + 0.2]
+            assert 100 < len(shown) <= most
+            assert cKDTree(raised).query(shown)[0].max() < 0.0867  # half a decimetre along all axes
 
 
 def test_each_agent_has_six_cameras(da: DeepAccident, data: dict[str, Any]) -> None:
@@ -117,9 +122,10 @@ def test_a_missing_picture_leaves_a_hole(da: DeepAccident, tmp_path: Path) -> No
     for gone in ("other_vehicle/003/Camera_Front", "ego_vehicle/002/lidar01"):
         part.get_sample_data_path(f"{accident(part)}/{gone}").unlink()
     data = data_of(render_replay(part, None, tmp_path / "replay.html"))
-    holes = [[each is None for each in row].index(True) for row in (data["cameras"][2][0]["pictures"], data["points"])]
-    assert holes == [2, 1]
-    assert [sum(each is None for each in row) for row in (data["cameras"][2][0]["pictures"], data["points"])] == [1, 1]
+    shown = data["cameras"][2][0]["pictures"], data["points"][0]
+    assert [[each is None for each in row] for row in shown] == [[at == gone for at in range(6)] for gone in (2, 1)]
+    assert (data["files"], data["sensors"]) == ([35, 34, 34, 35, 35, 35], 35)
+    assert "1 of 30 LiDAR files are missing in the release; unpack the archives of lidar01." in data["notes"]
     assert "1 of 180 camera files are missing in the release; unpack the cameras' archives." in data["notes"]
 
 
