@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -79,7 +78,9 @@ def _visibility(dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES
     return render_visibility_matrix(dataset, token, **choices)
 
 
-def _seconds(context: click.Context, parameter: click.Parameter, value: str) -> list[float]:
+def _seconds(context: click.Context, parameter: click.Parameter, value: str | None) -> list[float] | None:
+    if value is None:
+        return None
     try:
         return [float(word) for word in value.split(",")]
     except ValueError:
@@ -211,10 +212,9 @@ _PICTURES = {
             click.option(
                 "--seconds",
                 callback=_seconds,
-                default=",".join(f"{second:g}" for second in COUNTDOWN),
-                show_default=True,
+                help="Moments to show, in seconds before the impact.  "
+                f"[default: {','.join(f'{second:g}' for second in COUNTDOWN)}]",
                 metavar="S[,S…]",
-                help="Moments to show, in seconds before the impact.",
             ),
             _LAYERS,
         ),
@@ -270,15 +270,17 @@ def _verb(name: str, picture: _Picture) -> click.Command:
     @advanced(
         "--dpi",
         type=click.FloatRange(min=1),
-        help="Pixels per inch; the text grows with it.  [default: 100; paper: 300; slide: 240]",
+        help="Pixels per inch; the text grows with it.  [default: 100; papers: 300; slide: 240]",
     )
     @click.option(
         "--style",
         "styles",
         multiple=True,
         type=WordChoice((*picture.styles, *get_args(StyleName))),
-        help=f"{own}paper: as wide as a column, without token; slide: 16 to 9, with large text.",
+        help=f"{own}for papers as wide as a column or a page, with small text, few panels and no token; paper: one "
+        "panel in a column, several over a page (IEEE); slide: 16 to 9, with large text.",
     )
+    @click.option("--no-title", is_flag=True, help="No title: a caption says it.")
     @frame_range_parameter
     @together(*picture.options)
     def render_view(
@@ -287,6 +289,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         size: tuple[int, int] | None,
         dpi: float | None,
         styles: tuple[str, ...],
+        no_title: bool,
         frames: range | None,
         **options: Any,
     ) -> None:
@@ -306,7 +309,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         if looks:
             choices["style"] = looks[-1]
         places = [cast(StyleName, word) for word in styles if word not in picture.styles]
-        with style(places[-1]) if places else nullcontext():
+        with style(places[-1] if places else None, title=not no_title):
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
                 drawn = picture.drawn(dataset, row, size, dpi or current_style().dpi, choices)
                 save_picture(drawn, path, dpi=dpi)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import figure_or_new, with_light_grid
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
@@ -17,6 +16,7 @@ from deepaccident_devkit.render.styles import (
     OWN_COLOR,
     SERIES_COLORS,
     in_own_settings,
+    text_size,
 )
 from deepaccident_devkit.safety import (
     COALITIONS,
@@ -95,7 +95,7 @@ def render_avoidability(report: AvoidabilityReport, group: str = GROUPS[0], *, f
     for ax in panels[-1]:
         ax.set_xlabel("seconds of warning")
     handles, labels = panels[0, 0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=SMALLEST_TEXT)
+    fig.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=text_size())
     fig.suptitle(f"{group}: braking after a warning, for each of nine ways to brake")
     return fig
 
@@ -143,7 +143,7 @@ def render_lead_times(ledger: LeadTimeLedger, *, fig: Figure | None = None) -> F
     _draw_leads(leads, [ledger.mean_leads[number] for number in order], order)
     _draw_shapley(shapley, ledger.mean_shapley)
     fig.suptitle(f"{len(ledger.accidents)} accidents; observed: {ledger.rule.text}")
-    fig.supxlabel(CAVEAT, fontsize=SMALLEST_TEXT, color=MUTED_COLOR)
+    fig.supxlabel(CAVEAT, fontsize=text_size(), color=MUTED_COLOR)
     return fig
 
 
@@ -154,8 +154,8 @@ def _draw_members(ax: Axes, order: Sequence[int]) -> None:
             there = agent in COALITIONS[number]
             ax.plot(column, row, "o", color=AGENT_COLORS[agent] if there else "none", markersize=_DOT)
     ax.set(xlim=(-0.6, len(AGENTS) - 0.4), ylim=(len(order) - 0.4, -0.6), yticks=[])
-    ax.set_xticks(range(len(AGENTS)), [short_name(agent) for agent in AGENTS], rotation=90, fontsize=SMALLEST_TEXT)
-    ax.set_title("set of agents", fontsize=SMALLEST_TEXT)
+    ax.set_xticks(range(len(AGENTS)), [short_name(agent) for agent in AGENTS], rotation=90, fontsize=text_size())
+    ax.set_title("set of agents", fontsize=text_size())
     ax.spines[:].set_visible(False)
     ax.tick_params(length=0)
 
@@ -164,7 +164,7 @@ def _draw_leads(ax: Axes, means: Sequence[MeanTime], order: Sequence[int]) -> No
     shades = [SERIES_COLORS[::-1][min(len(COALITIONS[number]), len(SERIES_COLORS)) - 1] for number in order]
     _draw_bars(ax, means, shades)
     ax.set(ylim=(len(order) - 0.4, -0.6), yticks=[], xlim=(0, None), xlabel="mean lead time (s)")
-    ax.set_title("both colliders observed before the impact", fontsize=SMALLEST_TEXT)
+    ax.set_title("both colliders observed before the impact", fontsize=text_size())
     with_light_grid(ax, "x")
 
 
@@ -172,9 +172,9 @@ def _draw_shapley(ax: Axes, means: Sequence[MeanTime]) -> None:
     _draw_bars(ax, means, [AGENT_COLORS[agent] for agent in PARTNERS])
     total = sum(mean.mean or 0.0 for mean in means)
     words = [short_name(agent) + _share_text(mean.mean, total) for agent, mean in zip(PARTNERS, means, strict=True)]
-    ax.set_yticks(range(len(words)), words, fontsize=SMALLEST_TEXT)
+    ax.set_yticks(range(len(words)), words, fontsize=text_size())
     ax.set(ylim=(len(words) - 0.4, -0.6), xlim=(0, None), xlabel="mean Shapley value (s)")
-    ax.set_title("what each partner adds to the ego", fontsize=SMALLEST_TEXT)
+    ax.set_title("what each partner adds to the ego", fontsize=text_size())
     with_light_grid(ax, "x")
 
 

@@ -172,11 +172,12 @@ def test_small_actors_have_a_mark_of_their_class() -> None:
     small = boxes(category=["pedestrian", "car", "cyclist"])
     draw_boxes_from_above(small, ax, [RED, RED, CATEGORY_COLORS["cyclist"]])
     draw_boxes_from_above(small, hidden, [RED] * 3, fill=0)
-    marks = {line.get_marker(): (tuple(line.get_xydata()[0]), line.get_markerfacecolor()) for line in ax.lines}
-    first, _, last = map(tuple, small.center[:, :2])
-    assert marks == {"o": (first, RED), "D": (last, CATEGORY_COLORS["cyclist"])}
-    assert min(line.get_markersize() for line in ax.lines) >= 6
-    assert {line.get_markerfacecolor() for line in hidden.lines} == {"none"}
+    marks = ax.collections[-1]
+    corners = [path.vertices[:-1] for path in marks.get_paths()]
+    assert ([*map(len, corners)], [*map(to_hex, marks.get_facecolor())]) == ([16, 4], [RED, CATEGORY_COLORS["cyclist"]])
+    np.testing.assert_allclose([each.mean(axis=0) for each in corners], small.center[[0, 2], :2], atol=1e-9)
+    assert {*np.ptp(np.concatenate(corners[:1]), axis=0).round(6)} == {2.0}  # metres
+    assert len(hidden.collections[-1].get_facecolor()) == 0
 
 
 def test_velocities_in_an_image_lead_to_where_the_centre_would_be() -> None:

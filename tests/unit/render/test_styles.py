@@ -156,7 +156,7 @@ def test_a_figure_keeps_the_style_that_it_was_made_in() -> None:
     with style("paper"):
         paper = curve()
         inside = pixels(paper)
-    assert paper.xaxis.label.get_fontsize() == 9
+    assert paper.xaxis.label.get_fontsize() == 7
     np.testing.assert_array_equal(pixels(paper), inside)
 
 
