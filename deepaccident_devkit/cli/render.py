@@ -34,10 +34,10 @@ from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.samples import render_calibration, render_frame, render_sample
-from deepaccident_devkit.render.styles import StyleName, current_style, style
+from deepaccident_devkit.render.styles import current_style, style
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, check_target, render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
-from deepaccident_devkit.taxonomy import Frame
+from deepaccident_devkit.taxonomy import Frame, StyleName
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import default_scenario
 
@@ -92,6 +92,7 @@ _VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres
 _COORDINATES = advanced(
     "--frame", type=WordChoice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
 )
+_BY_CLASS = click.option("--color-by", type=WordChoice(("class",)), help="Give boxes a hue for each class.")
 _LAYERS = click.option(
     "--layers",
     multiple=True,
@@ -118,7 +119,7 @@ class _Picture:
     of: str
     help: str
     canvas: str = "fig"
-    options: tuple[Any, ...] = (_LAYERS,)
+    options: tuple[Any, ...] = (_BY_CLASS, _LAYERS)
     default: str = "the first accident, or if there is none, the first scenario"
     styles: tuple[str, ...] = ()
 
@@ -138,7 +139,7 @@ _PICTURES = {
         draw=render_sample,
         of="sample",
         help="Render one sample: its six camera images, and its boxes and LiDAR points from above.",
-        options=(_AGENTS, _LAYERS),
+        options=(_AGENTS, _BY_CLASS, _LAYERS),
     ),
     "sample-data": _Picture(
         draw=_sensor_file,
@@ -148,9 +149,9 @@ _PICTURES = {
         options=(
             click.option(
                 "--color-by",
-                type=WordChoice(get_args(ColorBy)),
+                type=WordChoice((*get_args(ColorBy), "class")),
                 help="Show all LiDAR points on a camera image, with colours of this, also points that are hidden "
-                "behind objects.",
+                "behind objects; or class: a hue for each class of boxes.",
             ),
             _LAYERS,
         ),
@@ -164,13 +165,13 @@ _PICTURES = {
         draw=render_instance,
         of="instance",
         help="Render one actor over time: its path, its camera images, its speed, and which agents see it.",
-        options=(_AGENTS, _LAYERS),
+        options=(_AGENTS, _BY_CLASS, _LAYERS),
     ),
     "frame": _Picture(
         draw=render_frame,
         of="frame",
         help="Render one moment of all agents side by side: front cameras, and boxes and LiDAR from above.",
-        options=(_AGENTS, _LAYERS),
+        options=(_AGENTS, _BY_CLASS, _LAYERS),
     ),
     "bev": _Picture(
         draw=_linked(render_bev),
@@ -183,6 +184,7 @@ _PICTURES = {
             advanced("--sweeps", type=click.IntRange(min=1), help="Number of frames of LiDAR points.  [default: 1]"),
             link_parameters(),
             seed_parameter,
+            _BY_CLASS,
             _LAYERS,
         ),
         help="Render one moment from above: boxes, LiDAR points and other layers, of one or several agents.",
@@ -191,6 +193,7 @@ _PICTURES = {
         draw=render_motion_labels,
         of="sample",
         help="Render the motion labels of one sample: one column per frame; instances, centerness, offset and flow.",
+        options=(_LAYERS,),
         styles=get_args(MotionStyle),
     ),
     "visibility": _Picture(
@@ -199,7 +202,7 @@ _PICTURES = {
         help="Render who sees whom: from above, an actor with one dot for each agent that sees it, or as a table.",
         canvas="ax",
         styles=_VISIBILITY_STYLES,
-        options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _LAYERS),
+        options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _BY_CLASS, _LAYERS),
     ),
     "accident": _Picture(
         draw=render_accident,
@@ -245,7 +248,7 @@ _PICTURES = {
         draw=render_calibration,
         of="frame",
         help="Render LiDAR points and boxes of all agents in camera images, to check the calibration.",
-        options=(_AGENTS, _LAYERS),
+        options=(_AGENTS, _BY_CLASS, _LAYERS),
     ),
 }
 
@@ -309,7 +312,8 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         if looks:
             choices["style"] = looks[-1]
         places = [cast(StyleName, word) for word in styles if word not in picture.styles]
-        with style(places[-1] if places else None, title=not no_title):
+        by_class = choices.get("color_by") == "class" and choices.pop("color_by")
+        with style(places[-1] if places else None, title=not no_title, color_by=by_class or "role"):
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
                 drawn = picture.drawn(dataset, row, size, dpi or current_style().dpi, choices)
                 save_picture(drawn, path, dpi=dpi)

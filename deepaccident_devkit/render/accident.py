@@ -22,7 +22,7 @@ from deepaccident_devkit.render.boxes import (
     role_colors,
 )
 from deepaccident_devkit.render.camera import CAMERA_LAYERS, BestView, best_view, crop_about, draw_camera
-from deepaccident_devkit.render.captions import is_there, set_scene_title, set_title
+from deepaccident_devkit.render.captions import is_there, set_scene_title
 from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.figures import Layer, figure_or_new, layers_of, settled, with_light_grid
 from deepaccident_devkit.render.ground import draw_underlay
@@ -146,7 +146,8 @@ def render_accident(
         _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
     for agent, ax in zip(names, axes[:, 0], strict=False):
         _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
-    _write_head("from above", "black", axes[-1, 0], above=across)
+    unit = ",\nspeeds in m/s" if current_style().few else ""
+    _write_head(f"from above{unit}", "black", axes[-1, 0], above=across)
     words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
     set_scene_title(fig, dataset, record["token"], best, below=words)
     return settled(fig)
@@ -296,7 +297,8 @@ def draw_pair_from_above(pair: Pair, index: int, layers: Collection[Layer], ax: 
         f"{pair.tags[actor]} {number_words(float(np.linalg.norm(velocity)))}"
         for actor, velocity in zip(both.actor_id.tolist(), both.velocity, strict=True)
     ]
-    set_title(ax, f"{', '.join(speeds)} m/s", fontsize=text_size())
+    words = "\n".join(speeds) if current_style().few else f"{', '.join(speeds)} m/s"
+    ax.set_title(words, fontsize=text_size())
 
 
 def number_words(value: float) -> str:
@@ -418,8 +420,14 @@ def _panels(fig: Figure, agents: int, moments: int) -> tuple[Any, bool]:
 
 def _agents_with_room(fig: Figure, agents: int, moments: int) -> int:
     """How many of the agents can be shown so large that one can see what happens, or as large as they can be."""
-    widths = {number: _width(fig, number, moments)[0] for number in range(1, agents + 1)}
-    return max(number for number, width in widths.items() if width >= min(_LEAST_WIDTH, 0.9 * max(widths.values())))
+    panels = {number: _width(fig, number, moments) for number in range(1, agents + 1)}
+    least = min(_LEAST_WIDTH, 0.9 * max(width for width, _ in panels.values()))
+    areas = {
+        number: width**2 * (number * 9 / 16 + (81 / 256 if across else 1))
+        for number, (width, across) in panels.items()
+        if width >= least
+    }
+    return max(areas, key=areas.__getitem__) if current_style().few else max(areas)
 
 
 def _best_agents(pair: Pair, agents: Sequence[str], frames: Sequence[int], number: int) -> list[str]:

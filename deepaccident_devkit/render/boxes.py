@@ -16,10 +16,11 @@ from deepaccident_devkit.render.figures import Layer
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     CASING_COLOR,
-    CATEGORY_COLORS,
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
     OWN_COLOR,
+    category_colors,
+    current_style,
     in_own_settings,
     text_size,
 )
@@ -39,7 +40,7 @@ EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4),
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
 _MARK_RADIUS: Final = 1.0
 """Metres from the middle of the mark of a small actor, from above, to its rim: about a car's width in all."""
-_LEAST_RADIUS: Final = 2.6
+_LEAST_RADIUS: Final = 2.0
 """Points: it is at least as large, so that it is found in a view of a whole town."""
 _CORNERS: Final[Mapping[str, int]] = {"o": 16, "D": 4, "^": 3}
 """Corners of the marks, by matplotlib's names."""
@@ -66,7 +67,7 @@ def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
         raise GeometryError(
             f"box: expected a Box, found {type(box).__name__}; the box is first, then the axes: draw_box(box, ax)"
         )
-    chosen = color or CATEGORY_COLORS[box.category]
+    chosen = color or category_colors()[box.category]
     _draw_footprints(box.center[None, :2], box.bottom_corners().T[None, :, :2], ax, [chosen], 0.25, {})
     return ax
 
@@ -245,7 +246,7 @@ def _moving(boxes: Boxes) -> BoolArray:
 
 def _write_ids(places: FloatArray, actor_ids: IntArray, ax: Axes, colors: Sequence[str]) -> None:
     """Write the ids of tracked actors at places (N, 2): first those of hues, which are the accident's actors."""
-    shades = set(CATEGORY_COLORS.values())
+    shades = set(category_colors().values())
     order = sorted(np.flatnonzero(actor_ids != UNTRACKED_ID).tolist(), key=lambda row: colors[row] in shades)
     words = ["own" if actor_ids[row] == OWN_ACTOR_ID else str(actor_ids[row]) for row in order]
     place_chips(ax, zip(words, places[order], strict=True), colors=[colors[row] for row in order])
@@ -341,10 +342,13 @@ def agent_letters(agent: str) -> str:
 
 
 def actor_color(category: str, agent: str | None = None, *, collides: bool = False) -> str:
-    """The colour of an actor's box: red if it collides, else the hue of the agent that it is, else its category's."""
+    """The colour of an actor's box: red if it collides, else the hue of the agent that it is, else its category's.
+
+    If the style says so, it is the category's for agents too.
+    """
     if collides:
         return COLLIDER_COLOR
-    return CATEGORY_COLORS[category] if agent is None else AGENT_COLORS[agent]
+    return category_colors()[category] if agent is None or current_style().by_class else AGENT_COLORS[agent]
 
 
 def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str]:

@@ -16,11 +16,11 @@ from deepaccident_devkit.release.store import listed
 from deepaccident_devkit.render.boxes import in_drawing_order
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
-    CATEGORY_COLORS,
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
     MISSING_COLOR,
     MUTED_COLOR,
+    category_colors,
     current_style,
     text_size,
 )
@@ -202,7 +202,7 @@ def box_handles(colors: Collection[str]) -> list[Artist]:
     from matplotlib.patches import Patch
 
     agents = {short_name(agent): color for agent, color in AGENT_COLORS.items()}
-    meanings = {"colliding pair": COLLIDER_COLOR, **agents, **CATEGORY_COLORS}
+    meanings = {"colliding pair": COLLIDER_COLOR, **agents, **category_colors()}
     return [
         _mark(name, CATEGORY_MARKERS[name], color)
         if name in CATEGORY_MARKERS

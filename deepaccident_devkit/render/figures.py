@@ -182,6 +182,21 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
     return path
 
 
+def report_figure(
+    size: tuple[float, float], *, panels: Literal["one", "several"] = "several", **heights: float
+) -> Figure:
+    """A figure that pyplot does not know, of a size in inches, or its style's; `heights` are as in `figure_or_new`."""
+    return detached_figure(size_in_style(size, panels=panels, heights=heights))
+
+
+def write_report_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None) -> Path:
+    """Write a figure of a report into a PNG file, and for a paper or a slide also into a PDF file beside it."""
+    style = current_style()
+    if style.few:
+        write_figure(figure, path.with_suffix(".pdf"), dpi=style.dpi)
+    return write_figure(figure, path, dpi=style.dpi if style.few else dpi, words=words)
+
+
 def figure_png(figure: Figure, *, dpi: float) -> bytes:
     """A figure from `detached_figure` as the bytes of a PNG file."""
     written = io.BytesIO()

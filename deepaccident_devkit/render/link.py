@@ -134,7 +134,7 @@ def render_link(
     clouds = {"without the link": None, "with the link": link} if "points" in shown and room != "column" else {}
     if current_style().few:
         clouds.pop("without the link", None)
-    wide, panels = (1.0, "several") if clouds else (widening(None), "one")
+    wide, panels = (1.0, "several") if clouds else (widening(None) ** 1.5, "one")  # the legend is below
     size = 5.0 * (1 + len(clouds)) + 0.4, 6.4
     fig = figure_or_new(fig, size, panels=panels, page=0.6 if clouds else 1.28, column=1.28)
     first, *others = fig.subplots(1, 1 + len(clouds), squeeze=False)[0]

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI = 120
+_LEAST_SHARE: Final = 0.1
+"""Percents: a smaller share has no number."""
 _Draw = Callable[[DatasetStatistics, "Figure"], None]
 _WIDTH: Final = 10.7
 """Inches of a page of A4 in landscape."""
@@ -172,7 +174,8 @@ def _title(histogram: Histogram) -> str:
     if not outside:
         return histogram.title
     share = 100 * outside / histogram.total()
-    return f"{histogram.title}\n({share:.2g} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
+    words = f"{share:.1f}" if share >= _LEAST_SHARE else f"less than {_LEAST_SHARE}"
+    return f"{histogram.title}\n({words} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
 
 
 def _counting(axis: Axis) -> None:

@@ -17,7 +17,8 @@ from typing import Any, Final, Literal, TypeVar, cast, get_args
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.support.pages import part
-from deepaccident_devkit.taxonomy import AGENTS, SPLITS
+from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.taxonomy import AGENTS, SPLITS, StyleName
 
 AGENT_COLORS: Mapping[str, str] = dict(
     zip(AGENTS, ("#2b6fe0", "#2fc0cc", "#fa7b40", "#dfb000", "#563083"), strict=True)
@@ -33,6 +34,15 @@ CATEGORY_COLORS: Mapping[str, str] = {
     "motorcycle": "#7b8996",
     "pedestrian": "#1d272f",
 }
+CLASS_COLORS: Mapping[str, str] = {
+    "car": "#40409f",
+    "truck": "#402040",
+    "van": "#9f9fdf",
+    "cyclist": "#40bf9f",
+    "motorcycle": "#ff8000",
+    "pedestrian": "#9f00ff",
+}
+"""Hues of the classes, for pictures that are about them: all eyes tell them from each other and from the pair's red."""
 CATEGORY_MARKERS: Mapping[str, str] = {"cyclist": "D", "motorcycle": "^", "pedestrian": "o"}
 """matplotlib's markers of the classes whose boxes are too small to be found from above."""
 INSTANCE_COLORS = ("#63717e", "#b5c3cf", "#4a5864", "#94a2b0", "#323f4b", "#7b8996")
@@ -96,7 +106,6 @@ Drawing = TypeVar("Drawing", bound=Callable[..., Any])
 _ROOM_FOR_WORDS: Final = 0.5
 """Inches of a picture's height that words take, about: they shrink less than the picture."""
 Drawing = TypeVar("Drawing", bound=Callable[..., Any])
-StyleName = Literal["paper", "cvpr-column", "cvpr-page", "ieee-column", "ieee-page", "slide"]
 _FONTS: Final = {"pdf.fonttype": 42, "ps.fonttype": 42}
 """Type 42: the letters of a PDF file stay letters, as publishers ask."""
 _applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
@@ -121,6 +130,7 @@ class _Style:
         room: what a picture with several panels has room for: all of them, a page's width, a column or a slide.
         tokens: whether titles have tokens.
         titled: whether pictures have a title.
+        by_class: whether boxes have the hues of their classes, all but the pair's.
         rc: matplotlib's settings.
     """
 
@@ -132,6 +142,7 @@ class _Style:
     room: Literal["all", "page", "column", "slide"] = "all"
     tokens: bool = True
     titled: bool = True
+    by_class: bool = False
     rc: Mapping[str, Any]
 
     @property
@@ -199,7 +210,9 @@ def in_own_settings(function: Drawing) -> Drawing:
 
 
 @contextmanager
-def style(name: StyleName | None = None, *, title: bool = True) -> Iterator[None]:
+def style(
+    name: StyleName | None = None, *, title: bool = True, color_by: Literal["role", "class"] = "role"
+) -> Iterator[None]:
     """In a `with` statement: new pictures have the size, panels and letters that a paper or a slide needs.
 
     Args:
@@ -208,15 +221,18 @@ def style(name: StyleName | None = None, *, title: bool = True) -> Iterator[None
             page. `slide`: 16 to 9, with large letters, 1920 × 1080 pixels. None: as in a notebook. In papers and on
             slides views of many panels show fewer, and nothing has tokens.
         title: whether pictures have a title; a paper's caption may say it.
+        color_by: what the colours of boxes mean: the `role` in the accident, or the `class`, with a hue for each; the
+            pair is red in both.
 
     Raises:
-        ChoiceError: no such style.
+        ChoiceError: no such style or way to colour.
     """
     from matplotlib import rc_context
 
     if name is not None and name not in _STYLES:
         raise ChoiceError(f"style: expected one of {', '.join(get_args(StyleName))}, found {name!r}")
-    chosen = replace(_NOTEBOOK if name is None else _STYLES[name], titled=title)
+    by_class = choice("color_by", color_by, ("role", "class")) == "class"
+    chosen = replace(_NOTEBOOK if name is None else _STYLES[name], titled=title, by_class=by_class)
     token = _current.set(chosen)
     try:
         with rc_context(cast("Any", {**chosen.rc, "savefig.dpi": chosen.dpi})):
@@ -228,6 +244,11 @@ def style(name: StyleName | None = None, *, title: bool = True) -> Iterator[None
 def current_style() -> _Style:
     """The style of pictures that are made now."""
     return _current.get()
+
+
+def category_colors() -> Mapping[str, str]:
+    """The colours of classes in pictures that are made now."""
+    return CLASS_COLORS if _current.get().by_class else CATEGORY_COLORS
 
 
 def text_size() -> float:

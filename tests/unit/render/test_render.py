@@ -17,6 +17,7 @@ from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.accident import draw_countdown
 from deepaccident_devkit.render.outcomes import draw_outcome_in_camera, render_outcome_in_cameras, sample_verdict
+from deepaccident_devkit.render.styles import current_style
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link
 
@@ -34,8 +35,12 @@ def ego(scenario: Any) -> str:
     return f"{scenario['token']}/ego_vehicle/{scenario['num_frames'] - 1:03d}"
 
 
+def moments() -> tuple[float, ...]:
+    return (0.2, 0.0) if current_style().room == "column" else (0.2, 0.1, 0.0)
+
+
 VIEWS: dict[str, Callable[[DeepAccident, Any], Any]] = {
-    "accident": lambda da, scenario: da.render_accident(scenario, seconds=(0.2, 0.0), layers=DRAWN),
+    "accident": lambda da, scenario: da.render_accident(scenario, seconds=moments(), layers=DRAWN),
     "annotation": lambda da, scenario: da.render_annotation(f"{ego(scenario)}/1"),
     "calibration": lambda da, scenario: da.render_calibration(scenario["last_frame_token"], layers=["boxes"]),
     "frame": lambda da, scenario: da.render_frame(scenario["last_frame_token"], layers=["boxes"]),

@@ -192,6 +192,7 @@ def test_the_measures_agree_with_known_values(script: ModuleType) -> None:
         ("verdicts", 29),
         ("classes of vehicles", 18),
         ("all classes", 9),
+        ("classes by choice, and the pair", 33),
         ("series", 16),
         ("splits", 17),
     ],
