@@ -74,6 +74,10 @@ _WIDTH: Final = 3.3
 """Width of a panel in inches."""
 _LEAST_WIDTH: Final = 1.6
 """Inches of a camera's panel below which agents are left out."""
+_ROW_WORDS: Final = 0.03
+"""Inches of words above a row, for letters of one point."""
+_ENOUGH: Final = 0.6
+"""Of a small picture that panels should cover, by the estimate of `_width`."""
 _TITLE: Final = 1.0
 """Inches of the height that titles take, about."""
 _MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
@@ -125,8 +129,8 @@ def render_accident(
     contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
     record = dataset.get("scenario", scenario)
     cut = _cut_words(contact, record["num_frames"])
-    column = current_style().room == "column"
-    moments = _moments(seconds or (_IN_A_COLUMN if column else COUNTDOWN), record["num_frames"])
+    usual = _IN_A_COLUMN if current_style().room == "column" else COUNTDOWN
+    moments = _moments(seconds or usual, record["num_frames"])
     there = agents_of(dataset, scenario)
     first = sample_token(record["token"], there[0], record["num_frames"])
     names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
@@ -407,7 +411,8 @@ def _width(fig: Figure, agents: int, moments: int) -> tuple[float, bool]:
     """Inches of a panel of the first row or column, about, and whether rows are columns because it is then wider."""
     width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi - _TITLE
     down = min(width / moments, height / (agents * 9 / 16 + 1))
-    across = (16 / 9 if agents else 1) * min(height / moments, width / (agents * 16 / 9 + 1))
+    row = height / moments - _ROW_WORDS * text_size()
+    across = (16 / 9 if agents else 1) * min(row, width / (agents * 16 / 9 + 1))
     return max(down, across), across > down
 
 
@@ -423,11 +428,12 @@ def _agents_with_room(fig: Figure, agents: int, moments: int) -> int:
     panels = {number: _width(fig, number, moments) for number in range(1, agents + 1)}
     least = min(_LEAST_WIDTH, 0.9 * max(width for width, _ in panels.values()))
     areas = {
-        number: width**2 * (number * 9 / 16 + (81 / 256 if across else 1))
+        number: moments * width**2 * (number * 9 / 16 + (81 / 256 if across else 1))
         for number, (width, across) in panels.items()
         if width >= least
     }
-    return max(areas, key=areas.__getitem__) if current_style().few else max(areas)
+    enough = _ENOUGH * fig.bbox.width * fig.bbox.height / fig.dpi**2 if current_style().few else 0.0
+    return max((number for number, area in areas.items() if area > enough), default=max(areas, key=areas.__getitem__))
 
 
 def _best_agents(pair: Pair, agents: Sequence[str], frames: Sequence[int], number: int) -> list[str]:

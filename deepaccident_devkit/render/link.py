@@ -126,7 +126,7 @@ def render_link(
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
     """
     shown = layers_of(layers, _SHOWN, _LAYERS)
-    record, room = dataset.get("sample", sample), current_style().room
+    record, room = dataset.sample[dataset.getind("sample", sample)], current_style().room
     if view_range is not None:
         check_view_range(view_range)
     shared = shared_boxes(dataset, record, link, agents)
@@ -134,9 +134,9 @@ def render_link(
     clouds = {"without the link": None, "with the link": link} if "points" in shown and room != "column" else {}
     if current_style().few:
         clouds.pop("without the link", None)
-    wide, panels = (1.0, "several") if clouds else (widening(None) ** 1.5, "one")  # the legend is below
+    wide = 1.0 if clouds else widening(None) ** 1.5  # the legend is below
     size = 5.0 * (1 + len(clouds)) + 0.4, 6.4
-    fig = figure_or_new(fig, size, panels=panels, page=0.6 if clouds else 1.28, column=1.28)
+    fig = figure_or_new(fig, size, panels="several" if clouds else "one", page=0.6 if clouds else 1.28, column=1.28)
     first, *others = fig.subplots(1, 1 + len(clouds), squeeze=False)[0]
     first.set(xlim=(-wide * reach, wide * reach), ylim=(-reach, reach), aspect="equal")
     x_words, y_words = axis_words("ego")

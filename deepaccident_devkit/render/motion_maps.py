@@ -348,7 +348,7 @@ def instance_handles(maps: MotionMaps) -> list[Artist]:
 
     drawn = {to_hex(color) for color in maps.colors}
     meanings = {"colliding pair": COLLIDER_COLOR} | {short_name(name): hue for name, hue in AGENT_COLORS.items()}
-    handles = [Patch(label=name, facecolor=color) for name, color in meanings.items() if color in drawn]
+    handles: list[Artist] = [Patch(label=name, facecolor=color) for name, color in meanings.items() if color in drawn]
     if maps.own > 0:
         handles.append(Patch(label="own box", facecolor="none", edgecolor=OWN_COLOR, linewidth=_OWN_EDGE))
     return handles

@@ -103,7 +103,7 @@ def render_sample(
     fig = figure_or_new(fig, (16, 5.6), page=0.42, column=1.6)
     width, height = fig.bbox.size
     if height > width:
-        mosaic = [*map(list, CAMERA_GRID), ["bev"] * 3]
+        mosaic: list[Any] = [*map(list, CAMERA_GRID), ["bev"] * 3]
         axes = fig.subplot_mosaic(mosaic, height_ratios=(1, 1, 16 / 3))
     else:
         grid, ratios = (CAMERA_GRID, (4, 4, 4, 4.5)) if width > _WIDE * height else (_TALL_GRID, (4, 4, 8))

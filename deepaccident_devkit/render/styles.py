@@ -105,7 +105,6 @@ COLORS: Final = f"""
 Drawing = TypeVar("Drawing", bound=Callable[..., Any])
 _ROOM_FOR_WORDS: Final = 0.5
 """Inches of a picture's height that words take, about: they shrink less than the picture."""
-Drawing = TypeVar("Drawing", bound=Callable[..., Any])
 _FONTS: Final = {"pdf.fonttype": 42, "ps.fonttype": 42}
 """Type 42: the letters of a PDF file stay letters, as publishers ask."""
 _applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
