@@ -74,6 +74,8 @@ _WIDTH: Final = 3.3
 """Width of a panel in inches."""
 _LEAST_WIDTH: Final = 1.6
 """Inches of a camera's panel below which agents are left out."""
+_SHORT: Final = 16
+"""Letters that a line above a panel of a small picture has room for."""
 _ROW_WORDS: Final = 0.03
 """Inches of words above a row, for letters of one point."""
 _ENOUGH: Final = 0.6
@@ -301,8 +303,8 @@ def draw_pair_from_above(pair: Pair, index: int, layers: Collection[Layer], ax: 
         f"{pair.tags[actor]} {number_words(float(np.linalg.norm(velocity)))}"
         for actor, velocity in zip(both.actor_id.tolist(), both.velocity, strict=True)
     ]
-    words = "\n".join(speeds) if current_style().few else f"{', '.join(speeds)} m/s"
-    ax.set_title(words, fontsize=text_size())
+    words = ", ".join(speeds) + ("" if current_style().few else " m/s")
+    ax.set_title("\n".join(speeds) if current_style().few and len(words) > _SHORT else words, fontsize=text_size())
 
 
 def number_words(value: float) -> str:

@@ -94,7 +94,7 @@ def render_avoidability(report: AvoidabilityReport, group: str = GROUPS[0], *, f
     panels = fig.subplots(len(rows), len(shares), squeeze=False, sharex="col", sharey=True)
     for row, (label, values_of) in enumerate(rows):
         drawn = [_draw(ax, each, values_of(each)) for ax, each in zip(panels[row], shares, strict=True)]
-        highest = 1.0 if row == 0 else max(1.0, *(float(np.nanmax(image.get_array())) for image in drawn))
+        highest = 1.0 if row == 0 else max(1.0, *(float(np.nanmax(np.asarray(image.get_array()))) for image in drawn))
         for image in drawn:
             image.set(clim=(0, highest), cmap=_BETTER if row == 0 else f"{_BETTER}_r")
         fig.colorbar(drawn[-1], ax=list(panels[row]), label=label, pad=0.01)
