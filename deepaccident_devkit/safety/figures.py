@@ -157,11 +157,8 @@ def _best_sets(means: Sequence[MeanTime]) -> list[int]:
     sizes = range(3, 1 + len(AGENTS))
     of_size = [[number for number, names in enumerate(COALITIONS) if len(names) == size] for size in sizes]
     best = [max(numbers, key=lambda number: means[number].mean or 0.0) for numbers in of_size]
-    return [*sorted((each for each, names in enumerate(COALITIONS) if len(names) < 3), key=_size_first), *best]
-
-
-def _size_first(number: int) -> tuple[int, int]:
-    return len(COALITIONS[number]), number
+    small = [(len(names), number) for number, names in enumerate(COALITIONS) if len(names) < 3]
+    return [*(number for _, number in sorted(small)), *best]
 
 
 def _draw_members(ax: Axes, order: Sequence[int]) -> None:

@@ -235,7 +235,7 @@ def figures_of(report: SafetyReport) -> Iterator[_Drawn]:
     if report.ledger.accidents:
         yield _Drawn(
             name="lead_times",
-            caption="Mean lead times of all sets of agents with the ego, and what each partner adds.",
+            caption="Mean lead times of sets of agents with the ego, and what each partner adds.",
             alt="Mean lead times by set of agents and Shapley values of the partners; the tables have the numbers.",
             draw=lambda: render_lead_times(report.ledger, fig=report_figure(LEAD_TIME_SIZE, column=COLUMN_HEIGHT)),
         )
