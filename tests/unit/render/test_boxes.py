@@ -27,7 +27,7 @@ from deepaccident_devkit.render.boxes import (
     role_colors,
     segments_in_image,
 )
-from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, CLASS_COLORS, COLLIDER_COLOR, style
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperative_boxes
 
@@ -211,6 +211,10 @@ def test_the_pair_is_red_other_recorders_have_hues_and_the_rest_shades(da: DeepA
     actors = [*zip(boxes.actor_id.tolist(), boxes.category_names, strict=True)]
     assert role_colors(da, approach, boxes) == [hues.get(actor, CATEGORY_COLORS[name]) for actor, name in actors]
     assert len(hues.keys() & {actor for actor, _ in actors}) > 2
+    with style(color_by="class"):
+        by_class = role_colors(da, approach, boxes)
+    red = {actor: color for actor, color in hues.items() if color == COLLIDER_COLOR}
+    assert by_class == [red.get(actor, CLASS_COLORS[name]) for actor, name in actors]
 
 
 def test_an_agent_has_its_part_s_colour_in_its_own_label_and_in_the_union(da: DeepAccident, approach: str) -> None:

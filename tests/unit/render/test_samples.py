@@ -76,7 +76,7 @@ def test_the_order_of_agents_is_fixed_and_who_is_left_out_leaves_no_hole(da: Dee
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("size", "wide"), [((3.25, 5), 1.3), ((7.16, 4.4), 1.3), ((12.8, 7.2), 1.0)])
+@pytest.mark.parametrize(("size", "wide"), [((3.25, 5), 1.1), ((7.16, 4.4), 1.3), ((12.8, 7.2), 1.0)])
 def test_cameras_are_above_the_shared_view_in_a_high_figure(
     da: DeepAccident, frame: str, size: tuple[float, float], wide: float
 ) -> None:
