@@ -42,7 +42,7 @@ _SHOWN: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
 }
 _POSSIBLE: Final[dict[MotionStyle, tuple[Layer, ...]]] = {"maps": _MAP_LAYERS, "trail": TRAIL_LAYERS}
 _FEW_MAPS: Final = ("instance", "flow")
-_FEW_FRAMES: Final = {"column": 2, "page": 3, "slide": 3}
+_FEW_FRAMES: Final = {"column": 1, "page": 3, "slide": 3}
 """How many frames maps show in a small picture."""
 _KEY_WIDTH: Final = 0.5
 """Width of the column that explains the colours, in widths of a panel."""
@@ -61,7 +61,7 @@ def render_motion_labels(
 ) -> Figure:
     """Render a sample's motion labels: one column for each frame, with instances, centerness, offset and flow.
 
-    In a paper or on a slide, maps are the instances and the flow of at most three of the recorded frames.
+    In a paper or on a slide, maps are the instances and the flow of at most three of the frames that have a flow.
 
     Args:
         dataset: the release.
@@ -246,11 +246,12 @@ def _draw_maps(maps: MotionMaps, shown: frozenset[Layer], fig: Figure | None) ->
     if current_style().few:
         names = tuple(name for name in names if name in _FEW_MAPS)
         there = np.flatnonzero(maps.valid)
+        there = there[: max(1, len(there) - 1)]  # the last has no flow
         most = _FEW_FRAMES[current_style().room]
         frames = np.unique(there[np.linspace(0, len(there) - 1, most).round().astype(int)]).tolist()
     columns, rows = len(frames), len(names)
     fig = figure_or_new(
-        fig, (2.8 * (columns + _KEY_WIDTH) + 0.6, 2.8 * rows + 1.3), page=0.3 * rows + 0.06, column=0.4 * rows + 0.12
+        fig, (2.8 * (columns + _KEY_WIDTH) + 0.6, 2.8 * rows + 1.3), page=0.3 * rows + 0.06, column=0.57 * rows + 0.1
     )
     axes = fig.subplots(rows, columns + 1, squeeze=False, width_ratios=(*[1.0] * columns, _KEY_WIDTH))
     panels = axes[:, :columns]
