@@ -152,8 +152,9 @@ def render_accident(
         _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
     for agent, ax in zip(names, axes[:, 0], strict=False):
         _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
-    unit = ",\nspeeds in m/s" if current_style().few else ""
-    _write_head(f"from above{unit}", "black", axes[-1, 0], above=across)
+    _write_head(
+        "from above,\nspeeds in m/s" if current_style().few else "from above", "black", axes[-1, 0], above=across
+    )
     words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
     set_scene_title(fig, dataset, record["token"], best, below=words)
     return settled(fig)
