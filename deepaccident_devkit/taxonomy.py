@@ -10,6 +10,7 @@ Frame = Literal["world", "ego", "lidar"]
 OnError = Literal["raise", "skip"]
 Layout = Literal["A", "B"]
 ModelPreset = Literal["released", "tiny"]
+StyleName = Literal["paper", "cvpr-column", "cvpr-page", "ieee-column", "ieee-page", "slide"]
 ModelFusion = Literal["mean", "max", "released", "disconet", "cobevt", "v2xvit"]
 """Of `deepaccident_devkit.model`; here, so that they can be listed without torch."""
 

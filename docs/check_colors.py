@@ -33,6 +33,7 @@ GROUPS = {
     "verdicts": tuple(styles.OUTCOME_COLORS.values()),
     "classes of vehicles": tuple(styles.CATEGORY_COLORS[name] for name in ("car", "truck", "van")),
     "all classes": tuple(styles.CATEGORY_COLORS.values()),
+    "classes by choice, and the pair": (*styles.CLASS_COLORS.values(), styles.COLLIDER_COLOR),
     "series": styles.SERIES_COLORS,
     "splits": tuple(styles.SPLIT_COLORS.values()),
 }

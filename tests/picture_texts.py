@@ -6,8 +6,8 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import laid_out
+from deepaccident_devkit.render.styles import text_size
 
 TOUCHING = 1.5
 """Pixels that count as nothing: letters do not fill the boxes of their texts."""
@@ -31,11 +31,17 @@ def text_faults(figure: Any) -> list[str]:
     faults += [
         f"{text.get_text()!r}: {text.get_fontsize():.1f} points"
         for text, _ in boxes
-        if text.get_fontsize() < SMALLEST_TEXT - 1e-6
+        if text.get_fontsize() < text_size() - 1e-6
     ]
     pairs = combinations(boxes, 2)
     faults += [f"{a.get_text()!r} over {b.get_text()!r}" for (a, one), (b, other) in pairs if one.fully_overlaps(other)]
     return faults
+
+
+def panels_share(figure: Any) -> float:
+    """Which share of a figure's canvas its panels are: axes that are switched off only hold words."""
+    areas = [ax.get_window_extent() for ax in figure.axes if ax.axison]
+    return float(sum(area.width * area.height for area in areas) / (figure.bbox.width * figure.bbox.height))
 
 
 def _drawn(figure: Any) -> list[Any]:

@@ -40,7 +40,9 @@ def accident(da: DeepAccident) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("verb", [*VIEWS, "sample-data --color-by depth", "visibility --style table"])
+@pytest.mark.parametrize(
+    "verb", [*VIEWS, "sample-data --color-by depth", "visibility --style table", "bev --color-by class"]
+)
 def test_every_view_draws_the_first_accident_when_no_token_is_given(
     da: DeepAccident, accident: str, tmp_path: Path, verb: str
 ) -> None:
@@ -58,6 +60,8 @@ def test_size_and_fonts_are_the_views_own_or_of_a_style(da: DeepAccident, tmp_pa
     run("sample-data", da.dataroot, "--out", tmp_path / "paper.png", "--style", "paper")
     own, paper = (pixels(tmp_path / f"{name}.png").shape for name in ("own", "paper"))
     assert (own[:2], paper[1]) == ((540, 800), 1050)  # 3.5 inches of 300 pixels
+    run("labels", da.dataroot, "--out", tmp_path / "own.pdf", "--no-title")
+    assert b"/CIDFontType2" in (tmp_path / "own.pdf").read_bytes()  # Type 42
     run("labels", da.dataroot, "--out", tmp_path / "a.pdf", "--style", "trail", "--style", "slide")
     pdf = (tmp_path / "a.pdf").read_bytes()
     assert (b"/CIDFontType2" in pdf, b"/MediaBox [ 0 0 576 324 ]" in pdf, plt.get_fignums()) == (True, True, [])

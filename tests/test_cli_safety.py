@@ -38,7 +38,7 @@ def test_some_scenarios_and_as_many_replays(da_motion: DeepAccident, tmp_path: P
 
 
 def test_text_and_files(da_motion: DeepAccident, tmp_path: Path) -> None:
-    text = run("avoidability", da_motion.dataroot, "--workers", 1, "--out", tmp_path).stdout
+    text = run("avoidability", da_motion.dataroot, "--workers", 1, "--style", "ieee-page", "--out", tmp_path).stdout
     report = avoidability_report(da_motion, workers=1)
     assert report.to_text() in text
     group = next(line for line in text.splitlines() if line.endswith("need")).split(":")[0].replace("-", "_")
@@ -49,10 +49,12 @@ def test_text_and_files(da_motion: DeepAccident, tmp_path: Path) -> None:
         "avoidability_outcome_shares.csv",
         "avoidability_secondary_contacts.csv",
         "avoidability_self_check.csv",
+        f"avoidability_{group}.pdf",
         f"avoidability_{group}.png",
     ]
     assert (tmp_path / "avoidability.json").read_text(encoding="utf-8") == report.to_json()
     assert "written: 7 files" in text
+    assert b"/MediaBox [ 0 0 515" in (tmp_path / f"avoidability_{group}.pdf").read_bytes()  # 7.16 inches of 72 points
 
 
 def test_json_of_chosen_scenarios(da_motion: DeepAccident, tmp_path: Path) -> None:

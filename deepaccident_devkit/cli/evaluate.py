@@ -17,6 +17,7 @@ from deepaccident_devkit.cli.options import (
     PATH,
     engine_of,
     engine_parameters,
+    figure_style_parameter,
     json_parameter,
     on_error_parameter,
     refuse_unused,
@@ -178,6 +179,7 @@ def _task_verb(task: TaskName) -> click.Command:
     )
     @click.option("--out", type=PATH, help="Folder to write all numbers, figures and a report into.")
     @click.option("--overwrite", is_flag=True, help="Replace an evaluation that is already in --out.")
+    @figure_style_parameter
     @advanced("--include-results", is_flag=True, help="Copy the results into --out, so that others can verify them.")
     @json_parameter
     def evaluated(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
@@ -250,7 +252,7 @@ def _written(
 def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
     """End with a usage error if an option was given that changes nothing in this evaluation, or lacks another."""
     if options["out"] is None:
-        refuse_unused("without --out", "overwrite", "include_results")
+        refuse_unused("without --out", "overwrite", "include_results", "style")
     if options.get("threshold_from") is None:
         refuse_unused("without --threshold-from", "threshold_by")
     elif "threshold" in setup.switches:

@@ -10,6 +10,7 @@ from deepaccident_devkit.cli.options import (
     DATAROOT,
     PATH,
     engine_parameters,
+    figure_style_parameter,
     index_dir_parameter,
     json_parameter,
     on_error_parameter,
@@ -24,6 +25,7 @@ from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.render.evaluation import render_comparison
 from deepaccident_devkit.render.figures import PICTURE_SUFFIXES, save_picture
+from deepaccident_devkit.render.styles import current_style
 from deepaccident_devkit.reports import write_csv
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.tables import place_outside
@@ -83,6 +85,7 @@ def verify(
     help="File to write all numbers into (.csv or .json), or a figure of the differences "
     f"({', '.join(PICTURE_SUFFIXES)}); you can repeat this option.",
 )
+@figure_style_parameter
 @json_parameter
 def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...], as_json: bool) -> None:
     """Compare the evaluations in the folders A and B, and test which differences are statistically significant."""
@@ -97,7 +100,7 @@ def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...
         elif path.suffix.lower() == ".json":
             write_bytes(path, as_text.encode())
         else:
-            save_picture(render_comparison(comparison), path, dpi=_DPI)
+            save_picture(render_comparison(comparison), path, dpi=None if current_style().few else _DPI)
     click.echo(as_text if as_json else comparison.to_text())
     for path in out:
         click.echo(f"written: {path}", err=as_json)

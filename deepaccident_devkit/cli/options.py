@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import click
 from click.core import ParameterSource
@@ -13,7 +13,7 @@ from click.core import ParameterSource
 from deepaccident_devkit.cli.verbs import Function, WordChoice, advanced, together
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.taxonomy import VERSIONS
+from deepaccident_devkit.taxonomy import VERSIONS, StyleName
 
 _WORDS = {"yes": "true", "no": "false"}
 
@@ -54,6 +54,23 @@ reader_parameters = together(
     dataroot_argument, version_parameter, workers_parameter, index_dir_parameter, on_error_parameter
 )
 """For a verb that runs in one process: DATAROOT, --version, --index-dir, --workers and --on-error."""
+
+
+def _enter_style(context: click.Context, _: click.Parameter, value: str | None) -> None:
+    """Make all figures of the command in a style."""
+    from deepaccident_devkit.render.styles import style
+
+    if value is not None:
+        context.with_resource(style(cast("Any", value)))
+
+
+figure_style_parameter = click.option(
+    "--style",
+    type=WordChoice(get_args(StyleName)),
+    expose_value=False,
+    callback=_enter_style,
+    help="Make the figures as wide as a paper's column or page, or for a slide, and write them as PDF files, too.",
+)
 where_parameter = click.option(
     "--where",
     multiple=True,

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -35,10 +34,10 @@ from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.samples import render_calibration, render_frame, render_sample
-from deepaccident_devkit.render.styles import StyleName, current_style, style
+from deepaccident_devkit.render.styles import current_style, style
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, check_target, render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
-from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR, Frame
+from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR, Frame, StyleName
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import default_scenario
 
@@ -80,7 +79,9 @@ def _visibility(dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES
     return render_visibility_matrix(dataset, token, **choices)
 
 
-def _seconds(context: click.Context, parameter: click.Parameter, value: str) -> list[float]:
+def _seconds(context: click.Context, parameter: click.Parameter, value: str | None) -> list[float] | None:
+    if value is None:
+        return None
     try:
         return [float(word) for word in value.split(",")]
     except ValueError:
@@ -92,6 +93,7 @@ _VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres
 _COORDINATES = advanced(
     "--frame", type=WordChoice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
 )
+_BY_CLASS = click.option("--color-by", type=WordChoice(("class",)), help="Give boxes a hue for each class.")
 _LAYERS = click.option(
     "--layers",
     multiple=True,
@@ -119,7 +121,7 @@ class _Picture:
     of: str
     help: str
     canvas: str = "fig"
-    options: tuple[Any, ...] = (_LAYERS,)
+    options: tuple[Any, ...] = (_BY_CLASS, _LAYERS)
     default: str = "the first accident, or if there is none, the first scenario"
     styles: tuple[str, ...] = ()
     channels: tuple[str, ...] = (*CAMERAS, LIDAR)
@@ -140,7 +142,7 @@ _PICTURES = {
         draw=render_sample,
         of="sample",
         help="Render one sample: its six camera images, and its boxes and LiDAR points from above.",
-        options=(_AGENTS, _LAYERS),
+        options=(_AGENTS, _BY_CLASS, _LAYERS),
     ),
     "sample-data": _Picture(
         draw=_sensor_file,
@@ -150,9 +152,9 @@ _PICTURES = {
         options=(
             click.option(
                 "--color-by",
-                type=WordChoice(get_args(ColorBy)),
+                type=WordChoice((*get_args(ColorBy), "class")),
                 help="Show all LiDAR points on a camera image, with colours of this, also points that are hidden "
-                "behind objects.",
+                "behind objects; or class: a hue for each class of boxes.",
             ),
             _LAYERS,
         ),
@@ -166,13 +168,13 @@ _PICTURES = {
         draw=render_instance,
         of="instance",
         help="Render one actor over time: its path, its camera images, its speed, and which agents see it.",
-        options=(_AGENTS, _LAYERS),
+        options=(_AGENTS, _BY_CLASS, _LAYERS),
     ),
     "frame": _Picture(
         draw=render_frame,
         of="frame",
         help="Render one moment of all agents side by side: front cameras, and boxes and LiDAR from above.",
-        options=(_AGENTS, _LAYERS),
+        options=(_AGENTS, _BY_CLASS, _LAYERS),
         channels=_FRONT_AND_POINTS,
     ),
     "bev": _Picture(
@@ -187,6 +189,7 @@ _PICTURES = {
             advanced("--sweeps", type=click.IntRange(min=1), help="Number of frames of LiDAR points.  [default: 1]"),
             link_parameters(),
             seed_parameter,
+            _BY_CLASS,
             _LAYERS,
         ),
         help="Render one moment from above: boxes, LiDAR points and other layers, of one or several agents.",
@@ -195,6 +198,7 @@ _PICTURES = {
         draw=render_motion_labels,
         of="sample",
         help="Render the motion labels of one sample: one column per frame; instances, centerness, offset and flow.",
+        options=(_LAYERS,),
         styles=get_args(MotionStyle),
         channels=(),
     ),
@@ -205,7 +209,7 @@ _PICTURES = {
         canvas="ax",
         styles=_VISIBILITY_STYLES,
         channels=(),
-        options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _LAYERS),
+        options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _BY_CLASS, _LAYERS),
     ),
     "accident": _Picture(
         draw=render_accident,
@@ -218,10 +222,9 @@ _PICTURES = {
             click.option(
                 "--seconds",
                 callback=_seconds,
-                default=",".join(f"{second:g}" for second in COUNTDOWN),
-                show_default=True,
+                help="Moments to show, in seconds before the impact.  "
+                f"[default: {','.join(f'{second:g}' for second in COUNTDOWN)}]",
                 metavar="S[,S…]",
-                help="Moments to show, in seconds before the impact.",
             ),
             _LAYERS,
         ),
@@ -253,7 +256,7 @@ _PICTURES = {
         draw=render_calibration,
         of="frame",
         help="Render LiDAR points and boxes of all agents in camera images, to check the calibration.",
-        options=(_AGENTS, _LAYERS),
+        options=(_AGENTS, _BY_CLASS, _LAYERS),
         channels=_FRONT_AND_POINTS,
     ),
 }
@@ -280,15 +283,17 @@ def _verb(name: str, picture: _Picture) -> click.Command:
     @advanced(
         "--dpi",
         type=click.FloatRange(min=1),
-        help="Pixels per inch; the text grows with it.  [default: 100; paper: 300; slide: 240]",
+        help="Pixels per inch; the text grows with it.  [default: 100; papers: 300; slide: 240]",
     )
     @click.option(
         "--style",
         "styles",
         multiple=True,
         type=WordChoice((*picture.styles, *get_args(StyleName))),
-        help=f"{own}paper: as wide as a column, without token; slide: 16 to 9, with large text.",
+        help=f"{own}for papers as wide as a column or a page, with small text, few panels and no token; paper: one "
+        "panel in a column, several over a page (IEEE); slide: 16 to 9, with large text.",
     )
+    @click.option("--no-title", is_flag=True, help="No title: a caption says it.")
     @frame_range_parameter
     @together(*picture.options)
     def render_view(
@@ -297,6 +302,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         size: tuple[int, int] | None,
         dpi: float | None,
         styles: tuple[str, ...],
+        no_title: bool,
         frames: range | None,
         **options: Any,
     ) -> None:
@@ -316,7 +322,8 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         if looks:
             choices["style"] = looks[-1]
         places = [cast(StyleName, word) for word in styles if word not in picture.styles]
-        with style(places[-1]) if places else nullcontext():
+        by_class = choices.get("color_by") == "class" and choices.pop("color_by")
+        with style(places[-1] if places else None, title=not no_title, color_by=by_class or "role"):
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
                 drawn = picture.drawn(dataset, row, size, dpi or current_style().dpi, choices)
                 save_picture(drawn, path, dpi=dpi)

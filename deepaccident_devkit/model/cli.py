@@ -6,7 +6,14 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.agents import cooperating_parameter, names_or_configuration
-from deepaccident_devkit.cli.options import PATH, model_parameters, reader_parameters, release_of, use_threads_sparingly
+from deepaccident_devkit.cli.options import (
+    PATH,
+    figure_style_parameter,
+    model_parameters,
+    reader_parameters,
+    release_of,
+    use_threads_sparingly,
+)
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.taxonomy import ModelFusion, ModelPreset
@@ -63,6 +70,7 @@ Examples:
 )
 @model_parameters
 @advanced("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
+@figure_style_parameter
 @click.option("--out", required=True, type=PATH, metavar="RUN", help="Folder of weights, log and curves.")
 def train(weights: Path | None, **options: Any) -> None:
     """Train the model on the release in DATAROOT.

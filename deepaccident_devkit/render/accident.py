@@ -23,10 +23,18 @@ from deepaccident_devkit.render.boxes import (
 )
 from deepaccident_devkit.render.camera import CAMERA_LAYERS, BestView, best_view, crop_about, draw_camera
 from deepaccident_devkit.render.captions import is_there, set_scene_title
-from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
+from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.figures import Layer, figure_or_new, layers_of, settled, with_light_grid
 from deepaccident_devkit.render.ground import draw_underlay
-from deepaccident_devkit.render.styles import AGENT_COLORS, CASING_COLOR, COLLIDER_COLOR, GRID_COLOR, in_own_settings
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    CASING_COLOR,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    current_style,
+    in_own_settings,
+    text_size,
+)
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, FRAME_PERIOD, short_name
@@ -60,11 +68,18 @@ _FREE: Final = 22.0
 _HIDDEN: Final = (0, (3, 2))
 COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
 """Seconds before the impact."""
+_IN_A_COLUMN: Final = (1.0, 0.0)
 _SHOWN: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
 _WIDTH: Final = 3.3
 """Width of a panel in inches."""
 _LEAST_WIDTH: Final = 1.6
 """Inches of a camera's panel below which agents are left out."""
+_SHORT: Final = 16
+"""Letters that a line above a panel of a small picture has room for."""
+_ROW_WORDS: Final = 0.03
+"""Inches of words above a row, for letters of one point."""
+_ENOUGH: Final = 0.6
+"""Of a small picture that panels should cover, by the estimate of `_width`."""
 _TITLE: Final = 1.0
 """Inches of the height that titles take, about."""
 _MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
@@ -77,7 +92,7 @@ def render_accident(
     dataset: Dataset,
     scenario: RowArgument,
     *,
-    seconds: Sequence[float] = COUNTDOWN,
+    seconds: Sequence[float] | None = None,
     agents: Agents = None,
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
@@ -94,8 +109,10 @@ def render_accident(
         dataset: the release.
         scenario: token or record of one with a collision.
         seconds: before the recording's last frame, which the impact is near; moments before the first are left out.
+            None is for `COUNTDOWN`, or in a paper's column for one second before the impact and the impact.
         agents: whose images are shown; an empty list for none. None is for all that are there or, where their images
-            would be narrower than 1.6 inches, as on a slide, for those that see the pair best; the title says so.
+            would be narrower than 1.6 inches, as on a slide, for the ego and those that see the pair best; the title
+            says so.
         layers: `image`, `bev` (the road), `boxes`, `trajectories` and `grid` are the default; also
             `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image` no image file is read.
         fig: an empty figure to render on; a new one if None.
@@ -114,15 +131,16 @@ def render_accident(
     contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
     record = dataset.get("scenario", scenario)
     cut = _cut_words(contact, record["num_frames"])
-    moments = _moments(seconds, record["num_frames"])
+    usual = _IN_A_COLUMN if current_style().room == "column" else COUNTDOWN
+    moments = _moments(seconds or usual, record["num_frames"])
     there = agents_of(dataset, scenario)
     first = sample_token(record["token"], there[0], record["num_frames"])
     names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
-    fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1))
+    fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1), column=1.45)
     pair, best = Pair.of(dataset, contact), ""
     room = _agents_with_room(fig, len(names), len(moments)) if agents is None else len(names)
     if room < len(names):
-        best = f"the {room} of {len(names)} agents that see the pair best"
+        best = f"{room} of {len(names)} agents"
         names = _best_agents(pair, names, [index for _, index in moments], room)
     axes, across = _panels(fig, len(names), len(moments))
     for column, (left, index) in enumerate(moments):
@@ -134,9 +152,11 @@ def render_accident(
         _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
     for agent, ax in zip(names, axes[:, 0], strict=False):
         _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
-    _write_head("from above", "black", axes[-1, 0], above=across)
+    _write_head(
+        "from above,\nspeeds in m/s" if current_style().few else "from above", "black", axes[-1, 0], above=across
+    )
     words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
-    set_scene_title(fig, dataset, record["token"], best, below=words, fontsize=11)
+    set_scene_title(fig, dataset, record["token"], best, below=words)
     return settled(fig)
 
 
@@ -284,7 +304,8 @@ def draw_pair_from_above(pair: Pair, index: int, layers: Collection[Layer], ax: 
         f"{pair.tags[actor]} {number_words(float(np.linalg.norm(velocity)))}"
         for actor, velocity in zip(both.actor_id.tolist(), both.velocity, strict=True)
     ]
-    ax.set_title(f"{', '.join(speeds)} m/s", fontsize=SMALLEST_TEXT)
+    words = ", ".join(speeds) + ("" if current_style().few else " m/s")
+    ax.set_title("\n".join(speeds) if current_style().few and len(words) > _SHORT else words, fontsize=text_size())
 
 
 def number_words(value: float) -> str:
@@ -319,8 +340,8 @@ def _draw_scale(reach: float, ax: Axes, *, grid: bool) -> None:
     left, low = (each + 0.1 * reach for each in ax.viewLim.min)
     ax.plot([left, left + metres], [low, low], color="black", linewidth=2)
     paper = {"facecolor": CASING_COLOR, "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
-    ax.text(left, low + 0.06 * reach, f"{metres:.0f} m", fontsize=SMALLEST_TEXT, va="bottom", zorder=6, bbox=paper)
-    keep_free(ax, [[(left, low), (left + metres, low)]], margin=(-2, -2, 2, 2 * SMALLEST_TEXT))
+    ax.text(left, low + 0.06 * reach, f"{metres:.0f} m", fontsize=text_size(), va="bottom", zorder=6, bbox=paper)
+    keep_free(ax, [[(left, low), (left + metres, low)]], margin=(-2, -2, 2, 2 * text_size()))
 
 
 def _write_tags_in_image(pair: Pair, actors: list[int], bounds: FloatArray, ax: Axes) -> None:
@@ -393,7 +414,8 @@ def _width(fig: Figure, agents: int, moments: int) -> tuple[float, bool]:
     """Inches of a panel of the first row or column, about, and whether rows are columns because it is then wider."""
     width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi - _TITLE
     down = min(width / moments, height / (agents * 9 / 16 + 1))
-    across = (16 / 9 if agents else 1) * min(height / moments, width / (agents * 16 / 9 + 1))
+    row = height / moments - _ROW_WORDS * text_size()
+    across = (16 / 9 if agents else 1) * min(row, width / (agents * 16 / 9 + 1))
     return max(down, across), across > down
 
 
@@ -406,15 +428,23 @@ def _panels(fig: Figure, agents: int, moments: int) -> tuple[Any, bool]:
 
 def _agents_with_room(fig: Figure, agents: int, moments: int) -> int:
     """How many of the agents can be shown so large that one can see what happens, or as large as they can be."""
-    widths = {number: _width(fig, number, moments)[0] for number in range(1, agents + 1)}
-    return max(number for number, width in widths.items() if width >= min(_LEAST_WIDTH, 0.9 * max(widths.values())))
+    panels = {number: _width(fig, number, moments) for number in range(1, agents + 1)}
+    least = min(_LEAST_WIDTH, 0.9 * max(width for width, _ in panels.values()))
+    areas = {
+        number: moments * width**2 * (number * 9 / 16 + (81 / 256 if across else 1))
+        for number, (width, across) in panels.items()
+        if width >= least
+    }
+    enough = _ENOUGH * fig.bbox.width * fig.bbox.height / fig.dpi**2 if current_style().few else 0.0
+    return max((number for number, area in areas.items() if area > enough), default=max(areas, key=areas.__getitem__))
 
 
 def _best_agents(pair: Pair, agents: Sequence[str], frames: Sequence[int], number: int) -> list[str]:
-    """So many of the agents: those in whose images most of the pair is, and of equal ones where it is largest."""
+    """So many of the agents: the ego, and those in whose images most, and of equals the largest, of the pair is."""
     views = {agent: [pair.view(agent, index)[1] for index in frames] for agent in agents}
     seen = {agent: [(view.shown, view.area) for view in views[agent] if view is not None] for agent in agents}
-    ranked = sorted(agents, key=lambda agent: np.sum([(0, 0), *seen[agent]], axis=0).tolist(), reverse=True)
+    best = {agent: np.sum([(0, 0), *seen[agent]], axis=0).tolist() for agent in agents}
+    ranked = sorted(agents, key=lambda agent: (agent == AGENTS[0], best[agent]), reverse=True)
     return in_drawing_order(ranked[:number])
 
 
@@ -436,7 +466,7 @@ def _write_name(words: str, ax: Axes) -> None:
         (3, 3),
         xycoords="axes fraction",
         textcoords="offset points",
-        fontsize=SMALLEST_TEXT,
+        fontsize=text_size(),
         bbox=paper,
         zorder=5,
         in_layout=False,
@@ -460,5 +490,5 @@ def _draw_speeds(pair: Pair, index: int, ax: Axes) -> None:
     ax.set(
         xlabel="time to the impact (s)", ylabel="speed (m/s)", xlim=(-(impact - 1) * FRAME_PERIOD, 0.1), ylim=(0, None)
     )
-    ax.legend(loc="lower left", fontsize=SMALLEST_TEXT, ncols=2, framealpha=0.7)
+    ax.legend(loc="lower left", fontsize=text_size(), ncols=2, framealpha=0.7)
     with_light_grid(ax, "both")

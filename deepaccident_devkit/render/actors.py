@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -24,10 +25,16 @@ from deepaccident_devkit.render.boxes import (
 )
 from deepaccident_devkit.render.camera import BestView, best_view, crop_about, draw_image
 from deepaccident_devkit.render.captions import set_scene_title, set_title
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import LAYERS, Layer, axis_words, figure_or_new, layers_of, with_light_grid
 from deepaccident_devkit.render.ground import draw_underlay
-from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR, in_own_settings
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    current_style,
+    in_own_settings,
+    text_size,
+)
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, FRAME_PERIOD, OWN_ACTOR_ID, frame_timestamp, short_name
@@ -41,11 +48,32 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _POSSIBLE: Final = tuple(layer for layer in LAYERS if layer in {"image", *BEV_LAYERS})
-_LETTERS_AN_INCH: Final = 12
+_LETTERS: Final = 104
+"""In an inch, if they are one point high."""
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "bev", "points", "boxes", "grid")
 _LAYERS: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
 _CROPS: Final = ("first", "second", "third", "fourth")
-_MOSAIC: Final[list[Any]] = [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]]
+_BESIDE: Final[list[Any]] = [["path", "first", "second"], ["path", "speed", "seen"]]
+_MOSAICS: Final[Mapping[str, dict[str, Any]]] = {
+    "all": {
+        "mosaic": [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]],
+        "height_ratios": (1, 1, 1.1),
+    },
+    "page": {"mosaic": _BESIDE, "width_ratios": (1.6, 1, 1)},
+    "slide": {"mosaic": _BESIDE, "width_ratios": (1.9, 1, 1)},
+    "column": {"mosaic": [["path"] * 2, ["first", "second"], ["seen"] * 2], "height_ratios": (2.0, 0.6, 0.8)},
+}
+"""The panels of an actor over time, by what there is room for."""
+_BOX_MOSAICS: Final[Mapping[str, dict[str, Any]]] = {
+    "all": {
+        "mosaic": [["camera", "above"], ["words", "words"]],
+        "width_ratios": (16, 10),
+        "height_ratios": (4, 0.8),
+    },
+    "page": {"mosaic": [["camera", "above"]], "width_ratios": (16, 10)},
+    "column": {"mosaic": [["camera"], ["above"]], "height_ratios": (9, 16)},
+}
+"""The panels of one box."""
 _FRAMES_A_SECOND: Final = round(1 / FRAME_PERIOD)
 _AROUND: Final = 10.0
 """At least so many metres are rendered around the path, on each side."""
@@ -74,7 +102,8 @@ def render_annotation(
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure: the part of the camera's image around the box, the box from above in the agent's ego frame, words.
+        The figure: the part of the camera's image around the box, the box from above in the agent's ego frame, words
+        (not in papers).
 
     Raises:
         TokenError: no such annotation.
@@ -86,8 +115,8 @@ def render_annotation(
     row = int(record["token"].rsplit("/", 1)[1])
     box = dataset.boxes(sample, "world").select([row])
     color = role_colors(dataset, sample, box)
-    fig = figure_or_new(fig, (10, 4.9))
-    axes = fig.subplot_mosaic([["camera", "above"], ["words", "words"]], width_ratios=(16, 10), height_ratios=(4, 0.7))
+    fig = figure_or_new(fig, (10, 4.9), page=0.43, column=1.6)
+    axes = fig.subplot_mosaic(**_BOX_MOSAICS.get(current_style().room, _BOX_MOSAICS["all"]))
     _draw_in_camera(dataset, best_view(dataset, [sample], box), box, color, axes["camera"], image="image" in chosen)
 
     own = box.transform(dataset.world_from(sample, "ego").inverse(), "ego")
@@ -97,17 +126,21 @@ def render_annotation(
     draw_boxes_from_above(own, axes["above"], color, fill=0.5, linewidths=2.5)
     axes["above"].set_title("ego frame of the agent", fontsize="medium")
 
-    axes["words"].set_axis_off()
-    columns = _facts(dataset, record, own)
-    letters = int(_LETTERS_AN_INCH * fig.bbox.width / fig.dpi / len(columns))
+    if "words" in axes:
+        _write_facts(dataset, record, own, axes["words"])
+    set_scene_title(fig, dataset, record["token"], record["category"])
+    return fig
+
+
+def _write_facts(dataset: Dataset, record: dict[str, Any], own: Boxes, ax: Axes) -> None:
+    """Write the facts about a box, which is in the ego frame, in columns."""
+    ax.set_axis_off()
+    columns, fig = _facts(dataset, record, own), cast("Figure", ax.figure)
+    letters = int(_LETTERS / text_size() * fig.bbox.width / fig.dpi / len(columns))
     for column, facts in enumerate(columns):
         lines = [textwrap.fill(fact, letters, subsequent_indent="  ") for fact in facts]
         place = column / len(columns)
-        axes["words"].text(
-            place, 1, "\n".join(lines), va="top", fontsize=SMALLEST_TEXT, transform=axes["words"].transAxes
-        )
-    set_scene_title(fig, dataset, record["token"], record["category"])
-    return fig
+        ax.text(place, 1, "\n".join(lines), va="top", fontsize=text_size(), transform=ax.transAxes)
 
 
 def _draw_in_camera(
@@ -184,7 +217,8 @@ def render_instance(
     Returns:
         The figure: the actor's path in world from above with its seconds and the impact; the largest images of it at
         four moments; below them its speed, LiDAR points in its box and who sees it (by the released rule; pale if an
-        agent only annotated it), over the time of the recording.
+        agent only annotated it), over the time of the recording. In papers and on slides there are two images and no
+        LiDAR points, in a paper's column no speed either.
 
     Raises:
         TokenError: no such instance.
@@ -195,14 +229,17 @@ def render_instance(
     actor = _actor(dataset, instance)
     names = in_drawing_order(cooperating_agents(dataset, sample_token(actor.scenario, actor.recorder, 1), agents))
     known = [sightings(dataset, actor.scenario, agent, actor.actor_id) for agent in names]
-    fig = figure_or_new(fig, (14, 8.5))
-    axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 1.1))
+    fig = figure_or_new(fig, (14, 8.5), page=0.42, column=1.65)
+    axes = fig.subplot_mosaic(**_MOSAICS[current_style().room])
     _draw_path(dataset, actor, chosen, axes["path"])
-    _draw_crops(dataset, actor, known, chosen, [axes[name] for name in _CROPS])
-    _draw_speed(actor, axes["speed"])
-    _draw_points(known, axes["points"])
-    _draw_seen(actor, known, axes["seen"])
-    for name in ("speed", "points", "seen"):
+    _draw_crops(dataset, actor, known, chosen, [axes[name] for name in _CROPS if name in axes])
+    over_time = {
+        "speed": partial(_draw_speed, actor),
+        "points": partial(_draw_points, known),
+        "seen": partial(_draw_seen, actor, known),
+    }
+    for name in over_time.keys() & axes.keys():
+        over_time[name](axes[name])
         _finish_time(actor, axes[name])
     who = "" if actor.own_agent is None else f" ({short_name(actor.own_agent)})"
     words = f"{actor.boxes.category_names[0]} {actor.actor_id}{who}"
@@ -314,7 +351,7 @@ def _draw_crops(
         draw_view(dataset, view, box.select(np.arange(len(colors))), colors, ax, image="image" in layers)
         agent, _, channel = view.camera.rsplit("/", 3)[1:]
         words = f"{frame_timestamp(int(index)):.1f} s, {short_name(agent)}, {camera_name(channel)}"
-        set_title(ax, words, fontsize=SMALLEST_TEXT)
+        set_title(ax, words, fontsize=text_size())
 
 
 def _draw_speed(actor: _Actor, ax: Axes) -> None:
@@ -339,7 +376,7 @@ def _draw_seen(actor: _Actor, known: Sequence[Sightings], ax: Axes) -> None:
             spans = [(time - FRAME_PERIOD / 2, FRAME_PERIOD) for time in one.timestamp[which].tolist()]
             ax.broken_barh(spans, (row - 0.35, 0.7), facecolors=AGENT_COLORS[one.agent], alpha=opacity, linewidth=0)
         if one.agent == actor.own_agent:
-            ax.text(actor.duration / 2, row, "is the actor itself", ha="center", va="center", fontsize=SMALLEST_TEXT)
+            ax.text(actor.duration / 2, row, "is the actor itself", ha="center", va="center", fontsize=text_size())
     ax.set_yticks(range(len(known)), [short_name(one.agent) for one in known])
     ax.set_ylim(len(known) - 0.5, -0.5)
     set_title(ax, "who sees it, pale: only annotated", fontsize="medium")
@@ -347,6 +384,7 @@ def _draw_seen(actor: _Actor, known: Sequence[Sightings], ax: Axes) -> None:
 
 def _finish_time(actor: _Actor, ax: Axes) -> None:
     with_light_grid(ax, "both")
+    ax.locator_params(axis="x", nbins=4)
     ax.set(xlim=(-FRAME_PERIOD / 2, actor.duration + FRAME_PERIOD / 2), xlabel="time (s)")
     if actor.impact is not None:
         ax.axvline(actor.impact, color=COLLIDER_COLOR, linewidth=1, linestyle="--")

@@ -23,7 +23,7 @@ from deepaccident_devkit.render.boxes import (
 )
 from deepaccident_devkit.render.captions import (
     absence_text,
-    draw_legend,
+    draw_legend_outside,
     handles_from_above,
     has_cloud,
     is_there,
@@ -32,7 +32,7 @@ from deepaccident_devkit.render.captions import (
     write_missing,
 )
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.figures import Layer, axes_or_new, axis_words, check_view_range, layers_of
+from deepaccident_devkit.render.figures import Layer, axes_or_new, axis_words, check_view_range, layers_of, widening
 from deepaccident_devkit.render.ground import draw_underlay, map_beneath
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
@@ -97,6 +97,7 @@ class BevView:
         sweeps: frames of points, the present included.
         seconds: how far trajectories reach back and ahead.
         center: of the picture, metres of `frame`; None for the agent's place.
+        wide: how much farther it shows to the left and the right of the picture than up and down.
     """
 
     view_range: float = 50.0
@@ -106,6 +107,12 @@ class BevView:
     sweeps: int = 1
     seconds: tuple[float, float] = (1.0, 3.0)
     center: tuple[float, float] | None = None
+    wide: float = 1.0
+
+    @property
+    def half(self) -> FloatArray:
+        """(2,) metres from the centre to the right and the upper edge."""
+        return np.array([self.wide * self.view_range, self.view_range])
 
     def __post_init__(self) -> None:
         """Check the frame and the range; raises ChoiceError."""
@@ -162,7 +169,15 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
     """
     chosen = layers_of(layers, BEV_DEFAULT, BEV_LAYERS)
-    view = BevView(view_range=view_range, frame=frame, agents=agents, link=link, sweeps=sweeps, seconds=seconds)
+    view = BevView(
+        view_range=view_range,
+        frame=frame,
+        agents=agents,
+        link=link,
+        sweeps=sweeps,
+        seconds=seconds,
+        wide=widening(ax),
+    )
     names = cooperating_agents(dataset, sample, agents)
     ax = axes_or_new(ax, (6, 6.6))
     colors, clouds = draw_bev(dataset, sample, view, chosen, ax)
@@ -170,9 +185,7 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     if link is not None and link != Link(seed=link.seed) and len(names) > 1:
         made.insert(0, link_words(link))
     set_scene_title(ax, dataset, dataset.get("sample", sample)["token"], below=", ".join(made))
-    draw_legend(
-        ax, handles_from_above(colors, clouds), columns=5, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5
-    )
+    draw_legend_outside(ax, handles_from_above(colors, clouds), columns=5)
     return ax
 
 
@@ -183,12 +196,8 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     target_from_world = dataset.world_from(record, view.frame).inverse()
     target_from_ego = target_from_world @ dataset.world_from(record, "ego")
     center = target_from_ego.translation[:2] if view.center is None else np.array(view.center)
-    ax.set(
-        xlim=(center[0] - view.view_range, center[0] + view.view_range),
-        ylim=(center[1] - view.view_range, center[1] + view.view_range),
-        aspect="equal",
-        anchor="N",
-    )
+    (left, low), (right, high) = center - view.half, center + view.half
+    ax.set(xlim=(left, right), ylim=(low, high), aspect="equal", anchor="N")
     ground = f"{record['token']}/{BEV_CAMERA}"
     has_ground = "bev" in layers and is_there(dataset, ground)
     town = None
@@ -198,14 +207,14 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
         added("picture", "draw_town_map")(town, ax, target_from_world=target_from_world)
     if has_ground:
         image = dataset.load_bev(record)
-        reach = view.view_range + float(np.abs(center - target_from_ego.translation[:2]).max())
+        reach = float(view.half.max()) + float(np.abs(center - target_from_ego.translation[:2]).max())
         draw_underlay(image, ax, target_from_ego=target_from_ego, view_range=reach)
     clouds = _draw_clouds(dataset, record, view, names, center, ax) if "points" in layers else {}
     absent = [missing_clouds_text([agent for agent, cloud in clouds.items() if cloud is None])]
     colored: frozenset[str] = frozenset()
     if not layers.isdisjoint(_OF_BOXES):
         boxes = _boxes(dataset, record, view, names)
-        boxes = boxes.select((np.abs(boxes.center[:, :2] - center) < view.view_range + _BEYOND).all(axis=1))
+        boxes = boxes.select((np.abs(boxes.center[:, :2] - center) < view.half + _BEYOND).all(axis=1))
         colors = role_colors(dataset, record, boxes)
         if "trajectories" in layers:
             draw_trails(
@@ -265,7 +274,7 @@ def _draw_clouds(
         if cloud is None:
             continue
         color = AGENT_COLORS[agent] if len(names) > 1 else POINT_COLOR
-        draw_points_from_above(cloud.xyz, ax, center=center, view_range=view.view_range, color=color)
+        draw_points_from_above(cloud.xyz, ax, center=center, half=view.half, color=color)
     return clouds
 
 
@@ -320,13 +329,13 @@ def link_words(link: Link) -> str:
 
 
 def draw_points_from_above(
-    xyz: FloatArray, ax: Axes, *, center: FloatArray, view_range: float, color: str = POINT_COLOR
+    xyz: FloatArray, ax: Axes, *, center: FloatArray, half: FloatArray, color: str = POINT_COLOR
 ) -> None:
-    """Render the points (P, 3) within a square of ±`view_range` metres around `center` (2,), all in one colour.
+    """Render the points (P, 3) within ±`half` (2,) metres of `center` (2,), all in one colour.
 
     Hues are paler than those of boxes, which lie over them.
     """
-    near = (np.abs(xyz[:, :2] - center) < view_range).all(axis=1)
+    near = (np.abs(xyz[:, :2] - center) < half).all(axis=1)
     ax.scatter(
         xyz[near, 0],
         xyz[near, 1],

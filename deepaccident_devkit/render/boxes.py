@@ -11,16 +11,18 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, PinholeCamera
-from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
+from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.figures import Layer
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     CASING_COLOR,
-    CATEGORY_COLORS,
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
     OWN_COLOR,
+    category_colors,
+    current_style,
     in_own_settings,
+    text_size,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables.tokens import sample_token
@@ -36,8 +38,12 @@ if TYPE_CHECKING:
 
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
-SMALLEST_MARK = 6.0
-"""Points: the size of the mark of a small actor from above."""
+_MARK_RADIUS: Final = 1.0
+"""Metres from the middle of the mark of a small actor, from above, to its rim: about a car's width in all."""
+_LEAST_RADIUS: Final = 2.0
+"""Points: it is at least as large, so that it is found in a view of a whole town."""
+_CORNERS: Final[Mapping[str, int]] = {"o": 16, "D": 4, "^": 3}
+"""Corners of the marks, by matplotlib's names."""
 _KEY_SPEED = 10
 """Metres a second of the arrow in a corner that gives the scale of the others."""
 _EDGE, _CASING = 1.2, 1.2
@@ -61,7 +67,7 @@ def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
         raise GeometryError(
             f"box: expected a Box, found {type(box).__name__}; the box is first, then the axes: draw_box(box, ax)"
         )
-    chosen = color or CATEGORY_COLORS[box.category]
+    chosen = color or category_colors()[box.category]
     _draw_footprints(box.center[None, :2], box.bottom_corners().T[None, :, :2], ax, [chosen], 0.25, {})
     return ax
 
@@ -69,7 +75,7 @@ def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
 def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill: float = 0.25, **how: Any) -> None:
     """Render boxes in x and y of their (level) frame, metres, each with a line towards its front, as opaque as `fill`.
 
-    Pedestrians, cyclists and motorcycles also have their class's mark, which is not smaller in a large view. `how` is
+    Pedestrians, cyclists and motorcycles also have their class's mark, as large as a car is wide. `how` is
     matplotlib's for the outlines, such as `linestyle`.
     """
     _draw_footprints(boxes.center[:, :2], boxes.bottom_corners()[..., :2], ax, colors, fill, how)
@@ -91,9 +97,7 @@ def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) ->
         how: Any = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "zorder": 4}
         arrows = ax.quiver(*start, *step, color=chosen, **how)
         words = f"{_KEY_SPEED} m/s"
-        key = ax.quiverkey(
-            arrows, 0.85, 0.03, _KEY_SPEED, words, color=OWN_COLOR, fontproperties={"size": SMALLEST_TEXT}
-        )
+        key = ax.quiverkey(arrows, 0.85, 0.03, _KEY_SPEED, words, color=OWN_COLOR, fontproperties={"size": text_size()})
         key.text.set_bbox({"facecolor": CASING_COLOR, "edgecolor": "none", "pad": 1.5})
 
 
@@ -217,15 +221,23 @@ def _draw_footprints(
 
 
 def _draw_small(boxes: Boxes, ax: Axes, colors: Sequence[str], *, filled: bool) -> None:
-    """The marks of classes that are too small to be found."""
-    from matplotlib.lines import Line2D
+    """The marks of classes that are too small to be found, in metres: none is larger than a car."""
+    from matplotlib.collections import PolyCollection
 
-    kinds = list(zip(boxes.category_names, colors, strict=True))
-    for name, color in sorted({kind for kind in kinds if kind[0] in CATEGORY_MARKERS}):
-        x, y = boxes.center[[kind == (name, color) for kind in kinds], :2].T
-        inside, edge = (color, CASING_COLOR) if filled else ("none", color)
-        style: Any = {"marker": CATEGORY_MARKERS[name], "markersize": SMALLEST_MARK, "zorder": 3.5}
-        ax.add_line(Line2D(x, y, linestyle="none", markerfacecolor=inside, markeredgecolor=edge, mew=0.7, **style))
+    corners = [_CORNERS.get(CATEGORY_MARKERS.get(name, "")) for name in boxes.category_names]
+    small = [(row, number) for row, number in enumerate(corners) if number is not None]
+    if not small:
+        return
+    turns = [np.pi / 2 + 2 * np.pi * np.arange(number) / number for _, number in small]
+    point = float(np.ptp(ax.get_xlim())) / ax.bbox.width * ax.figure.dpi / 72
+    radius = max(_MARK_RADIUS, _LEAST_RADIUS * point)
+    marks = [
+        boxes.center[row, :2] + radius * np.column_stack([np.cos(turn), np.sin(turn)])
+        for (row, _), turn in zip(small, turns, strict=True)
+    ]
+    own = [colors[row] for row, _ in small]
+    inside, edges = (own, CASING_COLOR) if filled else ("none", own)
+    ax.add_collection(PolyCollection(marks, facecolors=inside, edgecolors=edges, linewidths=0.7, zorder=3.5))
 
 
 def _moving(boxes: Boxes) -> BoolArray:
@@ -234,7 +246,7 @@ def _moving(boxes: Boxes) -> BoolArray:
 
 def _write_ids(places: FloatArray, actor_ids: IntArray, ax: Axes, colors: Sequence[str]) -> None:
     """Write the ids of tracked actors at places (N, 2): first those of hues, which are the accident's actors."""
-    shades = set(CATEGORY_COLORS.values())
+    shades = set(category_colors().values())
     order = sorted(np.flatnonzero(actor_ids != UNTRACKED_ID).tolist(), key=lambda row: colors[row] in shades)
     words = ["own" if actor_ids[row] == OWN_ACTOR_ID else str(actor_ids[row]) for row in order]
     place_chips(ax, zip(words, places[order], strict=True), colors=[colors[row] for row in order])
@@ -330,10 +342,13 @@ def agent_letters(agent: str) -> str:
 
 
 def actor_color(category: str, agent: str | None = None, *, collides: bool = False) -> str:
-    """The colour of an actor's box: red if it collides, else the hue of the agent that it is, else its category's."""
+    """The colour of an actor's box: red if it collides, else the hue of the agent that it is, else its category's.
+
+    If the style says so, it is the category's for agents too.
+    """
     if collides:
         return COLLIDER_COLOR
-    return CATEGORY_COLORS[category] if agent is None else AGENT_COLORS[agent]
+    return category_colors()[category] if agent is None or current_style().by_class else AGENT_COLORS[agent]
 
 
 def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str]:

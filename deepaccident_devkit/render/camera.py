@@ -25,6 +25,7 @@ from deepaccident_devkit.render.captions import (
     agent_handles,
     box_handles,
     draw_legend,
+    draw_legend_outside,
     draw_missing_image,
     has_cloud,
     is_there,
@@ -33,7 +34,7 @@ from deepaccident_devkit.render.captions import (
     set_scene_title,
     write_missing,
 )
-from deepaccident_devkit.render.figures import Layer, axes_or_new, layers_of
+from deepaccident_devkit.render.figures import Layer, axes_or_new, layers_of, widening
 from deepaccident_devkit.render.styles import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP, in_own_settings
 from deepaccident_devkit.support.arrays import FloatArray, as_floats
 from deepaccident_devkit.support.text import choice
@@ -95,15 +96,18 @@ def render_sample_data(
                 "that holds it, or choose other layers, such as boxes"
             )
         ax = axes_or_new(ax, (8, 5.4))
-        colors, below = draw_camera(dataset, record, chosen, ax), 0.5
+        colors = draw_camera(dataset, record, chosen, ax)
     else:
         lidar = record["channel"] == LIDAR
         chosen = layers_of(layers, ("points" if lidar else "bev", "boxes", "grid"), BEV_LAYERS)
+        view = BevView(frame="lidar" if lidar else "ego", wide=widening(ax))
         ax = axes_or_new(ax, (6, 7.2))
-        view = BevView(frame="lidar" if lidar else "ego")
-        colors, below = draw_bev(dataset, record["sample_token"], view, chosen, ax)[0], 4.5
+        colors = draw_bev(dataset, record["sample_token"], view, chosen, ax)[0]
     set_scene_title(ax, dataset, record["token"], record["channel"])
-    draw_legend(ax, box_handles(colors), loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=below)
+    if record["modality"] == "camera":
+        draw_legend(ax, box_handles(colors), loc="upper center", bbox_to_anchor=(0.5, 0))
+    else:
+        draw_legend_outside(ax, box_handles(colors))
     return ax
 
 

@@ -8,18 +8,20 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, cast
 
+import numpy as np
+
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.release.store import listed
 from deepaccident_devkit.render.boxes import in_drawing_order
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
-    CATEGORY_COLORS,
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
     MISSING_COLOR,
     MUTED_COLOR,
+    category_colors,
     current_style,
+    text_size,
 )
 from deepaccident_devkit.taxonomy import LIDAR, short_name
 
@@ -44,8 +46,10 @@ _BENEATH: Final = "token"
 _CAPITALS: Final = re.compile(r"(?<=[a-z])(?=[A-Z])")
 INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
 """A place in axes, so that nothing stands beside them."""
-_HANDLE: Final = 0.4
-"""Inches of a sign and the blanks around it."""
+_HANDLE: Final = 0.044
+"""Inches of a sign and the blanks around it, for letters of one point."""
+_LEGEND_SHARE: Final = 0.86
+"""Of a panel's width, for a legend below it."""
 _SPACING: Final[Mapping[str, Any]] = {"handlelength": 1.2, "columnspacing": 1.0}
 _MISSING, _LACKS = "missing", "lacks"
 """Mark the words of a grey panel, and those for a title, so that `missing_words` finds them."""
@@ -79,6 +83,8 @@ def set_scene_title(
     """
     from matplotlib.axes import Axes
 
+    if not current_style().titled:
+        return
     kind, name, *rest = token.split("/")
     moment = "" if rest[:1] in ([], ["actor"]) else moment_words(dataset, token)
     said = ", ".join(filter(None, [moment, words]))
@@ -105,7 +111,7 @@ def set_title(
     panel, drawn = isinstance(where, Axes), cast("Any", where)
     font = FontProperties(size=fontsize or rcParams["axes.titlesize" if panel else "figure.titlesize"])
     room = 72 * room_of(where)
-    text, size = _fitted(words, font, room, SMALLEST_TEXT)
+    text, size = _fitted(words, font, room, text_size())
     small, small_size = _fitted(
         token if current_style().tokens else "", FontProperties(size=_TOKEN_TEXT), room, _TOKEN_TEXT
     )
@@ -132,14 +138,14 @@ def _write_token(where: Any, token: str, size: float, title: Any) -> None:
         )
 
 
-def room_of(where: Axes | Figure) -> float:
+def room_of(where: Axes | Figure, panel_share: float = _PANEL_SHARE) -> float:
     """Inches of a figure's width, or of a panel's share of it, that words above or below may take."""
     from matplotlib.axes import Axes
 
     fig: Any = where.figure if isinstance(where, Axes) else where
     share, spec = _TITLE_SHARE, None
     if isinstance(where, Axes):
-        share, spec = _PANEL_SHARE, where.get_subplotspec()
+        share, spec = panel_share, where.get_subplotspec()
     if spec is not None:
         ratios: Any = spec.get_gridspec().get_width_ratios() or [1] * spec.get_gridspec().ncols
         share *= sum(ratios[spec.colspan.start : spec.colspan.stop]) / sum(ratios)
@@ -194,7 +200,7 @@ def box_handles(colors: Collection[str]) -> list[Artist]:
     from matplotlib.patches import Patch
 
     agents = {short_name(agent): color for agent, color in AGENT_COLORS.items()}
-    meanings = {"colliding pair": COLLIDER_COLOR, **agents, **CATEGORY_COLORS}
+    meanings = {"colliding pair": COLLIDER_COLOR, **agents, **category_colors()}
     return [
         _mark(name, CATEGORY_MARKERS[name], color)
         if name in CATEGORY_MARKERS
@@ -210,9 +216,9 @@ def agent_handles(agents: Collection[str]) -> list[Artist]:
 
 
 def handles_from_above(colors: Collection[str], clouds: Collection[str]) -> list[Artist]:
-    """What the colours of boxes and of agents' clouds mean; an agent with a cloud is named once."""
+    """What the colours of boxes and of agents' clouds mean, each once; in a small picture names stand at the clouds."""
     known = {AGENT_COLORS[agent] for agent in clouds}
-    return [*box_handles(set(colors) - known), *agent_handles(clouds)]
+    return [*box_handles(set(colors) - known), *agent_handles(() if current_style().few else clouds)]
 
 
 def _mark(label: str, marker: str, color: str) -> Artist:
@@ -226,11 +232,27 @@ def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int | None = 
     from matplotlib.font_manager import FontProperties
 
     if handles:
-        font = FontProperties(size=SMALLEST_TEXT)
-        widest = max(text_width(str(handle.get_label()), font) for handle in handles) / 72 + _HANDLE
-        columns = max(1, min(columns or len(handles), int(room_of(where) / widest)))
-        style = {"loc": "outside lower center", "fontsize": SMALLEST_TEXT, "frameon": False, **_SPACING, **how}
+        font = FontProperties(size=text_size())
+        widths = [text_width(str(handle.get_label()), font) / 72 + _HANDLE * text_size() for handle in handles]
+        columns = _columns_with_room(widths, columns or len(handles), room_of(where, _LEGEND_SHARE))
+        style = {"loc": "outside lower center", "fontsize": text_size(), "frameon": False, **_SPACING, **how}
         where.legend(handles=list(handles), ncols=columns, **style)
+
+
+def _columns_with_room(widths: Sequence[float], most: int, room: float) -> int:
+    """How many columns at most, each as wide as its widest sign, have room (inches)."""
+    for columns in range(min(most, len(widths)), 1, -1):
+        if sum(max(column) for column in np.array_split(widths, columns)) < room:
+            return columns
+    return 1
+
+
+def draw_legend_outside(ax: Axes, handles: Sequence[Artist], *, columns: int | None = None, **how: Any) -> None:
+    """Render a legend below axes, or on a slide, which is wide, to their right."""
+    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0), "borderaxespad": 4.5}
+    if current_style().room == "slide":
+        columns, place = 1, {"loc": "upper left", "bbox_to_anchor": (1, 1), "borderaxespad": 0.5}
+    draw_legend(ax, handles, columns=columns, **{**place, **how})
 
 
 def draw_legend_of_fills(ax: Axes, colors: Mapping[str, str]) -> None:
@@ -256,8 +278,9 @@ def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
     agent, _, channel = sample_data.rsplit("/", 3)[1:]
     ax.set_facecolor(MISSING_COLOR)
     words = absence_text(dataset, sample_data)
-    style: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": SMALLEST_TEXT, "transform": ax.transAxes}
-    ax.text(0.5, 0.97, words, label=f"{agent} {channel}: {words}", gid=_MISSING, zorder=0, **style)
+    how: dict[str, Any] = {"ha": "center", "va": "top", "clip_on": True, "in_layout": False, "gid": _MISSING}
+    told = f"{agent} {channel}: {words}"
+    ax.text(0.5, 0.97, words, label=told, fontsize=text_size(), transform=ax.transAxes, zorder=0, **how)
 
 
 def absence_text(dataset: Dataset, sample_data: str) -> str:

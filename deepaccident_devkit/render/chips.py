@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.render.styles import CASING_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
+from deepaccident_devkit.render.styles import CASING_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR, text_size
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.text import Annotation
 
 SMALLEST_TEXT: Final = 9
-"""In points: text of this size can be read in print."""
+"""In points, in a notebook; `text_size` is that of the style."""
 _PAD: Final = 1.5
 """Points of white around words."""
 _RINGS: Final = np.array([2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0])
@@ -53,7 +53,7 @@ def place_chips(
             "facecolor": CASING_COLOR,
             "edgecolor": edge,
             "linewidth": 0.7,
-            "boxstyle": f"square,pad={_PAD / SMALLEST_TEXT}",
+            "boxstyle": f"square,pad={_PAD / text_size()}",
         }
         placer.chips.append(
             ax.annotate(
@@ -64,7 +64,7 @@ def place_chips(
                 ha="center",
                 va="center",
                 color=OWN_COLOR,
-                fontsize=SMALLEST_TEXT,
+                fontsize=text_size(),
                 bbox=paper,
                 zorder=6,
                 clip_on=True,

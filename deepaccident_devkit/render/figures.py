@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.styles import GRID_COLOR, current_style, size_in_style
+from deepaccident_devkit.render.styles import GRID_COLOR, current_style, size_in_style, text_size
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.support.text import choice, path_of
 
@@ -28,6 +28,8 @@ Layer = Literal[
 above, `labels` what the motion labels say."""
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 _UNDATED: Final[Mapping[str, dict[str, Any]]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+_WIDE: Final = 1.6
+"""Width by height of a view from above on a slide."""
 _PASSES, _STILL = 4, 1e-5
 """How often a figure is laid out at most; of its width or height, how far a panel that does not move may move."""
 PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
@@ -53,15 +55,26 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (8, 8)) -> Axes:
     return plt.subplots(figsize=inches, layout="constrained", FigureClass=OwnFigure)[1]
 
 
-def figure_or_new(fig: Figure | None, size: tuple[float, float]) -> Figure:
-    """The figure given, or a new pyplot one, which notebooks display, of a size in inches or its style's."""
+def figure_or_new(
+    fig: Figure | None, size: tuple[float, float], *, panels: Literal["one", "several"] = "several", **heights: float
+) -> Figure:
+    """The figure given, or a new pyplot one, which notebooks display, of a size in inches or its style's.
+
+    `heights` are those of `page` and `column`, in widths.
+    """
     if fig is not None:
         return fig
     from matplotlib import pyplot as plt
 
     from deepaccident_devkit.render.own_figure import OwnFigure
 
-    return plt.figure(figsize=size_in_style(size, panels="several"), layout="constrained", FigureClass=OwnFigure)
+    inches = size_in_style(size, panels=panels, heights=heights)
+    return plt.figure(figsize=inches, layout="constrained", FigureClass=OwnFigure)
+
+
+def widening(ax: Axes | None) -> float:
+    """By how much a view from above, on these axes or new ones, is wider than high: on a slide it fills it."""
+    return _WIDE if ax is None and current_style().ratio is not None else 1.0
 
 
 def axis_words(frame: str) -> tuple[str, str]:
@@ -78,7 +91,7 @@ def check_view_range(metres: float) -> None:
 def titled_from_above(ax: Axes, title: str, *, grid: bool) -> Axes:
     """The axes as a view from above in metres, with a small title."""
     ax.set(aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
-    ax.set_title(title, fontsize=9)
+    ax.set_title(title, fontsize=text_size())
     return with_light_grid(ax, "both") if grid else ax
 
 
@@ -167,6 +180,21 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
     with replacing(path) as temporary, laid_out(figure, dpi):
         figure.savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
     return path
+
+
+def report_figure(
+    size: tuple[float, float], *, panels: Literal["one", "several"] = "several", **heights: float
+) -> Figure:
+    """A figure that pyplot does not know, of a size in inches, or its style's; `heights` are as in `figure_or_new`."""
+    return detached_figure(size_in_style(size, panels=panels, heights=heights))
+
+
+def write_report_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None) -> Path:
+    """Write a figure of a report into a PNG file, and for a paper or a slide also into a PDF file beside it."""
+    style = current_style()
+    if style.few:
+        write_figure(figure, path.with_suffix(".pdf"), dpi=style.dpi)
+    return write_figure(figure, path, dpi=style.dpi if style.few else dpi, words=words)
 
 
 def figure_png(figure: Figure, *, dpi: float) -> bytes:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
+import numpy as np
+
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, PostProcessing, motion_labels
 from deepaccident_devkit.render.boxes import collider_ids, recorder_ids
-from deepaccident_devkit.render.captions import set_scene_title
+from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.figures import Layer, axes_or_new, figure_or_new, layers_of, settled
 from deepaccident_devkit.render.motion_maps import (
     MAPS,
@@ -19,10 +21,11 @@ from deepaccident_devkit.render.motion_maps import (
     draw_key,
     draw_map_of,
     draw_trail_of,
+    instance_handles,
     maps_of_labels,
     maps_of_output,
 )
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.styles import current_style, in_own_settings
 from deepaccident_devkit.support.text import choice
 
 if TYPE_CHECKING:
@@ -38,6 +41,9 @@ _SHOWN: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
     "trail": ("labels", "trajectories"),
 }
 _POSSIBLE: Final[dict[MotionStyle, tuple[Layer, ...]]] = {"maps": _MAP_LAYERS, "trail": TRAIL_LAYERS}
+_FEW_MAPS: Final = ("instance", "flow")
+_FEW_FRAMES: Final = {"column": 1, "page": 3, "slide": 3}
+"""How many frames maps show in a small picture."""
 _KEY_WIDTH: Final = 0.5
 """Width of the column that explains the colours, in widths of a panel."""
 
@@ -49,18 +55,21 @@ def render_motion_labels(
     config: MotionLabelConfig | None = None,
     *,
     at_present: bool = True,
-    style: MotionStyle = "maps",
+    style: MotionStyle | None = None,
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
     """Render a sample's motion labels: one column for each frame, with instances, centerness, offset and flow.
+
+    In a paper or on a slide, maps are the instances and the flow of at most three of the frames that have a flow.
 
     Args:
         dataset: the release.
         sample: token or record.
         config: what labels show; None for the released ones.
         at_present: warp all frames to the present ego frame; if False, each is in its own.
-        style: `maps`, or `trail` for one panel with all frames, later ones paler, and the actors' paths.
+        style: `maps`, or `trail` for one panel with all frames, later ones paler, and the actors' paths; None is for
+            maps, or in a paper or on a slide for a trail.
         layers: for maps `labels` (the cells) and `velocities` (the arrows of the flow), which are the default, `ids`
             and `grid`; for a trail `trajectories` in place of `velocities`.
         fig: an empty figure to render on; a new one if None.
@@ -73,6 +82,7 @@ def render_motion_labels(
         NotAvailableError: the sample has no label.
         ChoiceError: no such style or layer, or a trail of frames that are not at the present.
     """
+    style = style or ("trail" if current_style().few and at_present else "maps")
     labels = motion_labels(dataset, sample, config)
     if at_present:
         labels = labels.to_present()
@@ -224,24 +234,33 @@ def _draw(maps: MotionMaps, style: MotionStyle, layers: Iterable[Layer] | None, 
     if style == "maps":
         return _draw_maps(maps, shown, fig)
     trail = _at_present(maps)
-    fig = figure_or_new(fig, (7.4, 6.8))
-    panel, key = fig.subplots(1, 2, width_ratios=(1, 0.24))
+    fig = figure_or_new(fig, (6.4, 6.8), panels="one", page=1.12, column=1.12)
+    panel = fig.subplots()
     draw_trail_of(trail, shown, panel)
-    draw_key(trail, "instance", key)
+    draw_legend(fig, instance_handles(trail))
     return fig
 
 
 def _draw_maps(maps: MotionMaps, shown: frozenset[Layer], fig: Figure | None) -> Figure:
-    names, frames = maps.names, len(maps.valid)
-    fig = figure_or_new(fig, (2.8 * (frames + _KEY_WIDTH) + 0.6, 2.8 * len(names) + 1.3))
-    axes = fig.subplots(len(names), frames + 1, squeeze=False, width_ratios=(*[1.0] * frames, _KEY_WIDTH))
-    panels = axes[:, :frames]
+    names, frames = maps.names, list(range(len(maps.valid)))
+    if current_style().few:
+        names = tuple(name for name in names if name in _FEW_MAPS)
+        there = np.flatnonzero(maps.valid)
+        there = there[: max(1, len(there) - 1)]  # the last has no flow
+        most = _FEW_FRAMES[current_style().room]
+        frames = np.unique(there[np.linspace(0, len(there) - 1, most).round().astype(int)]).tolist()
+    columns, rows = len(frames), len(names)
+    fig = figure_or_new(
+        fig, (2.8 * (columns + _KEY_WIDTH) + 0.6, 2.8 * rows + 1.3), page=0.3 * rows + 0.06, column=0.57 * rows + 0.1
+    )
+    axes = fig.subplots(rows, columns + 1, squeeze=False, width_ratios=(*[1.0] * columns, _KEY_WIDTH))
+    panels = axes[:, :columns]
     for row, name in enumerate(names):
-        for frame in range(frames):
-            draw_map_of(maps, name, frame, shown, panels[row, frame])
+        for ax, frame in zip(panels[row], frames, strict=True):
+            draw_map_of(maps, name, frame, shown, ax)
         panels[row, 0].set_ylabel(f"{name}\ny left (m)")
-        draw_key(maps, name, axes[row, frames])
-    for frame, ax in enumerate(panels[0]):
+        draw_key(maps, name, axes[row, columns])
+    for ax, frame in zip(panels[0], frames, strict=True):
         ax.set_title(f"+{frame * maps.step:.1f} s" if frame else "present")
     for ax in panels.flat:
         if ax is not panels[0, 0]:

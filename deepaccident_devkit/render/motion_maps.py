@@ -29,12 +29,15 @@ from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, 
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID, short_name
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
 DrawnMap = Literal["instance", "centerness", "offset", "flow"]
 MAPS: Final[tuple[DrawnMap, ...]] = get_args(DrawnMap)
 PALEST: Final = 0.22
 """How opaque the last frame of a trail is; the present is 1."""
+_OWN_EDGE: Final = 1.0
+"""Points of the edge of the own box."""
 _STILL: Final = 0.92
 """Grey of what does not move."""
 
@@ -242,7 +245,8 @@ def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
     """What the colours of a map mean."""
     ax.axis("off")
     if name == "instance":
-        _draw_instance_key(maps, ax)
+        if handles := instance_handles(maps):
+            ax.legend(handles=handles, loc="center left", frameon=False, borderpad=0, handlelength=1)
     elif name == "centerness":
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
@@ -288,7 +292,7 @@ def draw_edge(maps: MotionMaps, identity: int, ax: Axes, color: str, *, frame: i
     """Render the edge of an instance's cells."""
     cells = maps.instance[frame] == identity
     if cells.any():
-        ax.contour(*_cell_centers(maps), cells, levels=(0.5,), colors=color, linewidths=1.5)
+        ax.contour(*_cell_centers(maps), cells, levels=(0.5,), colors=color, linewidths=_OWN_EDGE)
 
 
 def _draw_arrows(maps: MotionMaps, frame: int, ax: Axes) -> None:
@@ -337,17 +341,17 @@ def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **how: Any) -> No
     ax.imshow(picture, origin="lower", extent=extent, interpolation="nearest", **how)
 
 
-def _draw_instance_key(maps: MotionMaps, ax: Axes) -> None:
+def instance_handles(maps: MotionMaps) -> list[Artist]:
+    """What the hues of instances mean."""
     from matplotlib.colors import to_hex
     from matplotlib.patches import Patch
 
     drawn = {to_hex(color) for color in maps.colors}
     meanings = {"colliding pair": COLLIDER_COLOR} | {short_name(name): hue for name, hue in AGENT_COLORS.items()}
-    handles = [Patch(label=name, facecolor=color) for name, color in meanings.items() if color in drawn]
+    handles: list[Artist] = [Patch(label=name, facecolor=color) for name, color in meanings.items() if color in drawn]
     if maps.own > 0:
-        handles.append(Patch(label="own box", facecolor="none", edgecolor=OWN_COLOR, linewidth=1.5))
-    if handles:
-        ax.legend(handles=handles, loc="center left", frameon=False, borderpad=0, handlelength=1)
+        handles.append(Patch(label="own box", facecolor="none", edgecolor=OWN_COLOR, linewidth=_OWN_EDGE))
+    return handles
 
 
 def _cell_centers(maps: MotionMaps) -> tuple[FloatArray, FloatArray]:

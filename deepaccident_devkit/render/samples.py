@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -22,17 +22,15 @@ from deepaccident_devkit.render.camera import (
 )
 from deepaccident_devkit.render.captions import (
     agent_handles,
-    box_handles,
     draw_legend,
     handles_from_above,
     has_cloud,
     missing_clouds_text,
     set_scene_title,
-    set_title,
     write_missing,
 )
 from deepaccident_devkit.render.figures import LAYERS, Layer, figure_or_new, layers_of
-from deepaccident_devkit.render.styles import AGENT_COLORS, in_own_settings
+from deepaccident_devkit.render.styles import AGENT_COLORS, current_style, in_own_settings, text_size
 from deepaccident_devkit.taxonomy import CAMERAS, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes, project_to_image
 
@@ -53,15 +51,14 @@ _TALL_GRID: Final = (
 """The same in a figure of about 16 to 9."""
 _WIDE: Final = 2.1
 """The least width by height of a figure with room for three cameras and a view from above side by side."""
-_VIEW_RANGE: Final = 50.0
-"""Metres to each side of an agent if there are several; in a tall figure more to its left and right."""
-_TALLEST: Final = 2.0
 _LEAST_SHARED, _AROUND_SHARED = 30.0, 12.0
 """Metres: the least reach of a view that agents share, and what it shows around them."""
 _MOST_CAMERAS: Final = 0.66
 """Of the width, for cameras beside a shared view."""
-_BESIDE, _ABOUT = 0.9, 1.6
-"""Inches of room for words beside panels, and above and below them."""
+_ABOUT, _BESIDE, _TITLE = 0.178, 0.08, 0.02
+"""Inches of room for words above and below panels, beside them, and for a panel's title, for letters of one point."""
+_WIDEST: Final = 2.2
+"""Width by height at most of a view that agents share."""
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
 CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
@@ -103,10 +100,14 @@ def render_sample(
     in_cameras, from_above = panel_layers(layers)
     record = dataset.get("sample", sample)
     names = cooperating_agents(dataset, record, agents)
-    fig = figure_or_new(fig, (16, 5.6))
-    wide = fig.bbox.width > _WIDE * fig.bbox.height
-    grid, ratios = (CAMERA_GRID, (4, 4, 4, 4.5)) if wide else (_TALL_GRID, (4, 4, 8))
-    axes = fig.subplot_mosaic([[*row, "bev"] for row in grid], width_ratios=ratios)
+    fig = figure_or_new(fig, (16, 5.6), page=0.42, column=1.6)
+    width, height = fig.bbox.size
+    if height > width:
+        mosaic: list[Any] = [*map(list, CAMERA_GRID), ["bev"] * 3]
+        axes = fig.subplot_mosaic(mosaic, height_ratios=(1, 1, 16 / 3))
+    else:
+        grid, ratios = (CAMERA_GRID, (4, 4, 4, 4.5)) if width > _WIDE * height else (_TALL_GRID, (4, 4, 8))
+        axes = fig.subplot_mosaic([[*row, "bev"] for row in grid], width_ratios=ratios)
     for channel in CAMERAS:
         draw_camera(dataset, dataset.get("sample_data", f"{record['token']}/{channel}"), in_cameras, axes[channel])
     shown = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
@@ -124,7 +125,7 @@ def render_frame(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render the front views of a moment's agents, and each one's boxes and LiDAR from above, side by side.
+    """Render the front views of a moment's agents beside one view of all of them from above, in world.
 
     The colliding pair is red, other recording vehicles have their agents' hues, all others a shade for their category.
 
@@ -133,42 +134,24 @@ def render_frame(
         frame: token or record.
         agents: which agents, or None for all that are there; a configuration is as seen from the first that is there.
             Their order is always that of `taxonomy.AGENTS`.
-        layers: each panel renders those of them that it has: cameras have those of `render_sample_data`, panels from
+        layers: each panel renders those of them that it has: cameras have those of `render_sample_data`, the panel from
             above those of `render_bev`. By default each panel has its own default.
-        fig: an empty figure to render on; a new one if None. Panels from above show 50 m in front of and behind the
-            agent, and in a tall figure more to its left and right.
+        fig: an empty figure to render on; a new one if None. The view from above is as wide as the agents need, and in
+            a figure that is higher than wide below the cameras.
 
     Returns:
-        The figure, one column for each agent. An image that was not downloaded is a grey panel.
+        The figure. An image that was not downloaded is a grey panel.
 
     Raises:
         TokenError: no such frame.
         ChoiceError: no such layer, agent or configuration.
         NotAvailableError: an agent is not in this (partial) release.
     """
-    in_cameras, from_above = panel_layers(layers)
-    record = dataset.get("frame", frame)
-    first = dataset.samples_of(record)[0]
-    names = in_drawing_order(cooperating_agents(dataset, first, agents))
-    fig = figure_or_new(fig, (3.6 * len(names), 6.9))
-    tall = _tallness(fig, len(names))
-    view = BevView(view_range=_VIEW_RANGE * tall)
-    axes = fig.subplots(2, len(names), squeeze=False, height_ratios=(9 / 16, tall))
-    drawn: set[str] = set()
-    for column, agent in enumerate(names):
-        sample = at_once(first, agent)
-        draw_camera(dataset, dataset.get("sample_data", f"{sample}/Camera_Front"), in_cameras, axes[0, column])
-        axes[0, column].set_title(agent)
-        above = axes[1, column]
-        drawn |= draw_bev(dataset, sample, view, from_above, above)[0]
-        above.set_xlim(-_VIEW_RANGE, _VIEW_RANGE)
-        if column:
-            above.set_ylabel("")
-            above.tick_params(labelleft=False)
-    if fig.figure is fig:  # a part of a figure is laid out with it
-        fig.set_layout_engine("compressed")
-    draw_legend(fig, box_handles(drawn))
-    set_scene_title(fig, dataset, record["token"])
+    first = dataset.samples_of(dataset.get("frame", frame))[0]
+    names = cooperating_agents(dataset, first, agents)
+    panel_layers(layers)  # refused before a figure is made
+    fig = figure_or_new(fig, (14.5, 6.0), page=0.62, column=1.5)
+    draw_shared_moment(dataset, frame, agents=names, layers=layers, fig=fig)
     return fig
 
 
@@ -183,22 +166,15 @@ def draw_shared_moment(
     record = dataset.get("frame", frame)
     names = in_drawing_order(agents)
     moments = [at_once(dataset.samples_of(record)[0], agent) for agent in names]
-    width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi
-    rows = min(2 if width > _WIDE * height else 3, len(names))
-    columns = -(-len(names) // rows)
-    camera_width = (height - _ABOUT) / rows * 16 / 9
-    share = min(columns * camera_width, _MOST_CAMERAS * width)
-    grid = fig.add_gridspec(rows, columns + 1, width_ratios=(width - share, *[share / columns] * columns))
-    for number, (agent, moment) in enumerate(zip(names, moments, strict=True)):
-        ax = fig.add_subplot(grid[number // columns, 1 + number % columns])
+    above, wide, cameras = _moment_panels(fig, len(names))
+    for agent, moment, ax in zip(names, moments, cameras, strict=True):
         draw_camera(dataset, dataset.get("sample_data", f"{moment}/Camera_Front"), in_cameras, ax)
         ax.set_title(short_name(agent), fontsize="medium")
     places = np.array([dataset.world_from(moment, "ego").translation[:2] for moment in moments])
     low, high = places.min(axis=0), places.max(axis=0)
     reach = max(_LEAST_SHARED, float((high - low).max()) / 2 + _AROUND_SHARED)
     x, y = ((low + high) / 2).tolist()
-    view = BevView(view_range=reach, frame="world", agents=tuple(names), center=(x, y))
-    above = fig.add_subplot(grid[:, 0])
+    view = BevView(view_range=reach, frame="world", agents=tuple(names), center=(x, y), wide=wide)
     shown = draw_bev(dataset, moments[0], view, from_above, above)
     above.set_anchor("C")
     draw_legend(fig, handles_from_above(*shown))
@@ -213,11 +189,32 @@ def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], froz
     return chosen.intersection(CAMERA_LAYERS), chosen.intersection(BEV_LAYERS)
 
 
-def _tallness(fig: Figure, columns: int) -> float:
-    """Height by width, at least 1, of panels from above that fill the figure below cameras of 16 to 9."""
-    width = (fig.bbox.width / fig.dpi - _BESIDE) / columns
-    height = fig.bbox.height / fig.dpi - _ABOUT
-    return min(max(height / width - 9 / 16, 1.0), _TALLEST)
+def _moment_panels(fig: Figure, agents: int) -> tuple[Axes, float, list[Axes]]:
+    """The panel from above, how wide by high it is, and one for each agent's camera beside it.
+
+    In a figure that is higher than wide, and in a paper, cameras are above it.
+    """
+    width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi
+    room = height - _ABOUT * text_size()
+    if height > width or current_style().room == "page":
+        columns = agents if width > height else min(_COLUMNS, agents)
+        rows = -(-agents // columns)
+        room -= rows * (width / columns * 9 / 16 + _TITLE * text_size())
+        tall = fig.add_gridspec(rows + 1, columns, height_ratios=(*[width / columns * 9 / 16] * rows, room))
+        cameras, above, broad = _filled(fig, tall, agents, first=0), fig.add_subplot(tall[rows, :]), width
+    else:
+        rows = min(2 if width > _WIDE * height else 3, agents)
+        columns = -(-agents // rows)
+        share = min(columns * room / rows * 16 / 9, _MOST_CAMERAS * width)
+        grid = fig.add_gridspec(rows, columns + 1, width_ratios=(width - share, *[share / columns] * columns))
+        cameras, above, broad = _filled(fig, grid, agents, first=1), fig.add_subplot(grid[:, 0]), width - share
+    return above, min(max(1.0, (broad - _BESIDE * text_size()) / room), _WIDEST), cameras
+
+
+def _filled(fig: Figure, grid: Any, number: int, *, first: int) -> list[Axes]:
+    """So many axes in a grid, from a first column on, row by row."""
+    columns = grid.ncols - first
+    return [fig.add_subplot(grid[each // columns, first + each % columns]) for each in range(number)]
 
 
 @in_own_settings
@@ -265,16 +262,20 @@ def render_calibration(
         if has_cloud(dataset, at_once(record, agent))
     }
     boxes = cooperative_boxes(dataset, sample, agents=names)
-    rows = -(-len(cameras) // _COLUMNS)
-    fig = figure_or_new(fig, (15, 3.1 * rows + 0.8))
-    axes = fig.subplots(rows, min(_COLUMNS, len(cameras)), squeeze=False)
+    columns = 2 if current_style().room == "column" else _COLUMNS
+    rows = -(-len(cameras) // columns)
+    fig = figure_or_new(fig, (15, 3.1 * rows + 0.8), page=0.2 * rows + 0.06, column=0.33 * rows + 0.12)
+    axes = fig.subplots(rows, min(columns, len(cameras)), squeeze=False)
     for ax in axes.flat[len(cameras) :]:
         ax.set_axis_off()
     for camera, ax in zip(cameras, axes.flat, strict=False):
         _draw_panel(dataset, camera, clouds, boxes, chosen, ax)
         if is_frame:
-            set_title(ax, f"{camera.rsplit('/', 3)[1]}, Camera_Front")
-    draw_legend(fig, agent_handles(clouds))
+            ax.set_title(f"{short_name(camera.rsplit('/', 3)[1])}, front")
+    if len(cameras) < axes.size:
+        draw_legend(axes.flat[-1], agent_handles(clouds), columns=1, loc="center")
+    else:
+        draw_legend(fig, agent_handles(clouds))
     write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
     whose = "each agent" if len(names) > 1 else names[0]
     where = record["frame_token"] if is_frame else record["token"]

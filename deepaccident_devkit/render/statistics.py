@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.captions import draw_legend
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import detached_figure, figure_or_new, with_light_grid, write_figure
 from deepaccident_devkit.render.styles import (
     CATEGORY_COLORS,
@@ -20,6 +19,7 @@ from deepaccident_devkit.render.styles import (
     GRID_COLOR,
     SPLIT_COLORS,
     in_own_settings,
+    text_size,
 )
 from deepaccident_devkit.statistics import (
     GROUPS,
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI = 120
+_LEAST_SHARE: Final = 0.1
+"""Percents: a smaller share has no number."""
 _Draw = Callable[[DatasetStatistics, "Figure"], None]
 _WIDTH: Final = 10.7
 """Inches of a page of A4 in landscape."""
@@ -58,7 +60,7 @@ def draw_counts(table: CountTable, ax: Axes) -> Axes:
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
     for position, total in enumerate(starts):
         share = f" ({100 * total / whole:.0f} %)" if whole else ""
-        how: Any = {"textcoords": "offset points", "va": "center", "fontsize": SMALLEST_TEXT}
+        how: Any = {"textcoords": "offset points", "va": "center", "fontsize": text_size()}
         ax.annotate(f"{total:,}{share}", (total, position), (4, 0), **how)
     ax.set_yticks(range(len(values)), values)
     ax.invert_yaxis()
@@ -84,7 +86,7 @@ def draw_quantiles(table: QuantileTable, field: str, ax: Axes) -> Axes:
     rows = [row for row in table.quantiles if row.field == field and row.group == GROUPS[0] and row.values]
     draw_quantile_boxes({row.category: row for row in rows}, ax)
     ax.set(ylabel=f"{field} ({table.unit})", title=f"{field.capitalize()} by category", ylim=(0, None))
-    ax.tick_params(axis="x", labelsize=SMALLEST_TEXT)
+    ax.tick_params(axis="x", labelsize=text_size())
     return ax
 
 
@@ -99,7 +101,7 @@ def draw_angles(histogram: Histogram, ax: Axes) -> Axes:
     middles = [radians((low + high) / 2) for low, high in pairwise(edges)]
     _draw_stacked(histogram, ax, middles, radians(edges[1] - edges[0]))
     ax.set_xticks([radians(angle) for angle in range(0, 360, 30)])
-    ax.tick_params(labelsize=SMALLEST_TEXT)
+    ax.tick_params(labelsize=text_size())
     counts = histogram.counts[GROUPS[0]]
     lowest = min(range(len(counts)), key=lambda bar: counts[bar - 1] + counts[bar])
     ax.set_rlabel_position(edges[lowest])  # beside the bars
@@ -149,9 +151,9 @@ def draw_quantile_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
         medians = [row.values[PROBABILITIES.index(0.5)] for row in rows.values() if row.values]
         for position, median in enumerate(medians, 1):
             text = f"{median:.{1 if median >= 10 else 2}f}"
-            ax.annotate(text, (position + 0.25, median), va="center", fontsize=SMALLEST_TEXT)
+            ax.annotate(text, (position + 0.25, median), va="center", fontsize=text_size())
         ax.set_xlim(0.6, len(boxes) + 0.75)
-    ax.set_xlabel("line: median; box: 25–75 %; whiskers: 5–95 %", fontsize=SMALLEST_TEXT)
+    ax.set_xlabel("line: median; box: 25–75 %; whiskers: 5–95 %", fontsize=text_size())
     with_light_grid(ax, "y")
 
 
@@ -172,7 +174,8 @@ def _title(histogram: Histogram) -> str:
     if not outside:
         return histogram.title
     share = 100 * outside / histogram.total()
-    return f"{histogram.title}\n({share:.2g} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
+    words = f"{share:.1f}" if share >= _LEAST_SHARE else f"less than {_LEAST_SHARE}"
+    return f"{histogram.title}\n({words} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
 
 
 def _counting(axis: Axis) -> None:
@@ -239,8 +242,8 @@ def _collisions(statistics: DatasetStatistics, fig: Figure) -> None:
     draw_angles(statistics.histograms["collision_angles"], ax=angles)
     draw_angles(statistics.histograms["collision_bearings"], ax=bearings)
     headings = "collisions by the other's heading: 0° the same,\n90° to the left, 180° head-on, 270° to the right"
-    angles.set_xlabel(headings, fontsize=SMALLEST_TEXT)
-    bearings.set_xlabel("collisions by where the other is:\n0° ahead, 90° left, 270° right", fontsize=SMALLEST_TEXT)
+    angles.set_xlabel(headings, fontsize=text_size())
+    bearings.set_xlabel("collisions by where the other is:\n0° ahead, 90° left, 270° right", fontsize=text_size())
     draw_relative_positions(statistics.collisions, ax=fig.add_subplot(1, 3, 3))
 
 
@@ -274,7 +277,7 @@ def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure 
     shown = [name for name in SPLIT_COLORS if name in handles]
     if shown:
         chosen = [handles[name] for name in shown]
-        fig.legend(chosen, shown, loc="outside lower center", ncols=len(shown), title="split", fontsize=SMALLEST_TEXT)
+        fig.legend(chosen, shown, loc="outside lower center", ncols=len(shown), title="split", fontsize=text_size())
     return fig
 
 

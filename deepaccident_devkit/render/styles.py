@@ -10,13 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import RLock
+from types import MappingProxyType
 from typing import Any, Final, Literal, TypeVar, cast, get_args
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.support.pages import part
-from deepaccident_devkit.taxonomy import AGENTS, SPLITS
+from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.taxonomy import AGENTS, SPLITS, StyleName
 
 AGENT_COLORS: Mapping[str, str] = dict(
     zip(AGENTS, ("#2b6fe0", "#2fc0cc", "#fa7b40", "#dfb000", "#563083"), strict=True)
@@ -32,6 +34,15 @@ CATEGORY_COLORS: Mapping[str, str] = {
     "motorcycle": "#7b8996",
     "pedestrian": "#1d272f",
 }
+CLASS_COLORS: Mapping[str, str] = {
+    "car": "#40409f",
+    "truck": "#402040",
+    "van": "#9f9fdf",
+    "cyclist": "#40bf9f",
+    "motorcycle": "#ff8000",
+    "pedestrian": "#9f00ff",
+}
+"""Hues of the classes, for pictures that are about them: all eyes tell them from each other and from the pair's red."""
 CATEGORY_MARKERS: Mapping[str, str] = {"cyclist": "D", "motorcycle": "^", "pedestrian": "o"}
 """matplotlib's markers of the classes whose boxes are too small to be found from above."""
 INSTANCE_COLORS = ("#63717e", "#b5c3cf", "#4a5864", "#94a2b0", "#323f4b", "#7b8996")
@@ -92,10 +103,10 @@ COLORS: Final = f"""
 """
 """Dark for readers whose system is."""
 Drawing = TypeVar("Drawing", bound=Callable[..., Any])
-StyleName = Literal["paper", "slide"]
-_ROOM_FOR_WORDS: Final = 0.8
-"""Inches of a picture's height that words take, about: they do not shrink with the picture."""
-_TEXT: Final = {"font.size": 9, "axes.titlesize": 9, "figure.titlesize": 10, "pdf.fonttype": 42, "ps.fonttype": 42}
+_ROOM_FOR_WORDS: Final = 0.5
+"""Inches of a picture's height that words take, about: they shrink less than the picture."""
+_FONTS: Final = {"pdf.fonttype": 42, "ps.fonttype": 42}
+"""Type 42: the letters of a PDF file stay letters, as publishers ask."""
 _applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
 _ONE_AT_A_TIME: Final = RLock()  # matplotlib has its settings once for all threads
 
@@ -114,7 +125,11 @@ class _Style:
         panel: inches of the width of a picture with one panel; None for the view's own.
         figure: the same with several panels.
         ratio: width by height; None for the view's own.
+        letters: points of the smallest letters.
+        room: what a picture with several panels has room for: all of them, a page's width, a column or a slide.
         tokens: whether titles have tokens.
+        titled: whether pictures have a title.
+        by_class: whether boxes have the hues of their classes, all but the pair's.
         rc: matplotlib's settings.
     """
 
@@ -122,18 +137,45 @@ class _Style:
     panel: float | None = None
     figure: float | None = None
     ratio: float | None = None
+    letters: float = 9
+    room: Literal["all", "page", "column", "slide"] = "all"
     tokens: bool = True
+    titled: bool = True
+    by_class: bool = False
     rc: Mapping[str, Any]
 
+    @property
+    def few(self) -> bool:
+        """Whether views with many panels show few of them."""
+        return self.room != "all"
 
+
+def _small(letters: float, **how: Any) -> _Style:
+    """A style of small pictures with letters of so many points."""
+    sizes = {"font.size": letters, "axes.titlesize": letters, "figure.titlesize": letters + 1, "axes.linewidth": 0.6}
+    ticks = {f"{axis}tick.{name}": size for axis in "xy" for name, size in (("major.size", 2.5), ("major.pad", 2.0))}
+    return _Style(letters=letters, tokens=False, rc={**_FONTS, **sizes, **ticks, "axes.labelpad": 2.0}, **how)
+
+
+def _printed(panel: float, figure: float) -> _Style:
+    """A style of a paper; letters of 7 points in DejaVu Sans are as tall as 9 points of Times."""
+    return _small(7, dpi=300, panel=panel, figure=figure, room="column" if figure < _COLUMN else "page")
+
+
+_COLUMN: Final = 4.0
+"""Inches: a narrower picture is a column of a paper."""
 _STYLES: Final[Mapping[str, _Style]] = {
-    "paper": _Style(dpi=300, panel=3.5, figure=7.2, tokens=False, rc=_TEXT),
-    # letters of 9 points are large on a slide that is 8 inches wide
-    "slide": _Style(dpi=240, panel=8.0, figure=8.0, ratio=16 / 9, tokens=False, rc=_TEXT),
+    "paper": _printed(3.5, 7.16),
+    "cvpr-column": _printed(3.25, 3.25),
+    "cvpr-page": _printed(6.875, 6.875),
+    "ieee-column": _printed(3.5, 3.5),
+    "ieee-page": _printed(7.16, 7.16),
+    # letters of 8 points are large on a slide that is 8 inches wide
+    "slide": _small(8, dpi=240, panel=8.0, figure=8.0, ratio=16 / 9, room="slide"),
 }
 
 
-_NOTEBOOK: Final = _Style(dpi=100, rc={})
+_NOTEBOOK: Final = _Style(dpi=100, rc=_FONTS)
 
 
 _current: ContextVar[_Style] = ContextVar("style", default=_NOTEBOOK)
@@ -167,22 +209,29 @@ def in_own_settings(function: Drawing) -> Drawing:
 
 
 @contextmanager
-def style(name: StyleName) -> Iterator[None]:
-    """In a `with` statement: new pictures have the size and the letters that a paper or a slide needs.
+def style(
+    name: StyleName | None = None, *, title: bool = True, color_by: Literal["role", "class"] = "role"
+) -> Iterator[None]:
+    """In a `with` statement: new pictures have the size, panels and letters that a paper or a slide needs.
 
     Args:
-        name: `paper`: 3.5 inches wide, or with several panels 7.2 (one and two columns), letters of 9 points or more,
-            fonts embedded in PDF, 300 pixels an inch. `slide`: 16 to 9, with large letters, 1920 × 1080 pixels.
-            Neither has tokens.
+        name: `cvpr-column` (3.25 inches wide), `cvpr-page` (6.875), `ieee-column` (3.5) and `ieee-page` (7.16), for
+            papers: letters of 7 points or more, 300 pixels an inch. `paper`: an IEEE column, or with several panels a
+            page. `slide`: 16 to 9, with large letters, 1920 × 1080 pixels. None: as in a notebook. In papers and on
+            slides views of many panels show fewer, and nothing has tokens.
+        title: whether pictures have a title; a paper's caption may say it.
+        color_by: what the colours of boxes mean: the `role` in the accident, or the `class`, with a hue for each; the
+            pair is red in both.
 
     Raises:
-        ChoiceError: no such style.
+        ChoiceError: no such style or way to colour.
     """
     from matplotlib import rc_context
 
-    if name not in _STYLES:
-        raise ChoiceError(f"style: expected {' or '.join(get_args(StyleName))}, found {name!r}")
-    chosen = _STYLES[name]
+    if name is not None and name not in _STYLES:
+        raise ChoiceError(f"style: expected one of {', '.join(get_args(StyleName))}, found {name!r}")
+    by_class = choice("color_by", color_by, ("role", "class")) == "class"
+    chosen = replace(_NOTEBOOK if name is None else _STYLES[name], titled=title, by_class=by_class)
     token = _current.set(chosen)
     try:
         with rc_context(cast("Any", {**chosen.rc, "savefig.dpi": chosen.dpi})):
@@ -196,13 +245,30 @@ def current_style() -> _Style:
     return _current.get()
 
 
-def size_in_style(size: tuple[float, float], *, panels: Literal["one", "several"]) -> tuple[float, float]:
-    """Inches in the current style of a picture that would have this size in a notebook."""
+def category_colors() -> Mapping[str, str]:
+    """The colours of classes in pictures that are made now."""
+    return CLASS_COLORS if _current.get().by_class else CATEGORY_COLORS
+
+
+def text_size() -> float:
+    """Points of the smallest letters of pictures that are made now: they can be read in print."""
+    return _current.get().letters
+
+
+def size_in_style(
+    size: tuple[float, float], *, panels: Literal["one", "several"], heights: Mapping[str, float] = MappingProxyType({})
+) -> tuple[float, float]:
+    """Inches in the current style of a picture that would have this size in a notebook.
+
+    `heights` are those of `page` and `column`, in widths, where a view has other panels there.
+    """
     chosen = _current.get()
     width = chosen.panel if panels == "one" else chosen.figure
     if width is None:
         return size
     if chosen.ratio is not None:
         return width, width / chosen.ratio
+    if chosen.room in heights:
+        return width, width * heights[chosen.room]
     share = width / size[0]
     return width, share * size[1] + max(0.0, 1 - share) * _ROOM_FOR_WORDS

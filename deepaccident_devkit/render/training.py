@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 
 from deepaccident_devkit.render.figures import (
     axes_or_new,
-    detached_figure,
     figure_or_new,
+    report_figure,
     with_light_grid,
-    write_figure,
+    write_report_figure,
 )
-from deepaccident_devkit.render.styles import MUTED_COLOR, OWN_COLOR, PREDICTED_COLOR, in_own_settings
+from deepaccident_devkit.render.styles import MUTED_COLOR, OWN_COLOR, PREDICTED_COLOR, in_own_settings, text_size
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,8 +37,11 @@ def render_curve(steps: Sequence[int], values: Sequence[float], title: str, *, a
     crowded = len(values) > _MEANS
     ax.plot(steps, values, ".", color=MUTED_COLOR if crowded else PREDICTED_COLOR, markersize=2 if crowded else 6)
     groups = [np.array_split(np.asarray(each, dtype=float), min(_MEANS, len(values)) or 1) for each in (steps, values)]
-    ax.plot(*([group.mean() for group in each] for each in groups), color=OWN_COLOR if crowded else PREDICTED_COLOR)
-    ax.set_title(title, fontsize=9)
+    with catch_warnings():
+        simplefilter("ignore", RuntimeWarning)  # a group of gaps alone is a gap
+        means = [[np.nanmean(group) for group in each] for each in groups]
+    ax.plot(*means, color=OWN_COLOR if crowded else PREDICTED_COLOR)
+    ax.set_title(title, fontsize=text_size())
     ax.set_ylim(bottom=0)
     return with_light_grid(ax, "both")
 
@@ -58,17 +63,22 @@ def render_training(rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figur
 
 
 def save_training(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
-    """Write `render_training` into a PNG file, which it replaces. Raises OSError."""
-    write_figure(render_training(rows, title, fig=detached_figure(_size(len(_curves(rows))))), path, dpi=_DPI)
+    """Write `render_training` into a PNG file, as `write_report_figure` does. Raises OSError."""
+    write_report_figure(render_training(rows, title, fig=report_figure(_size(len(_curves(rows))))), path, dpi=_DPI)
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[int, float]]]:
-    """Name → (step, value): losses first, then scores."""
+    """Name → (step, value): losses first, their total before them, then scores.
+
+    A loss of exactly 0 was computed of nothing, and is a gap (NaN).
+    """
     losses: dict[str, list[tuple[int, float]]] = {}
     scores: dict[str, list[tuple[int, float]]] = {}
     for row in rows:
-        for name, value in (row.get("losses") or {}).items():
-            losses.setdefault(name, []).append((row["step"], value))
+        parts = row.get("losses") or {}
+        total = {"total": row["loss"]} if "loss" in row and parts else {}
+        for name, value in (total | parts).items():
+            losses.setdefault(name, []).append((row["step"], value or math.nan))
         for name, value in (row.get("validation") or {}).items():
             scores.setdefault(f"validation: {name}", []).append((row["step"], value))
     return losses | scores

@@ -20,7 +20,7 @@ from deepaccident_devkit.render.boxes import (
 )
 from deepaccident_devkit.render.captions import (
     agent_handles,
-    draw_legend,
+    draw_legend_outside,
     has_cloud,
     missing_clouds_text,
     set_scene_title,
@@ -34,6 +34,7 @@ from deepaccident_devkit.render.figures import (
     check_view_range,
     layers_of,
     settled,
+    widening,
     with_light_grid,
 )
 from deepaccident_devkit.render.styles import (
@@ -42,7 +43,9 @@ from deepaccident_devkit.render.styles import (
     GRID_COLOR,
     MUTED_COLOR,
     OWN_COLOR,
+    current_style,
     in_own_settings,
+    text_size,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.support.text import choice
@@ -73,6 +76,7 @@ _EDGE: Final = 0.05
 _MIDDLE: Final = 0.36
 """Of the table's width, about: where the middle of the picture is, with the names of actors on the left."""
 _MOST_ROWS: Final = 24
+_ROWS_OF_A_SLIDE: Final = 14
 _BRIGHT: Final = 0.3
 """Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
 
@@ -220,8 +224,8 @@ def render_visibility(
     if view_range is not None:
         check_view_range(view_range)
     known = visibility_of(dataset, moment, agents, frame)
+    low, high = _view(known, view_range, widening(ax))
     own_figure, ax = ax is None, axes_or_new(ax, (6, 6.9))
-    low, high = _view(known, view_range)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
     words = axis_words(frame)
     ax.set(xlabel=words[0], ylabel=words[1])
@@ -278,32 +282,34 @@ def render_visibility_matrix(
     """
     known = visibility_of(dataset, moment, agents)
     rows = np.lexsort((known.boxes.actor_id, -known.seen.sum(axis=1), ~known.records, ~known.collides))
-    shown = rows[:_MOST_ROWS]
+    shown = rows[: _ROWS_OF_A_SLIDE if current_style().room == "slide" else _MOST_ROWS]
     columns = in_drawing_order(known.agents)
-    ax = axes_or_new(ax, (1.4 + 0.75 * len(columns), 1.2 + 0.27 * max(len(shown), 4)))
+    ax = axes_or_new(ax, (1.4 + 0.75 * len(columns), 1.2 + 0.29 * max(len(shown), 4)))
     for column, agent in enumerate(columns):
         _draw_column(known, shown, agent, column, ax)
     names = known.boxes.category_names
     words = [f"{names[row]} {known.boxes.actor_id[row]}" for row in shown.tolist()]
-    ax.set_yticks(range(len(shown)), words, fontsize=SMALLEST_TEXT)
+    ax.set_yticks(range(len(shown)), words, fontsize=text_size())
     for label, row in zip(ax.get_yticklabels(), shown.tolist(), strict=True):
         label.set_color(COLLIDER_COLOR if known.collides[row] else OWN_COLOR)
     heads = [short_name(agent) for agent in columns]
-    ax.set_xticks(range(len(columns)), heads, fontsize=SMALLEST_TEXT, rotation=90)
+    ax.set_xticks(
+        range(len(columns)), heads, fontsize=text_size(), rotation=0 if current_style().room == "slide" else 90
+    )
     ax.xaxis.tick_top()
     ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(max(len(shown), 1) - 0.5, -0.5))
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
     more = len(rows) - len(shown)
-    key = ["filled: the agent sees the actor", "number: its LiDAR points, 0: none", "–: not in the agent's label"]
-    ax.set_xlabel("\n".join([*key, *([f"{more} more actors"] if more else [])]), fontsize=SMALLEST_TEXT)
+    key = ["filled: seen; number: LiDAR points;", "–: not in the agent's label"]
+    ax.set_xlabel("\n".join([*key, *([f"{more} more actors"] if more else [])]), fontsize=text_size())
     above: dict[str, Any] = {"x": _MIDDLE, "y": None}  # above the heads of the columns
     set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], below="who sees whom", **above)
     return ax
 
 
-def _view(known: Visibility, view_range: float | None) -> tuple[FloatArray, FloatArray]:
-    """The lower left and the upper right corner, (2,) each, of the square that is shown."""
+def _view(known: Visibility, view_range: float | None, wide: float) -> tuple[FloatArray, FloatArray]:
+    """The lower left and the upper right corner, (2,) each, of the square that is shown, or of a wider one."""
     if view_range is not None:
         column = known.agents.index(known.ego) if known.ego in known.agents else 0
         middle, half = known.place[column], view_range
@@ -313,7 +319,8 @@ def _view(known: Visibility, view_range: float | None) -> tuple[FloatArray, Floa
         among = (np.abs(corners - middle) < half).all(axis=-1).any(axis=-1)  # none of them is cut
         whole = np.concatenate([[middle - half, middle + half], *corners[among]])
         middle, half = _square_about(whole, _EDGE * half * (np.abs(whole - middle).max() > half))
-    return middle - half, middle + half
+    sides = half * np.array([wide, 1.0])
+    return middle - sides, middle + sides
 
 
 def _square_about(places: FloatArray, margin: float) -> tuple[FloatArray, float]:
@@ -324,7 +331,7 @@ def _square_about(places: FloatArray, margin: float) -> tuple[FloatArray, float]
 
 def _draw_points(dataset: Dataset, known: Visibility, frame: str, ax: Axes) -> None:
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-    middle, half = np.array([left + right, low + high]) / 2, (right - left) / 2
+    middle, half = np.array([left + right, low + high]) / 2, np.array([right - left, high - low]) / 2
     scenario, _, number = known.sample.rsplit("/", 2)
     absent = [agent for agent in known.agents if not has_cloud(dataset, f"{scenario}/{agent}/{number}")]
     write_missing(ax, missing_clouds_text(absent))
@@ -332,7 +339,7 @@ def _draw_points(dataset: Dataset, known: Visibility, frame: str, ax: Axes) -> N
         if agent in absent:
             continue
         cloud = aggregate_point_cloud(dataset, known.sample, agents=[agent], frame=frame)
-        draw_points_from_above(cloud.xyz, ax, center=middle, view_range=half, color=AGENT_COLORS[agent])
+        draw_points_from_above(cloud.xyz, ax, center=middle, half=half, color=AGENT_COLORS[agent])
 
 
 def _draw_sight_lines(known: Visibility, ax: Axes) -> None:
@@ -350,18 +357,18 @@ def _draw_sight_lines(known: Visibility, ax: Axes) -> None:
 def _draw_dots(known: Visibility, ax: Axes) -> None:
     from matplotlib.transforms import ScaledTranslation
 
-    order = in_drawing_order(known.agents)
-    inches = ax.figure.dpi_scale_trans
+    order, scale = in_drawing_order(known.agents), text_size() / SMALLEST_TEXT
+    inches, slot_width, above = ax.figure.dpi_scale_trans, _SLOT * scale, _ABOVE * scale
     tops = np.column_stack([known.boxes.center[:, 0], known.boxes.bottom_corners()[..., 1].max(axis=1)])
-    side = len(order) / 2 * _SLOT
-    keep_free(ax, tops[known.seen.any(axis=1), None], margin=(-side, 0.0, side, 2 * _ABOVE))
+    side = len(order) / 2 * slot_width
+    keep_free(ax, tops[known.seen.any(axis=1), None], margin=(-side, 0.0, side, 2 * above))
     for slot, agent in enumerate(order):
         x, y = tops[known.seen[:, known.agents.index(agent)]].T
-        beside = ScaledTranslation((slot - (len(order) - 1) / 2) * _SLOT / 72, _ABOVE / 72, inches)
+        beside = ScaledTranslation((slot - (len(order) - 1) / 2) * slot_width / 72, above / 72, inches)
         ax.scatter(
             x,
             y,
-            s=15,
+            s=15 * scale**2,
             c=AGENT_COLORS[agent],
             edgecolors="white",
             linewidths=0.4,
@@ -380,18 +387,22 @@ def _write_hidden(known: Visibility, hidden: BoolArray, ax: Axes) -> None:
 
 
 def _draw_agents(known: Visibility, ax: Axes) -> None:
+    scale = text_size() / SMALLEST_TEXT
+    if current_style().few:
+        names = [(short_name(agent), place) for agent, place in zip(known.agents, known.place.tolist(), strict=True)]
+        place_chips(ax, names, colors=[AGENT_COLORS[agent] for agent in known.agents])
     for agent, (x, y) in zip(known.agents, known.place.tolist(), strict=True):
-        ax.plot(x, y, "*", color=AGENT_COLORS[agent], markeredgecolor="white", markersize=10, zorder=5)
+        ax.plot(x, y, "*", color=AGENT_COLORS[agent], markeredgecolor="white", markersize=10 * scale, zorder=5)
     if known.ego in known.agents:
         x, y = known.place[known.agents.index(known.ego)].tolist()
-        ax.plot(x, y, "o", markersize=15, fillstyle="none", color=AGENT_COLORS[known.ego], zorder=5)
+        ax.plot(x, y, "o", markersize=12 * scale, fillstyle="none", color=AGENT_COLORS[known.ego], zorder=5)
 
 
 def _draw_legend(known: Visibility, hidden: BoolArray, shown: Collection[Layer], ax: Axes) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles, ego = agent_handles(known.agents), short_name(known.ego)
+    handles, ego = agent_handles(() if current_style().few else known.agents), short_name(known.ego)
     if known.pair:
         handles.append(Patch(facecolor="none", edgecolor=COLLIDER_COLOR, label="colliding pair"))
     mark: dict[str, Any] = {"linestyle": "none", "color": MUTED_COLOR}
@@ -402,8 +413,7 @@ def _draw_legend(known: Visibility, hidden: BoolArray, shown: Collection[Layer],
         handles.append(Line2D([], [], color=MUTED_COLOR, linewidth=1.2, label="sees one of the pair"))
     if hidden.any():
         handles.append(Patch(facecolor="none", edgecolor=OWN_COLOR, linestyle="--", label=f"{ego} cannot see"))
-    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0), "borderaxespad": 5}
-    draw_legend(ax, handles, columns=4, title="dots above an actor: who sees it", title_fontsize=SMALLEST_TEXT, **place)
+    draw_legend_outside(ax, handles, columns=4, title="dots above: who sees it", title_fontsize=text_size())
 
 
 def _draw_column(known: Visibility, rows: IntArray, agent: str, column: int, ax: Axes) -> None:
@@ -419,7 +429,7 @@ def _draw_column(known: Visibility, rows: IntArray, agent: str, column: int, ax:
                 "itself" if own else "–",
                 ha="center",
                 va="center",
-                fontsize=SMALLEST_TEXT,
+                fontsize=text_size(),
                 color=MUTED_COLOR,
             )
             continue
@@ -427,7 +437,7 @@ def _draw_column(known: Visibility, rows: IntArray, agent: str, column: int, ax:
         ax.add_patch(Rectangle((column - 0.3, place - 0.4), 0.6, 0.8, facecolor=face, edgecolor=edge))
         ink = _legible_on(AGENT_COLORS[agent]) if seen else MUTED_COLOR
         ax.text(
-            column, place, f"{known.points[row, source]}", ha="center", va="center", fontsize=SMALLEST_TEXT, color=ink
+            column, place, f"{known.points[row, source]}", ha="center", va="center", fontsize=text_size(), color=ink
         )
 
 

@@ -9,6 +9,7 @@ import click
 
 from deepaccident_devkit.cli.options import (
     engine_of,
+    figure_style_parameter,
     json_parameter,
     refuse_unused,
     release_parameters,
@@ -18,7 +19,7 @@ from deepaccident_devkit.cli.options import (
 )
 from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.render.figures import detached_figure, write_figure
+from deepaccident_devkit.render.figures import report_figure, write_report_figure
 from deepaccident_devkit.safety import (
     ObservationRule,
     avoidability_report,
@@ -28,7 +29,13 @@ from deepaccident_devkit.safety import (
     twin_report,
 )
 from deepaccident_devkit.safety.avoidability_report import GROUPS
-from deepaccident_devkit.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability, render_lead_times
+from deepaccident_devkit.safety.figures import (
+    AVOIDABILITY_SIZE,
+    COLUMN_HEIGHT,
+    LEAD_TIME_SIZE,
+    render_avoidability,
+    render_lead_times,
+)
 from deepaccident_devkit.safety.page import REPLAYS, save_safety_report
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 
@@ -51,7 +58,9 @@ def _replay_count(context: click.Context, parameter: click.Parameter, value: str
 
 def _picture(render: Callable[..., Any], size: tuple[float, float], *what: Any) -> Callable[[Path], Path]:
     """What renders a figure of this size into a file."""
-    return lambda path: write_figure(render(*what, fig=detached_figure(size)), path, dpi=_DPI)
+    return lambda path: write_report_figure(
+        render(*what, fig=report_figure(size, column=COLUMN_HEIGHT)), path, dpi=_DPI
+    )
 
 
 def _lead_time(dataset: DeepAccident, chosen: Scenarios, *, kind: Any, **engine: Any) -> tuple[Any, Files]:
@@ -116,6 +125,7 @@ _OF_TOPIC: Final = {
     help="Folder to write into: the page with its files, or tables (JSON, CSV) and figures. Of describe: a JSON Lines "
     "file, with the facts and the text of each scenario.",
 )
+@figure_style_parameter
 @json_parameter
 def safety(topic: str, where: tuple[str, ...], out: str | None, as_json: bool, **options: Any) -> None:
     """Look into the accidents in DATAROOT. TOPIC says what is asked of them:

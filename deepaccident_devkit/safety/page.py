@@ -14,12 +14,18 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.parallel import Engine, Places, run_batch
-from deepaccident_devkit.render.figures import detached_figure, write_figure
+from deepaccident_devkit.render.figures import report_figure, write_report_figure
 from deepaccident_devkit.render.replay import tried_replay
 from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.safety import COALITIONS, OUTCOMES, PARTNERS, AccidentRow, OutcomeShares, SafetyReport
 from deepaccident_devkit.safety.avoidability_report import GROUPS
-from deepaccident_devkit.safety.figures import AVOIDABILITY_SIZE, LEAD_TIME_SIZE, render_avoidability, render_lead_times
+from deepaccident_devkit.safety.figures import (
+    AVOIDABILITY_SIZE,
+    COLUMN_HEIGHT,
+    LEAD_TIME_SIZE,
+    render_avoidability,
+    render_lead_times,
+)
 from deepaccident_devkit.safety.lead_times import CAVEAT
 from deepaccident_devkit.safety.report import CRITICAL, DECELERATIONS, actor_name
 from deepaccident_devkit.support.files import place_in, plain_names, writable_folder, write_bytes
@@ -97,7 +103,7 @@ def save_safety_report(
     written.append(folder / "safety.json")
     write_bytes(written[-1], report.to_json().encode())
     drawn, pictures = list(figures_of(report)), place_in(folder, "figures", opened=True)
-    figures = [(each, write_figure(each.draw(), pictures / f"{each.name}.png", dpi=_DPI)) for each in drawn]
+    figures = [(each, write_report_figure(each.draw(), pictures / f"{each.name}.png", dpi=_DPI)) for each in drawn]
     names = {} if dataset is None else replay_names([row.scenario for row in by_severity(report.rows)][:replays])
     failed = {} if dataset is None else _make_replays(dataset, folder.absolute(), names, **how)
     pages = {scenario: name for scenario, name in names.items() if scenario not in failed}
@@ -229,9 +235,9 @@ def figures_of(report: SafetyReport) -> Iterator[_Drawn]:
     if report.ledger.accidents:
         yield _Drawn(
             name="lead_times",
-            caption="Mean lead times of all sets of agents with the ego, and what each partner adds.",
+            caption="Mean lead times of sets of agents with the ego, and what each partner adds.",
             alt="Mean lead times by set of agents and Shapley values of the partners; the tables have the numbers.",
-            draw=lambda: render_lead_times(report.ledger, fig=detached_figure(LEAD_TIME_SIZE)),
+            draw=lambda: render_lead_times(report.ledger, fig=report_figure(LEAD_TIME_SIZE, column=COLUMN_HEIGHT)),
         )
     for group in GROUPS:
         if report.avoidability.members(group):
@@ -244,4 +250,4 @@ def figures_of(report: SafetyReport) -> Iterator[_Drawn]:
 
 
 def _draw_avoidability(report: SafetyReport, group: str) -> Figure:
-    return render_avoidability(report.avoidability, group, fig=detached_figure(AVOIDABILITY_SIZE))
+    return render_avoidability(report.avoidability, group, fig=report_figure(AVOIDABILITY_SIZE, column=COLUMN_HEIGHT))

@@ -71,7 +71,7 @@ def render_prevention(result: PreventedResult, group: str | None = None, *, ax: 
     ticks = [0, 0.5, 1, 2, 5, 10, 20, 40]
     ax.set_xticks(ticks, [f"{each:g}" for each in ticks])
     ax.set_xticks([], minor=True)
-    ax.set(xlabel="braking seconds a minute without an accident", ylabel="share of the accidents")
+    ax.set(xlabel="← better: braking seconds a minute without an accident", ylabel="share of the accidents, better →")
     ax.set(xlim=(-0.03, 1.4 * _MOST), ylim=(-0.03, 1.05))
     handles, _ = ax.get_legend_handles_labels()
     draw_legend(ax, handles, columns=3, loc="upper center", bbox_to_anchor=(0.5, -0.22))  # inside are points

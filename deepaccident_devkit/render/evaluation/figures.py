@@ -27,9 +27,9 @@ from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.captions import draw_legend_of_fills, set_scene_title, set_title
 from deepaccident_devkit.render.evaluation import tasks
 from deepaccident_devkit.render.evaluation.panels import PANEL, UNKNOWN, render_breakdown
-from deepaccident_devkit.render.figures import axes_or_new, detached_figure, titled_from_above, write_figure
+from deepaccident_devkit.render.figures import axes_or_new, report_figure, titled_from_above, write_report_figure
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
-from deepaccident_devkit.render.styles import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR, in_own_settings
+from deepaccident_devkit.render.styles import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR, current_style, in_own_settings
 from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -80,17 +80,18 @@ class RunFigure:
 
 
 def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
-    """Render a figure of a run into a PNG file of a folder, atomically, over one that is there; returns its path."""
+    """Render a figure of a run into a PNG file of a folder, over one that is there, as `write_report_figure` does."""
     said = {"Title": drawn.name, "Description": " ".join(filter(None, (_mark(run), _made_of(run))))}
-    return write_figure(complete_figure(run, drawn), folder / f"{drawn.name}.png", dpi=_DPI, words=said)
+    return write_report_figure(complete_figure(run, drawn), folder / f"{drawn.name}.png", dpi=_DPI, words=said)
 
 
 @in_own_settings
 def complete_figure(run: EvaluationRun, drawn: RunFigure) -> Figure:
-    """A figure that names its task, protocol, devkit and release, and what a partial run lacks."""
-    figure = detached_figure((PANEL[0], drawn.height))
+    """A figure that names its task, protocol, devkit and release (not for papers), and what a partial run lacks."""
+    figure = report_figure((PANEL[0], drawn.height), panels="one")
     drawn.draw(ax=figure.add_subplot())
-    figure.supxlabel(_made_of(run), fontsize=6, color=MUTED_COLOR, gid=_GID)
+    if not current_style().few:
+        figure.supxlabel(_made_of(run), fontsize=6, color=MUTED_COLOR, gid=_GID)
     if _mark(run):
         set_title(figure, _mark(run), color=WARNING_COLOR, fontsize=10, fontweight="bold")
     return figure

@@ -11,9 +11,15 @@ from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
 from deepaccident_devkit.evaluation.task import LIMITS, Headline, headlines
 from deepaccident_devkit.render.captions import set_title
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, with_light_grid
-from deepaccident_devkit.render.styles import AGENT_COLORS, ESTIMATE_COLOR, MUTED_COLOR, WARNING_COLOR, in_own_settings
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    ESTIMATE_COLOR,
+    MUTED_COLOR,
+    WARNING_COLOR,
+    in_own_settings,
+    text_size,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,7 +76,7 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
             (5, 0),
             textcoords="offset points",
             va="center",
-            fontsize=SMALLEST_TEXT,
+            fontsize=text_size(),
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},  # over a line that marks a value
         )
         ends.append(end)
@@ -79,7 +85,7 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
     if limit is not None:
         ax.set_xticks([limit * part / 5 for part in range(6)])
     labels = [f"{bar.label}\n{bar.below}".strip() for bar in bars]
-    ax.set_yticks(range(len(bars)), labels, fontsize=SMALLEST_TEXT, linespacing=1.15)
+    ax.set_yticks(range(len(bars)), labels, fontsize=text_size(), linespacing=1.15)
     ax.set_ylim(len(bars) - 0.4, -0.6)
     return with_light_grid(ax, "x")
 
@@ -155,7 +161,7 @@ def render_comparison(comparison: Comparison, *, fig: Figure | None = None) -> F
     set_title(fig, "\n".join([title, *comparison.partial]), fontsize=11, color=color)
     interval = f"whiskers: {100 * comparison.resampling.confidence:g} % intervals; full dots: significant"
     names = f"a: {comparison.a.name}; b: {comparison.b.name}"
-    fig.supxlabel(f"{names}\n{interval}", fontsize=SMALLEST_TEXT, color=MUTED_COLOR)
+    fig.supxlabel(f"{names}\n{interval}", fontsize=text_size(), color=MUTED_COLOR)
     axes = fig.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for ax, (unit, rows) in zip(axes, panels.items(), strict=False):
         _draw_differences(ax, rows)
@@ -176,11 +182,11 @@ def _draw_differences(ax: Axes, rows: Sequence[tuple[ComparedNumber, float]]) ->
         face = ESTIMATE_COLOR if each.real else "white"
         ax.plot(difference, row, "o", markersize=6.5, markerfacecolor=face, markeredgecolor=ESTIMATE_COLOR)
         text = _text(difference, each, "+") + (f", {each.better} is better" if each.better else "")
-        ax.annotate(text, (1.015, row), xycoords=("axes fraction", "data"), va="center", fontsize=SMALLEST_TEXT)
+        ax.annotate(text, (1.015, row), xycoords=("axes fraction", "data"), va="center", fontsize=text_size())
         least = 10.0 ** -_decimals(each)  # smaller differences are none to the reader
         ax.update_datalim([(-least, row), (least, row)])
     labels = [f"{each.headline}\n{_text(each.a, each)} → {_text(each.b, each)}" for each, _ in rows]
-    ax.set_yticks(range(len(rows)), labels, fontsize=SMALLEST_TEXT, linespacing=1.15)
+    ax.set_yticks(range(len(rows)), labels, fontsize=text_size(), linespacing=1.15)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.margins(x=0.08)
     ax.xaxis.set_major_locator(MaxNLocator(nbins=6))

@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.motion import RANGES, MotionEvaluator
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.render.boxes import write_beside
 from deepaccident_devkit.render.captions import set_title
-from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free
+from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
 from deepaccident_devkit.render.figures import axes_or_new, with_light_grid
 from deepaccident_devkit.render.styles import (
@@ -30,6 +30,7 @@ from deepaccident_devkit.render.styles import (
     SERIES_COLORS,
     TRUE_PLACE_COLOR,
     in_own_settings,
+    text_size,
 )
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import choice
@@ -69,7 +70,7 @@ def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax:
         ax.plot([step * frame for frame in range(frames)], quality, marker="o", color=color, label=f"{name} m")
     ax.set(xlabel="seconds from the present", ylabel="PQ (%)", ylim=(0, 104))
     ax.set_xticks([step * frame for frame in range(frames)])
-    ax.legend(fontsize=SMALLEST_TEXT, loc="lower left")
+    ax.legend(fontsize=text_size(), loc="lower left")
     return with_light_grid(ax, "y")
 
 
@@ -272,7 +273,7 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
         width = 1.2 + 0.8 * (count - 1 - level)  # so that all of several equal curves are seen
         ax.plot(recall[reached], precision[reached], dash, color=color, label=label, linewidth=width)
     ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
-    ax.legend(title="threshold", fontsize=SMALLEST_TEXT, title_fontsize=SMALLEST_TEXT, loc="best")
+    ax.legend(title="threshold", fontsize=text_size(), title_fontsize=text_size(), loc="best")
     return with_light_grid(ax, "both")
 
 

@@ -123,7 +123,7 @@ def test_the_pair_is_named_and_a_pedestrian_that_is_hit_is_found(tmp_path: Path)
     )
     da = DeepAccident("v1", tmp_path / "r", verbose=False)
     sample = next(one for one in da.sample if one["agent"] == "ego_vehicle" and one["time_to_impact"] == 0)
-    ax, boxes = render_bev(da, sample, view_range=100, ax=new_axes()), da.boxes(sample, "ego")
+    ax, boxes = render_bev(da, sample, view_range=30, ax=new_axes()), da.boxes(sample, "ego")
     assert texts(ax).count("pedestrian") == 1
     walks = np.array(boxes.category_names) == "pedestrian"
     hit = walks & np.isin(boxes.actor_id, [*collider_ids(da, sample)])

@@ -27,7 +27,7 @@ from deepaccident_devkit.render.boxes import (
     role_colors,
     segments_in_image,
 )
-from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, CLASS_COLORS, COLLIDER_COLOR, style
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperative_boxes
 
@@ -172,11 +172,12 @@ def test_small_actors_have_a_mark_of_their_class() -> None:
     small = boxes(category=["pedestrian", "car", "cyclist"])
     draw_boxes_from_above(small, ax, [RED, RED, CATEGORY_COLORS["cyclist"]])
     draw_boxes_from_above(small, hidden, [RED] * 3, fill=0)
-    marks = {line.get_marker(): (tuple(line.get_xydata()[0]), line.get_markerfacecolor()) for line in ax.lines}
-    first, _, last = map(tuple, small.center[:, :2])
-    assert marks == {"o": (first, RED), "D": (last, CATEGORY_COLORS["cyclist"])}
-    assert min(line.get_markersize() for line in ax.lines) >= 6
-    assert {line.get_markerfacecolor() for line in hidden.lines} == {"none"}
+    marks = ax.collections[-1]
+    corners = [path.vertices[:-1] for path in marks.get_paths()]
+    assert ([*map(len, corners)], [*map(to_hex, marks.get_facecolor())]) == ([16, 4], [RED, CATEGORY_COLORS["cyclist"]])
+    np.testing.assert_allclose([each.mean(axis=0) for each in corners], small.center[[0, 2], :2], atol=1e-9)
+    assert {*np.ptp(np.concatenate(corners[:1]), axis=0).round(6)} == {2.0}  # metres
+    assert len(hidden.collections[-1].get_facecolor()) == 0
 
 
 def test_velocities_in_an_image_lead_to_where_the_centre_would_be() -> None:
@@ -210,6 +211,10 @@ def test_the_pair_is_red_other_recorders_have_hues_and_the_rest_shades(da: DeepA
     actors = [*zip(boxes.actor_id.tolist(), boxes.category_names, strict=True)]
     assert role_colors(da, approach, boxes) == [hues.get(actor, CATEGORY_COLORS[name]) for actor, name in actors]
     assert len(hues.keys() & {actor for actor, _ in actors}) > 2
+    with style(color_by="class"):
+        by_class = role_colors(da, approach, boxes)
+    red = {actor: color for actor, color in hues.items() if color == COLLIDER_COLOR}
+    assert by_class == [red.get(actor, CLASS_COLORS[name]) for actor, name in actors]
 
 
 def test_an_agent_has_its_part_s_colour_in_its_own_label_and_in_the_union(da: DeepAccident, approach: str) -> None:

@@ -66,11 +66,16 @@ def test_a_paper_and_a_slide_have_their_sizes_and_no_tokens(da: DeepAccident, fr
         camera = f"{frame.rsplit('/', 1)[0]}/ego_vehicle/004/Camera_Front"
         assert da.render_sample_data(camera).figure.get_figwidth() == 3.5
         figure = da.render_frame(frame)
-        assert (figure.get_figwidth(), current_style().dpi, tokens_of(figure)) == (7.2, 300, [])
+        assert (figure.get_figwidth(), current_style().dpi, tokens_of(figure)) == (7.16, 300, [])
     with style("slide"):
         assert da.render_frame(frame).get_size_inches() * current_style().dpi == pytest.approx([1920, 1080])
     assert tokens_of(da.render_frame(frame)) == [frame]
-    assert_refused((style("poster").__enter__, ChoiceError, ("style", "paper or slide", "'poster'")))  # type: ignore[arg-type]
+    with style(title=False):
+        assert (da.render_frame(frame).get_suptitle(), da.render_bev(f"{camera.rsplit('/', 1)[0]}").get_title()) == (
+            "",
+            "",
+        )
+    assert_refused((style("poster").__enter__, ChoiceError, ("style", "paper, cvpr-column", "'poster'")))  # type: ignore[arg-type]
 
 
 FRONT = "ego_vehicle Camera_Front: not downloaded"

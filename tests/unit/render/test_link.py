@@ -10,7 +10,7 @@ from matplotlib.quiver import Quiver
 from wording import lacking
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.bev import link_words
 from deepaccident_devkit.render.link import render_link, shared_boxes
 from deepaccident_devkit.render.styles import AGENT_COLORS, TRUE_PLACE_COLOR
@@ -40,11 +40,10 @@ def test_arrows_are_as_long_as_the_poses_are_off(da_motion: DeepAccident, moving
     np.testing.assert_allclose(
         np.hypot(found.U, found.V), 0.5, atol=2.5e-3
     )  # the agents may stand on a slope, 10 % at most
-    assert ax.get_title().startswith("other: ")
-    assert ax.get_title().endswith("\noff by 0.50 m\n(at most 0.50 m)")
+    assert ax.get_title() == "boxes, off by at most 0.50 m"
     hues = {to_hex(color) for each in ax.collections for color in each.get_edgecolor()}
     assert {AGENT_COLORS["other_vehicle"], TRUE_PLACE_COLOR} <= hues
-    assert legend_words(figure)[-1] == "the error"
+    assert legend_words(figure) == ["other: 0.50 m", "true places", "the error"]
 
 
 def test_latency_moves_only_what_moves(da_motion: DeepAccident, moving: Any) -> None:
@@ -57,13 +56,13 @@ def test_latency_moves_only_what_moves(da_motion: DeepAccident, moving: Any) -> 
 
 
 def test_a_lost_message_is_said(da_motion: DeepAccident, moving: Any) -> None:
-    (ax,) = drawn(da_motion, moving, Link(packet_loss=1.0), agents="+behind", layers=["boxes"]).axes
-    assert (ax.get_title(), of_kind(ax, Quiver)) == ("ego behind: nothing arrived", [])
+    figure = drawn(da_motion, moving, Link(packet_loss=1.0), agents="+behind", layers=["boxes"])
+    assert (legend_words(figure)[0], of_kind(figure.axes[0], Quiver)) == ("ego behind: nothing arrived", [])
 
 
 def test_clouds_are_side_by_side(da: DeepAccident) -> None:
     sample, link = da.get_sample(da.scenario[0], "ego_vehicle", 5), Link(latency=0.2)
-    _, now, late = drawn(da, sample, link, agents="+other").axes
+    _, now, late = drawn(da, sample, link, agents="+other", view_range=50.0).axes
     assert [ax.get_title() for ax in (now, late)] == ["clouds without the link", "clouds with the link"]
     for ax, through in ((now, None), (late, link)):
         cloud = da.aggregate_point_cloud(sample, agents=["other_vehicle"], frame="ego", link=through).xyz[:, :2]
@@ -72,11 +71,15 @@ def test_clouds_are_side_by_side(da: DeepAccident) -> None:
         assert any(each.shape == shown.shape and np.allclose(each, shown) for each in drawn_)
 
 
-@pytest.mark.parametrize(("layers", "panels"), [(["boxes"], 4), (None, 6)])
-def test_each_partner_has_a_panel_of_its_own(da: DeepAccident, layers: Any, panels: int) -> None:
-    figure = drawn(da, da.get_sample(da.scenario[0], "ego_vehicle", 5), NOISE, layers=layers)
+@pytest.mark.parametrize(
+    ("layers", "place", "panels"),
+    [(["boxes"], None, 1), (None, None, 3), (None, "slide", 2), (None, "cvpr-column", 1)],
+)
+def test_all_partners_are_in_one_panel(da: DeepAccident, layers: Any, place: Any, panels: int) -> None:
+    with style(place):
+        figure = drawn(da, da.get_sample(da.scenario[0], "ego_vehicle", 5), NOISE, layers=layers)
     assert len(figure.axes) == panels
-    names = {ax.get_title().split(":")[0] for ax in figure.axes}
+    names = {words.split(":")[0] for words in legend_words(figure)}
     assert not lacking(names, "ego behind", "other", "other behind", "infrastructure")
 
 

@@ -88,10 +88,11 @@ def test_instances_are_where_they_are_and_have_their_colours() -> None:
 
 
 def test_recording_vehicles_have_their_hues_and_others_shades_in_the_picture_and_its_key() -> None:
-    ax, key = figure_of(two_cars().to_present(), agents={-100: "ego_vehicle"}, style="trail").axes
+    figure = figure_of(two_cars().to_present(), agents={-100: "ego_vehicle"}, style="trail")
+    (ax,) = figure.axes
     np.testing.assert_allclose(color_at(ax, 0.2, 0.2), to_rgb(AGENT_COLORS["ego_vehicle"]))
     assert to_hex(color_at(ax, 10.2, 5.2)) in INSTANCE_COLORS
-    assert legend_words(key) == ["ego", "own box"]
+    assert legend_words(figure) == ["ego", "own box"]
 
 
 def test_the_flow_says_where_it_ends() -> None:
@@ -198,9 +199,9 @@ def test_outputs_have_the_rows_that_they_have(labels: MotionLabels) -> None:
     alone, fig = instances_of(labels.instance, labels.config.grid), detached_figure((10, 8))
     assert len(draw_motion_output(output, fig=fig).axes) == 4 * (5 + 1)
     assert len(draw_motion_output(alone, fig=detached_figure((10, 3))).axes) == 5 + 1
-    assert len(draw_motion_output(alone, style="trail", fig=detached_figure((6, 5))).axes) == 2
+    assert len(draw_motion_output(alone, style="trail", fig=detached_figure((6, 5))).axes) == 1
 
 
 def test_labels_as_a_trail(da_motion: DeepAccident, sample: str) -> None:
     figure = da_motion.render_motion_labels(sample, style="trail", fig=detached_figure((6, 6)))
-    assert (len(figure.axes), tokens_of(figure)) == (2, [sample])
+    assert (len(figure.axes), tokens_of(figure)) == (1, [sample])

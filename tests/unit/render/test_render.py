@@ -1,13 +1,13 @@
 """The texts of every view: in the picture, not over each other, and large enough to be read in print."""
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
-from picture_texts import text_faults
+from picture_texts import panels_share, text_faults
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -17,6 +17,7 @@ from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.accident import draw_countdown
 from deepaccident_devkit.render.outcomes import draw_outcome_in_camera, render_outcome_in_cameras, sample_verdict
+from deepaccident_devkit.render.styles import current_style
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link
 
@@ -34,13 +35,18 @@ def ego(scenario: Any) -> str:
     return f"{scenario['token']}/ego_vehicle/{scenario['num_frames'] - 1:03d}"
 
 
+def moments() -> tuple[float, ...]:
+    return (0.2, 0.0) if current_style().room == "column" else (0.2, 0.1, 0.0)
+
+
 VIEWS: dict[str, Callable[[DeepAccident, Any], Any]] = {
-    "accident": lambda da, scenario: da.render_accident(scenario, seconds=(0.2, 0.1, 0.0), layers=DRAWN),
+    "accident": lambda da, scenario: da.render_accident(scenario, seconds=moments(), layers=DRAWN),
     "annotation": lambda da, scenario: da.render_annotation(f"{ego(scenario)}/1"),
     "calibration": lambda da, scenario: da.render_calibration(scenario["last_frame_token"], layers=["boxes"]),
     "frame": lambda da, scenario: da.render_frame(scenario["last_frame_token"], layers=["boxes"]),
     "instance": lambda da, scenario: da.render_instance(f"{scenario['token']}/actor/{scenario['collision']['ids'][0]}"),
     "labels": lambda da, scenario: da.render_motion_labels(ego(scenario)),
+    "labels maps": lambda da, scenario: da.render_motion_labels(ego(scenario), style="maps"),
     "labels trail": lambda da, scenario: da.render_motion_labels(ego(scenario), style="trail"),
     "sample": lambda da, scenario: da.render_sample(ego(scenario), layers=["boxes"]),
     "camera": lambda da, scenario: da.render_sample_data(f"{ego(scenario)}/Camera_Front", layers=["boxes"]),
@@ -50,6 +56,13 @@ VIEWS: dict[str, Callable[[DeepAccident, Any], Any]] = {
     "visibility matrix": lambda da, scenario: da.render_visibility_matrix(scenario["last_frame_token"]),
     "lidar": lambda da, scenario: da.render_sample_data(f"{ego(scenario)}/lidar01", layers=["boxes"]),
 }
+
+CAR = 4.5
+"""Metres."""
+AT_THE_END = ("frame", "visibility")
+"""Views of the last moment, the first in world."""
+WHOLE = (*AT_THE_END, "bev", "sample", "link", "lidar", "labels trail")
+"""Views from above that show the pair wherever they are."""
 
 
 def faults(da: DeepAccident, view: str, scenario: Any) -> list[str]:
@@ -61,11 +74,30 @@ def accidents(da: DeepAccident) -> list[Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", [None, "paper"])
+@pytest.mark.parametrize("where", [None, "paper", "cvpr-column", "ieee-page", "slide"])
 @pytest.mark.parametrize("view", VIEWS)
-def test_texts_are_in_the_picture_and_apart(da_b: DeepAccident, view: str, where: Any) -> None:
-    with style(where) if where else nullcontext():
-        assert faults(da_b, view, accidents(da_b)[0]) == []
+def test_texts_are_in_the_picture_and_apart_and_panels_are_large(da_b: DeepAccident, view: str, where: Any) -> None:
+    """What is square on a slide is as high as it can be, and maps have keys; no mark is larger than a car."""
+    scenario = accidents(da_b)[0]
+    with style(where):
+        figure = VIEWS[view](da_b, scenario).figure
+        assert text_faults(figure) == []
+    panels = [ax for ax in figure.axes if ax.axison]
+    square = where == "slide" and len(panels) == 1 and panels[0].bbox.height > 0.75 * figure.bbox.height
+    assert panels_share(figure) >= 0.5 or square or view == "labels maps" or where is None
+    for ax in [ax for ax in panels if where and "(m)" in ax.get_xlabel()]:
+        car = 72 / figure.dpi * CAR * ax.bbox.width / np.ptp(ax.get_xlim())
+        assert max([line.get_markersize() for line in ax.lines if line.get_marker() != "None"], default=0) <= car
+        marks = [path.vertices for each in ax.collections if each.get_zorder() == 3.5 for path in each.get_paths()]
+        assert max([np.ptp(corners[:, 0]) for corners in marks], default=0) <= CAR
+    if view in WHOLE:
+        sample = f"{scenario['token']}/ego_vehicle/{scenario['num_frames'] - (view in AT_THE_END):03d}"
+        boxes = da_b.cooperative_boxes(sample, frame="world" if view in AT_THE_END[:1] else "ego")
+        pair = boxes.select(np.isin(boxes.actor_id, scenario["collision"]["ids"])).center[:, :2]
+        above = next(ax for ax in panels if "(m)" in ax.get_xlabel())
+        low, high = np.array([above.get_xlim(), above.get_ylim()]).T
+        assert len(pair) == 2
+        assert ((low < pair) & (pair < high)).all()
 
 
 def test_texts_of_a_countdown_are_apart(da_b: DeepAccident) -> None:

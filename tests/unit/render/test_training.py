@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from picture_texts import text_faults
 
-from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.training import render_curve, render_training, save_training
 
 
@@ -25,13 +25,20 @@ def test_each_number_has_a_panel() -> None:
     figure = detached_figure((10, 5))
     assert render_training(rows(8), "a run", fig=figure) is figure
     titles = [ax.get_title() for ax in figure.axes]
-    assert titles == ["seg", "flow", "validation: iou", "validation: score", "", ""]
-    assert [ax.axison for ax in figure.axes] == [True] * 4 + [False] * 2
-    dots, line = figure.axes[2].get_lines()
+    assert titles == ["total", "seg", "flow", "validation: iou", "validation: score", ""]
+    assert [ax.axison for ax in figure.axes] == [True] * 5 + [False]
+    dots, line = figure.axes[3].get_lines()
     for each in (dots, line):
         np.testing.assert_allclose(each.get_xydata(), [[4, 0.04], [8, 0.08]])
     assert figure.get_suptitle() == "a run"
-    assert [ax.get_xlabel() for ax in figure.axes] == ["", "step", "step", "step", "", ""]
+    assert [ax.get_xlabel() for ax in figure.axes] == ["", "", "step", "step", "step", ""]
+
+
+def test_a_loss_of_nothing_is_a_gap() -> None:
+    log = [{"step": step, "losses": {"seg": 0.0 if step in (3, 4) else 1.0}} for step in range(1, 7)]
+    (ax, *_) = render_training(log, "a run", fig=detached_figure((10, 3))).axes
+    for line in ax.get_lines():
+        assert np.isnan(line.get_ydata()).tolist() == [False, False, True, True, False, False]
 
 
 def test_many_steps_are_averaged() -> None:
@@ -48,8 +55,13 @@ def test_many_steps_are_averaged() -> None:
 
 @pytest.mark.parametrize("log", [[], [{"step": 1, "losses": {"seg": 1.0}}], [{"step": 3}]])
 def test_short_logs_are_drawn(log: list[dict], tmp_path: Path) -> None:
-    save_training(log, "begun", tmp_path / "curves.png")
+    with style("ieee-page"):
+        save_training(log, "begun", tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 1000
+    assert (
+        b"/Type42" in (tmp_path / "curves.pdf").read_bytes()
+        or b"/CIDFontType2" in (tmp_path / "curves.pdf").read_bytes()
+    )
 
 
 def test_words_are_apart_and_large() -> None:

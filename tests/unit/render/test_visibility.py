@@ -103,7 +103,7 @@ def test_the_matrix_has_a_cell_for_each_actor_and_agent(hidden: DeepAccident) ->
     rows = [known.boxes.actor_id.tolist().index(actor) for actor in actors]
     order = [known.agents.index(agent) for agent in AGENTS]
     np.testing.assert_array_equal(full, known.seen[np.ix_(rows, order)])
-    assert not lacking(ax.get_xlabel(), "0: none", "–: not in the agent's label")
+    assert not lacking(ax.get_xlabel(), "filled: seen", "–: not in the agent's label")
     assert texts(ax).count("itself") == 4  # the pole has no body
 
 
