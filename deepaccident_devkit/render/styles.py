@@ -56,6 +56,8 @@ POINT_COLOR = "#9a9a9a"
 DEPTH_COLORMAP = "viridis_r"
 """LiDAR points in images; the nearest are yellow."""
 HEIGHT_COLORMAP = "cividis"
+HEIGHT_COLORS = ("#00224e", "#434e6c", "#7d7c78", "#bcae6c", "#fee838")
+"""The same for pages, from low to high."""
 CENTERNESS_COLORMAP = "Greys"
 DIRECTION_COLORS = ("#2a78c2", "#2a9d6f", "#c9b23a", "#8a5fb0")
 """Flow forward, to the left, backward and to the right; between them the colours are mixed."""

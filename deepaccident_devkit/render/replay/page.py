@@ -45,6 +45,7 @@ from deepaccident_devkit.render.styles import (
     COLLIDER_COLOR,
     COLORS,
     GRID_COLOR,
+    HEIGHT_COLORS,
     OUTCOME_COLORS,
     POINT_COLOR,
 )
@@ -70,8 +71,6 @@ _SCRIPTS: Final = (
     "strip",
     "replay",
 )
-_HEIGHTS: Final = ("#00224e", "#434e6c", "#7d7c78", "#bcae6c", "#fee838")
-"""Colours of points from low to high: those of `styles.HEIGHT_COLORMAP`."""
 _BASE64: Final = 4 / 3
 _BESIDE: Final = 8
 """Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
@@ -196,7 +195,7 @@ def _data(
             "pair": COLLIDER_COLOR,
             "points": POINT_COLOR,
             "grid": GRID_COLOR,
-            "heights": _HEIGHTS,
+            "heights": HEIGHT_COLORS,
             **OUTCOME_COLORS,
         },
         "markers": dict(CATEGORY_MARKERS),
