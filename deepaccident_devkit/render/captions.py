@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.release.store import listed
 from deepaccident_devkit.render.boxes import in_drawing_order
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     CATEGORY_COLORS,
@@ -272,6 +272,8 @@ def write_missing(ax: Axes, words: str) -> None:
         text = textwrap.fill(words, _CORNER_LETTERS)
         style: dict[str, Any] = {"fontsize": SMALLEST_TEXT, "bbox": paper, "zorder": 8, "gid": _MISSING}
         ax.annotate(text, (0, 0), (4, 4), xycoords="axes fraction", textcoords="offset points", **style)
+        wide, tall = 0.6 * SMALLEST_TEXT * min(len(words), _CORNER_LETTERS), 1.5 * SMALLEST_TEXT * text.count("\n")
+        keep_free(ax, [[(ax.get_xlim()[0], ax.get_ylim()[0])]], margin=(0, 0, wide, tall + 2 * SMALLEST_TEXT))
 
 
 def missing_clouds_text(agents: Collection[str]) -> str:

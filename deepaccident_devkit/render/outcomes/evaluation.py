@@ -35,8 +35,10 @@ from deepaccident_devkit.evaluation.predictions import (
 )
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels
-from deepaccident_devkit.render.boxes import collider_ids, draw_boxes_from_above
-from deepaccident_devkit.render.captions import set_scene_title
+from deepaccident_devkit.render.bev import BevView, draw_bev
+from deepaccident_devkit.render.boxes import camera_name, collider_ids, draw_boxes_from_above
+from deepaccident_devkit.render.camera import best_view
+from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import Layer, figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.motion_maps import draw_edge, maps_of_labels
@@ -46,19 +48,20 @@ from deepaccident_devkit.render.outcomes.above import (
     MOTION_LAYERS,
     WINDOW,
     MotionOutcome,
-    coming_words,
-    draw_accident_outcome,
+    draw_accidents,
     draw_detection_outcome,
     draw_motion_side,
     draw_true,
     layers_but_ids,
     motion_outcome,
+    shown_square,
     verdict_words,
 )
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import choice
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID, short_name
+from deepaccident_devkit.v2x import cooperative_boxes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,10 +72,13 @@ _RELEASED: Final = MotionLabelConfig()
 """Half a second from frame to frame, two seconds ahead."""
 _POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
     "motion": MOTION_LAYERS,
-    "accident": ACCIDENT_LAYERS,
+    "accident": ("image", "bev", *ACCIDENT_LAYERS),
     "detection": DETECTION_LAYERS,
 }
-_SIZE: Final = (12.4, 6.9)
+SIZES: Final = {"motion": (12.4, 6.9), "accident": (12.4, 5.9), "detection": (12.4, 6.9)}
+"""Inches."""
+_CAMERA_BESIDE: Final = (1.4, 1.0)
+"""How wide a camera and what is beside it are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -247,9 +253,10 @@ def render_evaluation(
 ) -> Figure:
     """Render a sample's truth and beside it a model's prediction, with a protocol's verdict in numbers.
 
-    Motion: true instances are found or missed, predicted ones right or false, frame by frame. Accidents: the places
-    where two collide, with the metres between foreseen and true places. Detections: matched, false and missed boxes.
-    The true pair that collides is red.
+    Motion: true instances are found or missed, predicted ones right or false, frame by frame. Detections: matched,
+    false and missed boxes. Accidents: who collides in the camera, of any agent, that shows them best, and from above
+    the road, the actors, and the places where two collide, with the metres between foreseen and true places. The true
+    pair that collides is red.
 
     Args:
         dataset: the release.
@@ -260,12 +267,12 @@ def render_evaluation(
         protocol: of the task, by name, or your own; None for `released`, or `boxes` for explicit accidents.
         label: the motion labels that motion is compared with; None makes the labels that the protocol needs, on the
             prediction's cells and half a second apart.
-        layers: for motion `labels`, `trajectories`, `ids`, `grid`; for accidents `boxes`, `trajectories`, `ids`,
-            `grid`; for detections `boxes`, `ids`, `grid`. All except `ids` are the default.
+        layers: for motion `labels`, `trajectories`, `ids`, `grid`; for accidents `image`, `bev`, `boxes`,
+            `trajectories`, `ids`, `grid`; for detections `boxes`, `ids`, `grid`. All except `ids` are the default.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure: truth to the left, prediction to the right, the verdict above.
+        The figure: truth to the left, prediction to the right, the verdict above; of accidents the camera to the left.
 
     Raises:
         TokenError: no such sample.
@@ -276,8 +283,8 @@ def render_evaluation(
     given, chosen = judged_as(prediction, task)
     shown = layers_but_ids(layers, _POSSIBLE[chosen])
     verdict = sample_verdict(dataset, sample, given, task=chosen, protocol=protocol, label=label)
-    fig = figure_or_new(fig, _SIZE)
-    left, right = fig.subplots(1, 2)
+    fig = figure_or_new(fig, SIZES[chosen])
+    left, right = fig.subplots(1, 2, width_ratios=_CAMERA_BESIDE if chosen == "accident" else None)
     if isinstance(verdict, DetectionVerdict):
         _draw_detection(verdict, collider_ids(dataset, verdict.sample), shown, left, right)
     elif isinstance(verdict, MotionVerdict):
@@ -286,7 +293,7 @@ def render_evaluation(
         if "labels" in shown:
             _edge_pair(verdict.label, collider_ids(dataset, verdict.sample), left)
     else:
-        _draw_accident(verdict, shown, left, right)
+        _draw_accident(dataset, verdict, shown, left, right)
     set_scene_title(fig, dataset, verdict.sample, below=verdict.words, fontsize=11)
     return settled(fig)
 
@@ -298,13 +305,42 @@ def _edge_pair(label: MotionLabels, ids: Collection[int], ax: Axes) -> None:
         draw_edge(maps, label.id_map.get(OWN_BOX_ID if actor == OWN_ACTOR_ID else actor, -1), ax, COLLIDER_COLOR)
 
 
-def _draw_accident(verdict: AccidentVerdict, shown: frozenset[Layer], left: Axes, right: Axes) -> None:
-    true = verdict.compared.true
-    draw_accident_outcome(verdict.compared, verdict.truth, layers=shown, ax=right)
-    limits = right.get_xlim(), right.get_ylim()
-    draw_accident_outcome(ComparedAccidents(true=true, predicted=()), verdict.truth, layers=shown, ax=left)
-    left.set(xlim=limits[0], ylim=limits[1])
-    left.set_title("truth" if true else f"truth: {coming_words(verdict.compared)}", fontsize=SMALLEST_TEXT)
+def _draw_accident(
+    dataset: Dataset, verdict: AccidentVerdict, shown: frozenset[Layer], left: Axes, right: Axes
+) -> None:
+    """The camera that shows the pair best, and from above the road, the agents and the places."""
+    from deepaccident_devkit.render.outcomes.cameras import draw_accidents_in_camera  # it needs this module's verdicts
+
+    middle, half = shown_square(verdict.compared, verdict.truth)
+    view = BevView(agents=None, view_range=half, center=middle)
+    draw_bev(dataset, verdict.sample, view, shown - {"trajectories"}, right)
+    draw_legend(right.figure, draw_accidents(verdict.compared, verdict.truth, shown & {"trajectories", "grid"}, right))
+    camera = best_camera(dataset, verdict)
+    draw_accidents_in_camera(dataset, verdict, camera, left, image="image" in shown)
+    agent, _, channel = camera.rsplit("/", 3)[1:]
+    left.set_title(f"{short_name(agent)}, {camera_name(channel)} camera", fontsize=SMALLEST_TEXT)
+
+
+def boxes_of(dataset: Dataset, verdict: AccidentVerdict) -> Boxes:
+    """The boxes, now and in world, of who collides by meta, or else of whom the first alarm names."""
+    record = dataset.get("sample", verdict.sample)
+    collision = dataset.get("scenario", record["scenario_token"])["collision"]
+    alarm = next(iter(verdict.compared.predicted), None)
+    named = None if alarm is None else alarm.ids
+    boxes = cooperative_boxes(dataset, record)
+    return boxes.select(np.isin(boxes.actor_id, (named or ()) if collision is None else collision["ids"]))
+
+
+def best_camera(dataset: Dataset, verdict: AccidentVerdict) -> str:
+    """The token of the image, of any agent, that shows best who collides, or whom the first alarm names.
+
+    The front camera of the sample's agent, if no camera shows them.
+    """
+    record = dataset.get("sample", verdict.sample)
+    boxes = boxes_of(dataset, verdict)
+    samples = [each["token"] for each in dataset.samples_of(record["frame_token"])]
+    view = best_view(dataset, samples, boxes) if len(boxes) else None
+    return f"{verdict.sample}/Camera_Front" if view is None else view.camera
 
 
 def _draw_detection(
