@@ -35,6 +35,7 @@ GROUPS = {
     "all classes": tuple(styles.CATEGORY_COLORS.values()),
     "series": styles.SERIES_COLORS,
     "splits": tuple(styles.SPLIT_COLORS.values()),
+    "a town's ground": tuple(styles.MAP_COLORS.values()),
 }
 """Colours that stand together in a picture and must be distinguished."""
 GROUNDS = {"white": "#ffffff", "road": styles.BEV_COLORS["road"], "mid-grey image": "#808080"}
