@@ -34,6 +34,7 @@ from deepaccident_devkit.render.captions import (
     write_missing,
 )
 from deepaccident_devkit.render.figures import Layer, axes_or_new, layers_of
+from deepaccident_devkit.render.hidden import hiding
 from deepaccident_devkit.render.styles import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP, in_own_settings
 from deepaccident_devkit.support.arrays import FloatArray, as_floats
 from deepaccident_devkit.support.text import choice
@@ -167,7 +168,9 @@ def render_pointcloud_in_image(
     color_by: ColorBy = "depth",
     ax: Axes | None = None,
 ) -> Axes:
-    """Render a camera's image with LiDAR points on it, even those that other things hide.
+    """Render a camera's image with LiDAR points on it.
+
+    Points of other agents are left out where the camera's own cloud has something in front of them (`render.hidden`).
 
     Args:
         dataset: the release.
@@ -216,7 +219,7 @@ def render_pointcloud_in_image(
 
 def _draw_agent(dataset: Dataset, source: SampleRecord, camera: RowArgument, ax: Axes) -> None:
     cloud = dataset.load_point_cloud(source, "lidar")
-    points = project_to_image(dataset, cloud, source, camera, colors=False)
+    points = hiding(dataset, camera)(project_to_image(dataset, cloud, source, camera, colors=False))
     draw_points_in_image(points.pixels[points.mask], ax, color=AGENT_COLORS[source["agent"]])
 
 
@@ -225,7 +228,7 @@ def _draw_metres(
 ) -> None:
     """Points coloured by depth or height, and a colour bar."""
     cloud = dataset.load_point_cloud(source, "world")
-    points = project_to_image(dataset, cloud, source, camera, colors=False)
+    points = hiding(dataset, camera)(project_to_image(dataset, cloud, source, camera, colors=False))
     values, limits, colormap = points.depth, _DEPTHS, DEPTH_COLORMAP
     if color_by == "height":
         ego_from_world = dataset.world_from(dataset.get("sample_data", camera)["sample_token"], "ego").inverse()

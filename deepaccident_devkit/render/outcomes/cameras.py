@@ -22,7 +22,7 @@ from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, settled
 from deepaccident_devkit.render.motion_maps import MotionMaps
 from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR, alarm_words
-from deepaccident_devkit.render.outcomes.evaluation import (
+from deepaccident_devkit.render.outcomes.verdicts import (
     AccidentVerdict,
     DetectionVerdict,
     MotionVerdict,

@@ -1,40 +1,16 @@
-"""What a protocol says of a sample's prediction, and `render_evaluation`, which shows it beside the label."""
+"""`render_evaluation`: a sample's truth beside a model's prediction, with the verdict of a protocol."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.evaluation.accident import (
-    AccidentEvaluator,
-    BoxTruth,
-    ComparedAccidents,
-    accident_context,
-    compared_accidents,
-)
-from deepaccident_devkit.evaluation.detection import (
-    DetectedBoxes,
-    DetectionEvaluator,
-    DetectionMatches,
-    DetectionProtocol,
-    detection_matches,
-    detection_protocol,
-    detection_truth,
-)
-from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.predictions import (
-    Accident,
-    MotionOutput,
-    Prediction,
-    checked_prediction,
-    labels_at_present,
-)
-from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Prediction, labels_at_present
+from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.render.bev import BevView, draw_bev
 from deepaccident_devkit.render.boxes import camera_name, collider_ids, draw_boxes_from_above
 from deepaccident_devkit.render.camera import best_view
@@ -47,29 +23,29 @@ from deepaccident_devkit.render.outcomes.above import (
     DETECTION_LAYERS,
     MOTION_LAYERS,
     WINDOW,
-    MotionOutcome,
     draw_accidents,
     draw_detection_outcome,
     draw_motion_side,
     draw_true,
     layers_but_ids,
-    motion_outcome,
     shown_square,
-    verdict_words,
+)
+from deepaccident_devkit.render.outcomes.cameras import draw_accidents_in_camera
+from deepaccident_devkit.render.outcomes.verdicts import (
+    AccidentVerdict,
+    DetectionVerdict,
+    MotionVerdict,
+    boxes_of,
+    judged_as,
+    sample_verdict,
 )
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, in_own_settings
-from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.text import choice
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID, short_name
-from deepaccident_devkit.v2x import cooperative_boxes
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Judged: TypeAlias = MotionOutput | list[Accident] | DetectedBoxes
-_RELEASED: Final = MotionLabelConfig()
-"""Half a second from frame to frame, two seconds ahead."""
 _POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
     "motion": MOTION_LAYERS,
     "accident": ("image", "bev", *ACCIDENT_LAYERS),
@@ -79,164 +55,6 @@ SIZES: Final = {"motion": (12.4, 6.9), "accident": (12.4, 5.9), "detection": (12
 """Inches."""
 _CAMERA_BESIDE: Final = (1.4, 1.0)
 """How wide a camera and what is beside it are."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MotionVerdict(ShortRepr):
-    """Predicted instances against the labels'.
-
-    Attributes:
-        sample: token.
-        label: the truth.
-        outcome: which instances match, frame by frame.
-        words: the numbers of each range.
-    """
-
-    sample: str
-    label: MotionLabels
-    outcome: MotionOutcome
-    words: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AccidentVerdict(ShortRepr):
-    """Foreseen accidents against the one to come.
-
-    Attributes:
-        sample: token.
-        compared: the accidents that the protocol compares, in the present ego frame.
-        truth: the actors around; None if it is not known.
-        words: what the sample counts as, by the allowed distance.
-    """
-
-    sample: str
-    compared: ComparedAccidents
-    truth: BoxTruth | None
-    words: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DetectionVerdict(ShortRepr):
-    """Detected boxes against the true ones.
-
-    Attributes:
-        sample: token.
-        rules: the protocol.
-        detected: in its frame.
-        truth: the true boxes in that frame.
-        matches: at the threshold of the protocol's errors or, if it has none, at the middle one.
-        words: the mean average precision of the sample.
-    """
-
-    sample: str
-    rules: DetectionProtocol
-    detected: DetectedBoxes
-    truth: Boxes
-    matches: DetectionMatches
-    words: str
-
-
-Verdict: TypeAlias = MotionVerdict | AccidentVerdict | DetectionVerdict
-
-
-def judged_as(prediction: object, task: str | None) -> tuple[Judged, str]:
-    """A prediction, explicit accidents as a list, and the task that it is judged in: the one given, or its own.
-
-    Raises ChoiceError if the prediction is not of the task, EvaluationError if it is no prediction.
-    """
-    given = prediction if isinstance(prediction, DetectedBoxes) else checked_prediction(prediction)
-    possible: tuple[str, ...] = ("accident",)
-    if isinstance(given, DetectedBoxes):
-        possible = ("detection",)
-    elif isinstance(given, MotionOutput):
-        possible = ("motion", "accident")
-    return given, possible[0] if task is None else choice("task of this prediction", task, possible)
-
-
-def sample_verdict(
-    dataset: Dataset,
-    sample: RowArgument,
-    prediction: Prediction | DetectedBoxes,
-    *,
-    task: str | None = None,
-    protocol: Any = None,
-    label: MotionLabels | None = None,
-) -> Verdict:
-    """Judge a prediction for a sample; arguments and errors are those of `render_evaluation`."""
-    given, chosen = judged_as(prediction, task)
-    token = dataset.get("sample", sample)["token"]
-    if isinstance(given, DetectedBoxes):
-        return _of_detection(dataset, token, given, protocol or "released")
-    if isinstance(given, MotionOutput) and chosen == "motion":
-        judge = MotionEvaluator(protocol or "released")
-        return _of_motion(token, given, label or _label(dataset, token, given, judge.protocol.labels), judge)
-    default = "released" if isinstance(given, MotionOutput) else "boxes"
-    return _of_accident(dataset, token, given, label, AccidentEvaluator(protocol or default))
-
-
-def _of_motion(token: str, given: MotionOutput, label: MotionLabels, judge: MotionEvaluator) -> MotionVerdict:
-    judge.update(token, given, label)
-    ranges = [
-        f"{name} m: IoU {within.iou:.1f} %, PQ {within.pq:.1f} %, {within.true_positive} TP, "
-        f"{within.false_positive} FP, {within.false_negative} FN"
-        for name, within in judge.compute().ranges.items()
-    ]
-    outcome = motion_outcome(given, label)
-    return MotionVerdict(sample=token, label=label, outcome=outcome, words="; ".join(ranges))
-
-
-def _of_accident(
-    dataset: Dataset, token: str, given: Prediction, label: MotionLabels | None, judge: AccidentEvaluator
-) -> AccidentVerdict:
-    if label is None and hasattr(judge.protocol, "labels"):
-        label = _label(dataset, token, given, judge.protocol.labels)
-    context = accident_context(dataset, token, _horizon(given))
-    judge.update(token, given, label, context)
-    return AccidentVerdict(
-        sample=token,
-        compared=compared_accidents(given, label, context, judge.protocol),
-        truth=context.truth,
-        words=f"accident: {verdict_words(judge.compute())}",
-    )
-
-
-def _of_detection(dataset: Dataset, token: str, given: DetectedBoxes, protocol: Any) -> DetectionVerdict:
-    rules = detection_protocol(protocol)
-    truth = detection_truth(dataset, token, rules)
-    here = dataset.world_from(token, rules.frame).inverse() @ dataset.world_from(token, given.boxes.frame)
-    detected = DetectedBoxes(boxes=given.boxes.transform(here, rules.frame), scores=given.scores)
-    judge = DetectionEvaluator(rules)
-    judge.update(token, detected, truth)
-    return DetectionVerdict(
-        sample=token,
-        rules=rules,
-        detected=detected,
-        truth=truth,
-        matches=detection_matches(detected, truth, rules),
-        words=f"detection: mean average precision of this sample {judge.compute().mean_average_precision:.1f} %",
-    )
-
-
-def _frames(given: Prediction) -> int | None:
-    """How many frames motion has; None for other predictions."""
-    if not isinstance(given, MotionOutput):
-        return None
-    if given.instances is not None:
-        return int(given.instances.shape[1])
-    return len((given.heads or ())[-1].segmentation)
-
-
-def _horizon(given: Prediction) -> float:
-    frames = _frames(given)
-    ahead = _RELEASED.future_frames if frames is None else frames - 1
-    return ahead * _RELEASED.step * FRAME_PERIOD
-
-
-def _label(dataset: Dataset, token: str, given: Prediction, protocol: str | None) -> MotionLabels:
-    config, frames = replace(_RELEASED, protocol=protocol or "released"), _frames(given)
-    if isinstance(given, MotionOutput) and frames is not None:
-        config = replace(config, grid=given.grid, future_frames=frames - 1)
-    return motion_labels(dataset, token, config)
 
 
 @in_own_settings
@@ -309,8 +127,6 @@ def _draw_accident(
     dataset: Dataset, verdict: AccidentVerdict, shown: frozenset[Layer], left: Axes, right: Axes
 ) -> None:
     """The camera that shows the pair best, and from above the road, the agents and the places."""
-    from deepaccident_devkit.render.outcomes.cameras import draw_accidents_in_camera  # it needs this module's verdicts
-
     middle, half = shown_square(verdict.compared, verdict.truth)
     view = BevView(agents=None, view_range=half, center=middle)
     draw_bev(dataset, verdict.sample, view, shown - {"trajectories"}, right)
@@ -319,16 +135,6 @@ def _draw_accident(
     draw_accidents_in_camera(dataset, verdict, camera, left, image="image" in shown)
     agent, _, channel = camera.rsplit("/", 3)[1:]
     left.set_title(f"{short_name(agent)}, {camera_name(channel)} camera", fontsize=SMALLEST_TEXT)
-
-
-def boxes_of(dataset: Dataset, verdict: AccidentVerdict) -> Boxes:
-    """The boxes, now and in world, of who collides by meta, or else of whom the first alarm names."""
-    record = dataset.get("sample", verdict.sample)
-    collision = dataset.get("scenario", record["scenario_token"])["collision"]
-    alarm = next(iter(verdict.compared.predicted), None)
-    named = None if alarm is None else alarm.ids
-    boxes = cooperative_boxes(dataset, record)
-    return boxes.select(np.isin(boxes.actor_id, (named or ()) if collision is None else collision["ids"]))
 
 
 def best_camera(dataset: Dataset, verdict: AccidentVerdict) -> str:

@@ -15,6 +15,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import render_pointcloud_in_image, render_sample_data
 from deepaccident_devkit.render.camera import best_view, crop_about
+from deepaccident_devkit.render.hidden import hiding
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
@@ -83,7 +84,7 @@ def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAcc
     ax = render_pointcloud_in_image(da, camera, pole, color_by="height", ax=new_axes())
     rendered(ax)
     drawn, cloud = ax.collections[0], da.load_point_cloud(pole, "world")
-    points = project_to_image(da, cloud, pole, camera, colors=False)
+    points = hiding(da, camera)(project_to_image(da, cloud, pole, camera, colors=False))
     height = da.world_from(behind, "ego").inverse().apply(cloud.xyz)[:, 2]
     order = np.flatnonzero(points.mask)[np.argsort(-points.depth[points.mask])]
     assert len(order) > 20

@@ -11,6 +11,7 @@ from matplotlib.colors import to_hex
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, render_calibration, render_frame, render_sample
+from deepaccident_devkit.render.hidden import hiding
 from deepaccident_devkit.render.samples import draw_shared_moment
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
@@ -152,6 +153,7 @@ def test_of_a_sample_all_agents_points_are_in_its_six_cameras(da: DeepAccident, 
     for ax, (agent, cloud) in ((ax, each) for ax in fig.axes for each in zip(AGENTS, range(5), strict=True)):
         camera, sample = f"{calibrated}/{ax.get_title()}", f"{scenario}/{agent}/{number}"
         points, shown = map_pointcloud_to_image(da, camera, sample, colors=False), of_kind(ax, PathCollection)[cloud]
+        points = hiding(da, camera)(points)
         np.testing.assert_allclose(np.reshape(shown.get_offsets(), (-1, 2)), points.pixels[points.mask], atol=1e-6)
         assert {to_hex(color) for color in shown.get_facecolor()} <= {AGENT_COLORS[agent]}
     assert [len(ax.images) for ax in fig.axes] == [1] * 6

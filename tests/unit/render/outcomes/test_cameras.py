@@ -33,7 +33,7 @@ from deepaccident_devkit.render.outcomes import (
     sample_verdict,
 )
 from deepaccident_devkit.render.outcomes.above import FORESEEN_COLOR
-from deepaccident_devkit.render.outcomes.evaluation import AccidentVerdict
+from deepaccident_devkit.render.outcomes.verdicts import AccidentVerdict
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.poses import camera_of
