@@ -257,10 +257,27 @@ def test_a_twin_goes_in_step(pages: Pages, dataset: DeepAccident) -> None:
         document = f"document.querySelectorAll('iframe')[{1 - leader}].contentDocument"
         return int(pages.value(f"{document}.getElementById('scrubber').value"))
 
+    def of_both(words: str) -> list[Any]:
+        """What an expression gives of each replay's document."""
+        every = "[...document.querySelectorAll('iframe')].map((each) => each.contentDocument)"
+        return list(pages.value(f"{every}.map((document) => {words})"))
+
+    looks = "document.getElementById('ground').dataset.view"
     assert led(0, 3) == min(last, max(0, 3 + shift))
     assert led(1, 2) == min(last, max(0, 2 - shift))
+    for replay in (1, 0):
+        before, same = of_both(looks)
+        assert before == same
+        pages.script(f"document.querySelectorAll('iframe')[{replay}].contentDocument.getElementById('closer').click()")
+        wait_for(lambda old=before: len({*of_both(looks)} - {old}) == 1 == len({*of_both(looks)}))
+    hides = "document.defaultView.getComputedStyle(document.getElementById('play')).visibility"
+    assert of_both(hides) == ["visible", "hidden"]
+    pages.script("frames[1].document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ' ', bubbles: true }))")
+    wait_for(lambda: int(of_both("document.getElementById('scrubber').value")[0]) == last)
+    assert of_both("document.getElementById('play').textContent") == ["Play", "Play"]
+    _, stays = of_both("Number(document.getElementById('scrubber').value)")
     pages.click("#step")
-    assert led(0, 5) == 2
+    assert (led(0, 0), of_both(hides)) == (stays, ["visible", "visible"])
 
 
 def test_hostile_names_are_text(pages: Pages, dataset: DeepAccident) -> None:

@@ -1,4 +1,4 @@
-// Two replays side by side, in step: what one plays or shows, the other does too.
+// Two replays side by side, in step: what one plays, shows or looks at, the other does too. The first one's controls play.
 
 const pair = document.getElementById("twins");
 const frames = [...pair.querySelectorAll("iframe")];
@@ -9,10 +9,12 @@ let leads = null; // whose move the other one follows
 
 const slider = (frame) => frame.contentDocument.getElementById("scrubber");
 const at = (frame) => Number(slider(frame).value);
+const beside = (frame) => frames[1 - frames.indexOf(frame)];
+const canvases = (frame) => [...frame.contentDocument.querySelectorAll("canvas[data-view]")];
 
 function follow(mover) {
   if (!step.checked || (leads !== null && leads !== mover)) return;
-  const other = frames[1 - frames.indexOf(mover)];
+  const other = beside(mover);
   if (!other.contentWindow.go) return;
   leads = mover;
   const wanted = at(mover) + (mover === frames[0] ? shift : -shift);
@@ -24,12 +26,49 @@ function follow(mover) {
   follow.later = setTimeout(() => history.replaceState(null, "", query), 200);
 }
 
+// Both recordings are in the same world: the other one's view of the same name gets the same place and zoom.
+function share(mover) {
+  if (!step.checked || !frames.every((each) => each.contentWindow.look)) return;
+  const other = beside(mover);
+  for (const { id, dataset } of canvases(mover)) {
+    const there = other.contentDocument.getElementById(id);
+    if (there.dataset.view !== dataset.view) other.contentWindow.look(id, dataset.view);
+  }
+}
+
 function ready(frame) {
   if (!frame.contentWindow || !frame.contentWindow.go) return;
-  frame.contentDocument.addEventListener("moment", () => follow(frame));
+  const inside = frame.contentDocument;
+  inside.addEventListener("moment", () => follow(frame));
+  const watched = new MutationObserver(() => share(frame));
+  watched.observe(inside.body, { attributes: true, attributeFilter: ["data-view"], subtree: true });
   if (frame === frames[0] && Number(first) > 0) frame.contentWindow.go(Number(first) - 1);
-  if (frames.every((each) => each.contentWindow.go)) follow(frames[0]);
+  if (frame === frames[1]) {
+    inside.addEventListener("keydown", playInFirst, true);
+    lead();
+  }
+  if (!frames.every((each) => each.contentWindow.go)) return;
+  follow(frames[0]);
+  const pairs = (each) => each.contentDocument.getElementById("follow").value === "pair";
+  share(frames.find(pairs) || frames[0]);
 }
+
+function playInFirst(event) {
+  if (!step.checked || event.key !== " ") return;
+  event.preventDefault();
+  event.stopPropagation();
+  frames[0].contentDocument.getElementById("play").click();
+}
+
+// In step the second one has no controls of its own.
+function lead() {
+  frames[1].contentDocument.body.classList.toggle("led", step.checked);
+}
+
+step.addEventListener("change", () => {
+  lead();
+  share(frames[0]);
+});
 for (const frame of frames) {
   frame.addEventListener("load", () => ready(frame));
   if (frame.contentDocument && frame.contentDocument.readyState === "complete") ready(frame);

@@ -117,6 +117,14 @@ function follow(value) {
   byId("follow").value = state.follow = value;
 }
 
+// For the pages around: look at what another replay's canvas of this id looks at, as its `data-view` says.
+const VIEWS = { ground };
+function look(id, view) {
+  follow("");
+  VIEWS[id].look(view.split(" ").map(Number));
+  VIEWS[id].draw();
+}
+
 function zoom(factor) {
   if (state.follow === "pair") follow(""); // it has its own scale
   ground.zoom(factor);
