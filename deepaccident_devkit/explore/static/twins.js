@@ -3,6 +3,7 @@
 const pair = document.getElementById("twins");
 const frames = [...pair.querySelectorAll("iframe")];
 const shift = Number(pair.dataset.shift); // of a frame's number in the second one
+const offset = pair.dataset.offset.split(" ").map(Number); // from the second one's places to the first one's, metres
 const step = document.getElementById("step");
 const first = new URLSearchParams(location.search).get("frame");
 let leads = null; // whose move the other one follows
@@ -10,6 +11,7 @@ let leads = null; // whose move the other one follows
 const slider = (frame) => frame.contentDocument.getElementById("scrubber");
 const at = (frame) => Number(slider(frame).value);
 const beside = (frame) => frames[1 - frames.indexOf(frame)];
+const numbers = (text) => (text || "").split(" ").map(Number);
 const canvases = (frame) => [...frame.contentDocument.querySelectorAll("canvas[data-view]")];
 
 function follow(mover) {
@@ -30,9 +32,12 @@ function follow(mover) {
 function share(mover) {
   if (!step.checked || !frames.every((each) => each.contentWindow.look)) return;
   const other = beside(mover);
+  const sign = mover === frames[0] ? -1 : 1;
   for (const { id, dataset } of canvases(mover)) {
-    const there = other.contentDocument.getElementById(id);
-    if (there.dataset.view !== dataset.view) other.contentWindow.look(id, dataset.view);
+    const wanted = numbers(dataset.view).map((each, place) => each + sign * (offset[place] || 0));
+    const there = numbers(other.contentDocument.getElementById(id).dataset.view);
+    const same = wanted.every((each, place) => Math.abs(each - there[place]) < 1e-6);
+    if (!same) other.contentWindow.look(id, wanted);
   }
 }
 

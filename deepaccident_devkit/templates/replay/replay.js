@@ -117,11 +117,11 @@ function follow(value) {
   byId("follow").value = state.follow = value;
 }
 
-// For the pages around: look at what another replay's canvas of this id looks at, as its `data-view` says.
+// For the pages around: show in a canvas, by its id, what the numbers of such a canvas' `data-view` say.
 const VIEWS = { ground };
 function look(id, view) {
   follow("");
-  VIEWS[id].look(view.split(" ").map(Number));
+  VIEWS[id].look(view);
   VIEWS[id].draw();
 }
 
