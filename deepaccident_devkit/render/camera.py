@@ -16,6 +16,7 @@ from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import (
     bounds_in_image,
+    camera_name,
     draw_boxes_in_image,
     draw_ids_in_image,
     draw_velocities_in_image,
@@ -103,7 +104,7 @@ def render_sample_data(
         ax = axes_or_new(ax, (6, 7.2))
         view = BevView(frame="lidar" if lidar else "ego")
         colors, below = draw_bev(dataset, record["sample_token"], view, chosen, ax)[0], 4.5
-    set_scene_title(ax, dataset, record["token"], record["channel"])
+    set_scene_title(ax, dataset, record["token"], camera_name(record["channel"]))
     draw_legend(ax, box_handles(colors), loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=below)
     return ax
 
@@ -131,7 +132,9 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
         draw_missing_image(dataset, camera["token"], ax)
     elif image:
         ax.imshow(dataset.load_image(camera), extent=(0, lens.width, lens.height, 0))
-    ax.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal", anchor="N", title=camera["channel"])
+    ax.set(
+        xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal", anchor="N", title=camera_name(camera["channel"])
+    )
     for scale in (ax.xaxis, ax.yaxis, *ax.spines.values()):
         scale.set_visible(False)
 
@@ -213,7 +216,7 @@ def render_pointcloud_in_image(
         draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0))
     elif sources:
         _draw_metres(dataset, sources[0], record, color_by, ax)
-    set_scene_title(ax, dataset, record["token"], record["channel"], below=f"LiDAR: {whose}")
+    set_scene_title(ax, dataset, record["token"], camera_name(record["channel"]), below=f"LiDAR: {whose}")
     return ax
 
 

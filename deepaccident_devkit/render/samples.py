@@ -28,7 +28,6 @@ from deepaccident_devkit.render.captions import (
     has_cloud,
     missing_clouds_text,
     set_scene_title,
-    set_title,
     write_missing,
 )
 from deepaccident_devkit.render.figures import LAYERS, Layer, figure_or_new, layers_of
@@ -159,7 +158,7 @@ def render_frame(
     for column, agent in enumerate(names):
         sample = at_once(first, agent)
         draw_camera(dataset, dataset.get("sample_data", f"{sample}/Camera_Front"), in_cameras, axes[0, column])
-        axes[0, column].set_title(agent)
+        axes[0, column].set_title(short_name(agent))
         above = axes[1, column]
         drawn |= draw_bev(dataset, sample, view, from_above, above)[0]
         above.set_xlim(-_VIEW_RANGE, _VIEW_RANGE)
@@ -275,9 +274,9 @@ def render_calibration(
     for camera, ax in zip(cameras, axes.flat, strict=False):
         _draw_panel(dataset, camera, clouds, boxes, chosen, ax)
         if is_frame:
-            set_title(ax, f"{camera.rsplit('/', 3)[1]}, Camera_Front")
+            ax.set_title(f"{short_name(camera.rsplit('/', 3)[1])}, front")
     draw_legend(fig, agent_handles(clouds))
-    whose = "each agent" if len(names) > 1 else names[0]
+    whose = "each agent" if len(names) > 1 else short_name(names[0])
     where = record["frame_token"] if is_frame else record["token"]
     set_scene_title(fig, dataset, where, f"LiDAR of {whose}")
     write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))

@@ -21,6 +21,7 @@ from deepaccident_devkit.evaluation.runs import save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.explore import Explorer, export_pages, make_app
 from deepaccident_devkit.explore.serving import Served, serving
+from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.safety import twin_of
 
 pytestmark = pytest.mark.slow
@@ -177,9 +178,9 @@ def test_the_keyboard_is_enough(pages: Pages, dataset: DeepAccident) -> None:
     pages.press(Keys.ARROW_LEFT)
     pages.wait(f"location.search === '?frame={last}'")
     pages.press("n")
-    pages.wait(f"document.title.startsWith({json.dumps(second['token'])})")
+    pages.wait(f"document.title.startsWith({json.dumps(scenario_words(second))})")
     pages.driver.back()
-    pages.wait(f"document.title.startsWith({json.dumps(first['token'])})")
+    pages.wait(f"document.title.startsWith({json.dumps(scenario_words(first))})")
     assert pages.frame() == last - 1
     pages.driver.back()
     pages.wait("document.getElementById('query')")
@@ -218,7 +219,7 @@ def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) 
     pages.go(scenario_page(accident(dataset)))
     pages.script("go(2); document.getElementById('layer-trails').click(); enlarge('2')")
     pages.script("document.getElementById('cloud-infrastructure').click(); zoom(2)")
-    pages.script("const s = cards[0].select; s.value = 'Back'; s.dispatchEvent(new Event('change'))")
+    pages.script("const s = cards[0].select; s.value = 'back'; s.dispatchEvent(new Event('change'))")
     pages.wait("['changed=', 'pictures=', 'view='].every((each) => location.search.includes(each))")
     looks = """[state.frame, state.large, state.follow, state.clouds, state.layers, cards[0].chosen,
         [ground.x, ground.y, ground.scale].map((each) => each.toFixed(1)), location.search]"""
@@ -343,6 +344,7 @@ def test_a_models_samples_and_two_side_by_side(browser: Browser, judged: tuple[S
     assert (pages.complaints(), pages.elsewhere()) == ([], [])
 
 
+H1 = "(document.querySelector('h1') || document.body).textContent"
 COLUMN = """
 const table = document.querySelector('.sortable');
 const column = [...table.tHead.rows[0].cells].findIndex((each) => each.textContent === '%s');
@@ -411,10 +413,10 @@ def test_keys_lead_from_page_to_page(index: Path, browser: Browser) -> None:
     names = browser.script(COLUMN % "scenario")
     browser.press("j")
     browser.script("document.activeElement.click()")
-    wait_for(lambda: names[0] in browser.driver.title)
+    wait_for(lambda: names[0] in browser.value(H1))
     for key, name in (("n", names[1]), ("p", names[0])):
         browser.press(key)
-        wait_for(lambda name=name: name in browser.driver.title)
+        wait_for(lambda name=name: name in browser.value(H1))
     browser.driver.find_element("link text", "All scenarios").click()
     wait_for(lambda: browser.driver.title.startswith(f"{len(names)} scenarios"))
 
@@ -427,7 +429,7 @@ def test_the_replay_plays_in_its_frame(index: Path, da: DeepAccident, browser: B
     wait_for(lambda: browser.frame() > 0)
     browser.driver.switch_to.default_content()
     browser.driver.find_element("link text", "The replay alone").click()
-    wait_for(lambda: "Accident replay" in browser.driver.title)
+    wait_for(lambda: browser.driver.title == scenario_words(da.scenario.get(accident(da))))
     assert browser.complaints() == []
 
 

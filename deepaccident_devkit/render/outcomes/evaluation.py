@@ -134,7 +134,7 @@ def _draw_accident(
     camera = best_camera(dataset, verdict)
     draw_accidents_in_camera(dataset, verdict, camera, left, image="image" in shown)
     agent, _, channel = camera.rsplit("/", 3)[1:]
-    left.set_title(f"{short_name(agent)}, {camera_name(channel)} camera", fontsize=SMALLEST_TEXT)
+    left.set_title(f"{short_name(agent)}, {camera_name(channel)}", fontsize=SMALLEST_TEXT)
 
 
 def best_camera(dataset: Dataset, verdict: AccidentVerdict) -> str:

@@ -135,7 +135,7 @@ def sample_verdict(
 def _of_motion(token: str, given: MotionOutput, label: MotionLabels, judge: MotionEvaluator) -> MotionVerdict:
     judge.update(token, given, label)
     ranges = [
-        f"{name} m: IoU {within.iou:.1f} %, PQ {within.pq:.1f} %, {within.true_positive} TP, "
+        f"{name} m: IoU {within.iou:.1f} %, VPQ {within.pq:.1f} %, {within.true_positive} TP, "
         f"{within.false_positive} FP, {within.false_negative} FN"
         for name, within in judge.compute().ranges.items()
     ]

@@ -42,7 +42,7 @@ def test_the_image_fills_the_pixels_of_its_calibration(da: DeepAccident, behind:
     (image,) = ax.images
     np.testing.assert_array_equal(image.get_array(), da.load_image(f"{behind}/Camera_Front"))
     assert (tuple(image.get_extent()), ax.get_xlim(), ax.get_ylim()) == ((0, 64, 36, 0), (0, 64), (36, 0))
-    assert title_of(ax) == "Night, wet cloudy, Town02: the impact, ego vehicle behind, Camera_Front"
+    assert title_of(ax) == "Town02, wet cloudy night: the impact, ego behind, front"
     assert plt.get_fignums() == []
 
 
@@ -76,7 +76,7 @@ def test_the_other_sensors_are_drawn_from_above_in_their_frame(
     near = boxes.select((np.abs(boxes.center[:, :2] - center) < 55).all(axis=1))
     assert footprints(of_kind(ax, PolyCollection)[0]) == footprints(near)
     assert (len(of_kind(ax, PathCollection)), len(ax.images)) == ((1, 0) if channel == "lidar01" else (0, 1))
-    assert title_of(ax).endswith(f": the impact, ego vehicle behind, {channel}")
+    assert title_of(ax).endswith(f": the impact, ego behind, {channel}")
 
 
 def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAccident, behind: str) -> None:
@@ -91,7 +91,7 @@ def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAcc
     np.testing.assert_allclose(drawn.get_offsets(), points.pixels[order])
     np.testing.assert_allclose(drawn.get_array(), height[order])
     assert drawn.get_cmap().name == HEIGHT_COLORMAP
-    assert title_of(ax).endswith("ego vehicle behind, Camera_Front LiDAR: the impact, infrastructure")
+    assert title_of(ax).endswith("ego behind, front LiDAR: the impact, infrastructure")
 
 
 def test_points_by_depth_are_the_camera_s_own_unless_told(da: DeepAccident, behind: str) -> None:

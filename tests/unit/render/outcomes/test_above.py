@@ -41,7 +41,7 @@ def test_accidents_without_truth(da_motion: DeepAccident) -> None:
     figure = render_evaluation(da_motion, token, [alarm], fig=detached_figure((9, 5)))
     assert title_of(figure).endswith("5 m: FP, 10 m: FP, 15 m: FP")
     assert [ax.get_title() for ax in figure.axes] == [
-        "ego, front camera",
+        "ego, front",
         "no accident comes, one is foreseen in 1.0 s",
     ]
     nothing = ComparedAccidents(true=None, predicted=())

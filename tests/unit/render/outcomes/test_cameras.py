@@ -25,7 +25,7 @@ from deepaccident_devkit.evaluation import (
 from deepaccident_devkit.evaluation.accident.scoring import ComparedAccidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
-from deepaccident_devkit.render.boxes import NEAREST_DRAWN
+from deepaccident_devkit.render.boxes import NEAREST_DRAWN, camera_name
 from deepaccident_devkit.render.outcomes import (
     draw_outcome_in_camera,
     render_evaluation,
@@ -289,7 +289,7 @@ def test_the_verdict_is_that_of_the_views_from_above(
         beside = render_evaluation(da_motion, sample, given, fig=detached_figure((12, 7)), **how)
         over = render_outcome_in_cameras(da_motion, sample, given, fig=detached_figure((15, 7)), **how)
         assert title_of(over) == title_of(beside)
-        assert [ax.get_title() for ax in over.axes] == IN_ORDER
+        assert [ax.get_title() for ax in over.axes] == [*map(camera_name, IN_ORDER)]
 
 
 def test_frames_and_legends_are_named(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:

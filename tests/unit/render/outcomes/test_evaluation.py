@@ -86,7 +86,7 @@ def test_an_accident_is_shown_on_the_road_and_in_the_camera_that_sees_both_best(
     moment = da.get("sample", approach)["frame_token"]
     best: Any = best_view(da, [each["token"] for each in da.samples_of(moment)], pair)
     agent, _, channel = best.camera.rsplit("/", 3)[1:]
-    assert camera.get_title() == f"{short_name(agent)}, {camera_name(channel)} camera"
+    assert camera.get_title() == f"{short_name(agent)}, {camera_name(channel)}"
     np.testing.assert_array_equal(camera.images[0].get_array(), da.load_image(best.camera))
     (road,) = above.images
     assert BEV_COLORS["road"] in {to_hex(color / 255) for color in np.unique(road.get_array().reshape(-1, 3), axis=0)}
