@@ -142,9 +142,8 @@ def best_camera(dataset: Dataset, verdict: AccidentVerdict) -> str:
 
     The front camera of the sample's agent, if no camera shows them.
     """
-    record = dataset.get("sample", verdict.sample)
     boxes = boxes_of(dataset, verdict)
-    samples = [each["token"] for each in dataset.samples_of(record["frame_token"])]
+    samples = [each["token"] for each in dataset.samples_of(dataset.get("sample", verdict.sample)["frame_token"])]
     view = best_view(dataset, samples, boxes) if len(boxes) else None
     return f"{verdict.sample}/Camera_Front" if view is None else view.camera
 

@@ -201,7 +201,6 @@ def boxes_of(dataset: Dataset, verdict: AccidentVerdict) -> Boxes:
     """The boxes, now and in world, of who collides by meta, or else of whom the first alarm names."""
     record = dataset.get("sample", verdict.sample)
     collision = dataset.get("scenario", record["scenario_token"])["collision"]
-    alarm = next(iter(verdict.compared.predicted), None)
-    named = None if alarm is None else alarm.ids
+    named = next((alarm.ids for alarm in verdict.compared.predicted), None)
     boxes = cooperative_boxes(dataset, record)
     return boxes.select(np.isin(boxes.actor_id, (named or ()) if collision is None else collision["ids"]))
