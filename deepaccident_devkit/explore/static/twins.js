@@ -7,6 +7,7 @@ const offset = pair.dataset.offset.split(" ").map(Number); // from the second on
 const step = document.getElementById("step");
 const first = new URLSearchParams(location.search).get("frame");
 let leads = null; // whose move the other one follows
+let touched = frames[0];
 
 const slider = (frame) => frame.contentDocument.getElementById("scrubber");
 const at = (frame) => Number(slider(frame).value);
@@ -28,12 +29,12 @@ function follow(mover) {
   follow.later = setTimeout(() => history.replaceState(null, "", query), 200);
 }
 
-// Both recordings are in the same world: the other one's view of the same name gets the same place and zoom.
-function share(mover) {
+// Both recordings are in the same world: the views of the replay that the reader touched last lead the other one's.
+function share() {
   if (!step.checked || !frames.every((each) => each.contentWindow.look)) return;
-  const other = beside(mover);
-  const sign = mover === frames[0] ? -1 : 1;
-  for (const { id, dataset } of canvases(mover)) {
+  const other = beside(touched);
+  const sign = touched === frames[0] ? -1 : 1;
+  for (const { id, dataset } of canvases(touched)) {
     const wanted = numbers(dataset.view).map((each, place) => each + sign * (offset[place] || 0));
     const there = numbers(other.contentDocument.getElementById(id).dataset.view);
     const same = wanted.every((each, place) => Math.abs(each - there[place]) < 1e-6);
@@ -45,7 +46,10 @@ function ready(frame) {
   if (!frame.contentWindow || !frame.contentWindow.go) return;
   const inside = frame.contentDocument;
   inside.addEventListener("moment", () => follow(frame));
-  const watched = new MutationObserver(() => share(frame));
+  for (const kind of ["pointerdown", "wheel", "keydown", "click", "change"]) {
+    inside.addEventListener(kind, () => (touched = frame), { capture: true, passive: true });
+  }
+  const watched = new MutationObserver(share);
   watched.observe(inside.body, { attributes: true, attributeFilter: ["data-view"], subtree: true });
   if (frame === frames[0] && Number(first) > 0) frame.contentWindow.go(Number(first) - 1);
   if (frame === frames[1]) {
@@ -55,7 +59,8 @@ function ready(frame) {
   if (!frames.every((each) => each.contentWindow.go)) return;
   follow(frames[0]);
   const pairs = (each) => each.contentDocument.getElementById("follow").value === "pair";
-  share(frames.find(pairs) || frames[0]);
+  touched = frames.find(pairs) || frames[0];
+  share();
 }
 
 function playInFirst(event) {
@@ -72,7 +77,7 @@ function lead() {
 
 step.addEventListener("change", () => {
   lead();
-  share(frames[0]);
+  share();
 });
 for (const frame of frames) {
   frame.addEventListener("load", () => ready(frame));

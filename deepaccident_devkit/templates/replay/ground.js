@@ -75,7 +75,7 @@ class Ground {
   }
 
   // The middle in metres and the pixels of a metre, in the order of `data-view`.
-  look([x, y, scale]) {
+  setView([x, y, scale]) {
     Object.assign(this, { x, y, scale });
   }
 

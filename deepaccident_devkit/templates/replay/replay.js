@@ -121,7 +121,7 @@ function follow(value) {
 const VIEWS = { ground };
 function look(id, view) {
   follow("");
-  VIEWS[id].look(view);
+  VIEWS[id].setView(view);
   VIEWS[id].draw();
 }
 
