@@ -36,6 +36,7 @@ GROUPS = {
     "classes by choice, and the pair": (*styles.CLASS_COLORS.values(), styles.COLLIDER_COLOR),
     "series": styles.SERIES_COLORS,
     "splits": tuple(styles.SPLIT_COLORS.values()),
+    "a town's ground": tuple(styles.MAP_COLORS.values()),
 }
 """Colours that stand together in a picture and must be distinguished."""
 GROUNDS = {"white": "#ffffff", "road": styles.BEV_COLORS["road"], "mid-grey image": "#808080"}

@@ -338,7 +338,8 @@ def _mcap(
     dataset = DeepAccident(**options)
     token = scenario or default_scenario(dataset)
     made = export_mcap(dataset, token, out, prediction=prediction, progress=True, **choices)
-    click.echo(f"{made}: {token}, {made.stat().st_size / 1e6:.1f} MB; open it in Foxglove, or with: rerun {made}")
+    size, script = f"{made.stat().st_size / 1e6:.1f} MB", made.with_suffix(".rerun.py")
+    click.echo(f"{made}: {token}, {size}; open it in Foxglove, or with: python {script}")
 
 
 _VERBS: Final[dict[str, Callable[[], click.Command]]] = {

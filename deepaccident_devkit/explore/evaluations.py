@@ -269,7 +269,7 @@ def _motion(row: Row, *, whole: bool) -> str:
 
 
 def _instances(row: Row, around: str) -> str:
-    shares = [f"{name} {_percent(row.get(f'{name.lower()}_{around}'))}" for name in ("PQ", "IoU")]
+    shares = [f"{name} {_percent(row.get(f'{key}_{around}'))}" for name, key in (("VPQ", "pq"), ("IoU", "iou"))]
     counts = [f"{_count(row, f'{case}_{around}')} {case.upper()}" for case in _CASES]
     return f"{around} m: {', '.join([*shares, *counts])}"
 

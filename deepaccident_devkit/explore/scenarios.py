@@ -168,11 +168,3 @@ def _facet(name: str, texts: Sequence[str | None]) -> Facet:
     place = {value: number for number, value in enumerate(values)}
     codes = np.array([place[UNKNOWN if text is None else text] for text in texts], dtype=np.int64)
     return Facet(name=name, values=tuple(values), codes=codes)
-
-
-def ending(record: ScenarioRecord) -> str:
-    """How a scenario ends, in a few words."""
-    told: Mapping[str, Any] | None = record["collision"]
-    if told is None:
-        return "end unknown" if record["weather"] is None else "no collision"
-    return " and ".join(told["classes"]) + " collide"

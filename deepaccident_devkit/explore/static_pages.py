@@ -27,6 +27,7 @@ from deepaccident_devkit.explore.scenarios import accident_columns
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.interactions.scenario import measures_of_moving_pairs
 from deepaccident_devkit.parallel import Engine, Places, run_batch
+from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.render.replay import recording_of, tried_replay
 from deepaccident_devkit.render.replay.page import facts
 from deepaccident_devkit.safety import twin_of
@@ -337,6 +338,7 @@ class _Pages:
             policy=_POLICY,
             asset=lambda _, name: f"{root}{_STATIC}/{name}",
             scenario_at=lambda _, token: f"{own(token)}/{INDEX}",
+            named=lambda token: scenario_words(self._dataset.scenario.get(token)),
             thumbnail_at=lambda _, token: f"{own(token)}/{THUMBNAIL}",
             **context,
         )

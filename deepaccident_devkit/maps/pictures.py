@@ -1,8 +1,8 @@
-"""Pictures of a town's map in pale colours: alone, beneath what is seen from above, and as a replay's road."""
+"""Pictures of a town's map: alone, in pale colours beneath what is seen from above, and as a replay's road."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -13,9 +13,10 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps.counting import GROUND_CLASSES
 from deepaccident_devkit.maps.making import kept_town_map, town_map
 from deepaccident_devkit.maps.town_map import TownMap
+from deepaccident_devkit.render.captions import draw_legend
 from deepaccident_devkit.render.figures import axes_or_new, axis_words
 from deepaccident_devkit.render.ground import draw_ground
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.styles import BEV_COLORS, MAP_COLORS, MUTED_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 
@@ -28,7 +29,7 @@ _MOST_CELLS: Final = 800
 
 @in_own_settings
 def render_town_map(dataset: Dataset, town: str, *, ax: Axes | None = None) -> Axes:
-    """Render the map of a town, which is made if none is kept: roads, their lines and sidewalks, in pale colours.
+    """Render the map of a town, which is made if none is kept: roads, their lines, sidewalks and other ground.
 
     Args:
         dataset: the release.
@@ -47,11 +48,18 @@ def render_town_map(dataset: Dataset, town: str, *, ax: Axes | None = None) -> A
 
 @in_own_settings
 def draw_whole_map(drawn: TownMap, ax: Axes) -> Axes:
-    """Render a map as far as it reaches, in metres of the world, with a title."""
+    """Render a map as far as it reaches, in metres of the world, with a title and a legend."""
+    from matplotlib.patches import Patch
+
     left, right, bottom, top = drawn.extent
     x_words, y_words = axis_words("world")
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel=x_words, ylabel=y_words)
-    draw_town_map(drawn, ax, target_from_world=SE3.identity())
+    draw_town_map(drawn, ax, target_from_world=SE3.identity(), colors=MAP_COLORS)
+    handles = [
+        Patch(facecolor=color, edgecolor=MUTED_COLOR, linewidth=0.5, label=name.replace("_", " "))
+        for name, color in MAP_COLORS.items()
+    ]
+    draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4.5)
     ax.set_title(f"{drawn.town}: {drawn.looks:,} pictures of {drawn.scenarios} scenarios")
     return ax
 
@@ -71,8 +79,8 @@ def map_beneath(dataset: Dataset, scenario: str, *, make: bool) -> TownMap | Non
         return None
 
 
-def draw_town_map(drawn: TownMap, ax: Axes, *, target_from_world: SE3) -> None:
-    """Render the part of a map that axes show, whose limits stay; what is no road or sidewalk is white."""
+def draw_town_map(drawn: TownMap, ax: Axes, *, target_from_world: SE3, colors: Mapping[str, str] = BEV_COLORS) -> None:
+    """Render the part of a map that axes show, whose limits stay; what has no colour, or was not seen, is white."""
     part = _shown(drawn, (ax.get_xlim(), ax.get_ylim()), target_from_world)
     if not part.agents.size:
         return
@@ -82,7 +90,7 @@ def draw_town_map(drawn: TownMap, ax: Axes, *, target_from_world: SE3) -> None:
     (left, bottom), reach = part.origin.tolist(), part.resolution
     extent = (left, left + columns * reach, bottom, bottom + rows * reach)
     numbers = {name: number for number, name in enumerate(GROUND_CLASSES, 1)}
-    draw_ground(cells, numbers, ax, extent=extent, placed=target_from_world, zorder=-1)
+    draw_ground(cells, numbers, ax, extent=extent, placed=target_from_world, zorder=-1, colors=colors)
 
 
 def ground_at(drawn: TownMap, points: FloatArray, names: Sequence[str]) -> ByteArray:

@@ -377,7 +377,9 @@ def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:
 
 
 def camera_name(channel: str) -> str:
-    """A camera's short name for pictures: `front`, `back left`."""
+    """A camera's short name for readers: `front`, `back left`; of another sensor its channel."""
+    if not channel.startswith("Camera_"):
+        return channel
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", channel.removeprefix("Camera_")).lower()
 
 

@@ -16,6 +16,7 @@ from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import (
     bounds_in_image,
+    camera_name,
     draw_boxes_in_image,
     draw_ids_in_image,
     draw_velocities_in_image,
@@ -35,6 +36,7 @@ from deepaccident_devkit.render.captions import (
     write_missing,
 )
 from deepaccident_devkit.render.figures import Layer, axes_or_new, layers_of, widening
+from deepaccident_devkit.render.hidden import hiding
 from deepaccident_devkit.render.styles import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP, in_own_settings
 from deepaccident_devkit.support.arrays import FloatArray, as_floats
 from deepaccident_devkit.support.text import choice
@@ -103,7 +105,7 @@ def render_sample_data(
         view = BevView(frame="lidar" if lidar else "ego", wide=widening(ax))
         ax = axes_or_new(ax, (6, 7.2))
         colors = draw_bev(dataset, record["sample_token"], view, chosen, ax)[0]
-    set_scene_title(ax, dataset, record["token"], record["channel"])
+    set_scene_title(ax, dataset, record["token"], camera_name(record["channel"]))
     if record["modality"] == "camera":
         draw_legend(ax, box_handles(colors), loc="upper center", bbox_to_anchor=(0.5, 0))
     else:
@@ -134,7 +136,9 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
         draw_missing_image(dataset, camera["token"], ax)
     elif image:
         ax.imshow(dataset.load_image(camera), extent=(0, lens.width, lens.height, 0))
-    ax.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal", anchor="N", title=camera["channel"])
+    ax.set(
+        xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal", anchor="N", title=camera_name(camera["channel"])
+    )
     for scale in (ax.xaxis, ax.yaxis, *ax.spines.values()):
         scale.set_visible(False)
 
@@ -171,7 +175,9 @@ def render_pointcloud_in_image(
     color_by: ColorBy = "depth",
     ax: Axes | None = None,
 ) -> Axes:
-    """Render a camera's image with LiDAR points on it, even those that other things hide.
+    """Render a camera's image with LiDAR points on it.
+
+    Points of other agents are left out where the camera's own cloud has something in front of them (`render.hidden`).
 
     Args:
         dataset: the release.
@@ -214,13 +220,13 @@ def render_pointcloud_in_image(
         draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0))
     elif sources:
         _draw_metres(dataset, sources[0], record, color_by, ax)
-    set_scene_title(ax, dataset, record["token"], record["channel"], below=f"LiDAR: {whose}")
+    set_scene_title(ax, dataset, record["token"], camera_name(record["channel"]), below=f"LiDAR: {whose}")
     return ax
 
 
 def _draw_agent(dataset: Dataset, source: SampleRecord, camera: RowArgument, ax: Axes) -> None:
     cloud = dataset.load_point_cloud(source, "lidar")
-    points = project_to_image(dataset, cloud, source, camera, colors=False)
+    points = hiding(dataset, camera)(project_to_image(dataset, cloud, source, camera, colors=False))
     draw_points_in_image(points.pixels[points.mask], ax, color=AGENT_COLORS[source["agent"]])
 
 
@@ -229,7 +235,7 @@ def _draw_metres(
 ) -> None:
     """Points coloured by depth or height, and a colour bar."""
     cloud = dataset.load_point_cloud(source, "world")
-    points = project_to_image(dataset, cloud, source, camera, colors=False)
+    points = hiding(dataset, camera)(project_to_image(dataset, cloud, source, camera, colors=False))
     values, limits, colormap = points.depth, _DEPTHS, DEPTH_COLORMAP
     if color_by == "height":
         ego_from_world = dataset.world_from(dataset.get("sample_data", camera)["sample_token"], "ego").inverse()

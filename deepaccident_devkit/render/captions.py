@@ -23,7 +23,7 @@ from deepaccident_devkit.render.styles import (
     current_style,
     text_size,
 )
-from deepaccident_devkit.taxonomy import LIDAR, short_name
+from deepaccident_devkit.taxonomy import CATEGORIES, LIDAR, short_name
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -56,41 +56,56 @@ _MISSING, _LACKS = "missing", "lacks"
 _NO_CLOUD: Final = "no LiDAR file of "
 
 
-def scene_words(dataset: Dataset, scenario: str) -> str:
-    """When and where a scenario (a token) takes place, as far as meta says it: `Night, hard rain, Town10HD`."""
-    record = dataset.get("scenario", scenario)
+def scene_words(record: Mapping[str, Any]) -> str:
+    """Where and when a scenario takes place, as far as meta says it: `Town10HD, wet night`."""
     weather = _CAPITALS.sub(" ", record["weather"] or "").lower()
-    words = ", ".join(filter(None, [record["time_of_day"], weather]))
-    return ", ".join(filter(None, [words[:1].upper() + words[1:], record["town"]]))
+    when = (" at " if weather.endswith("rain") else " ").join(filter(None, [weather, record["time_of_day"]]))
+    return ", ".join(filter(None, [record["town"], when.lower()]))
+
+
+def scenario_words(record: Mapping[str, Any]) -> str:
+    """A scenario's name for readers: `Town02, wet night: car hits pedestrian`, cars first; or `…: no collision`."""
+    told: Any = record["collision"]
+    if told is None:
+        end = "end unknown" if record["weather"] is None else "no collision"
+    else:
+        end = " hits ".join(sorted(told["classes"], key=(*CATEGORIES, *told["classes"]).index))
+    return ": ".join(filter(None, [scene_words(record), end]))
 
 
 def moment_words(dataset: Dataset, token: str) -> str:
-    """The moment of a frame's token, or the moment and the agent of a sample's: `1.0 s to the impact, ego vehicle`."""
+    """The moment of a frame's token, or the moment and the agent of a sample's: `1.0 s to the impact, ego behind`."""
     kind, name, *names, number = token.split("/")[:4]
     frame = dataset.get("frame", f"{kind}/{name}/{number}")
     left = dataset.samples_of(frame)[0]["time_to_impact"]
     time = f"{frame['timestamp']:.1f} s" if left is None else f"{left:.1f} s to the impact"
-    return ", ".join(["the impact" if left == 0 else time, *(agent.replace("_", " ") for agent in names)])
+    return ", ".join(["the impact" if left == 0 else time, *map(short_name, names)])
 
 
 def set_scene_title(
     where: Axes | Figure, dataset: Dataset, token: str, words: str = "", *, below: str = "", **style: Any
 ) -> None:
-    """Title axes or a figure `Night, hard rain, Town10HD: 1.0 s to the impact, ego vehicle`, and a token small beneath.
+    """Title axes or a figure `Town10HD, wet night: 1.0 s to the impact, ego`, and a token small beneath.
 
-    The token is that of a scenario, frame, sample, sensor file, box or actor; `words` follow on the same line, `below`
-    on another one, and on a last one what `write_missing` was given of these axes, or of a figure's.
+    Of a scenario or an actor it begins with `scenario_words`. The token is that of a scenario, frame, sample, sensor
+    file, box or actor; `words` follow on the same line, `below` on another one, and on a last one what `write_missing`
+    was given of these axes, or of a figure's.
     """
     from matplotlib.axes import Axes
 
     if not current_style().titled:
         return
     kind, name, *rest = token.split("/")
-    moment = "" if rest[:1] in ([], ["actor"]) else moment_words(dataset, token)
-    said = ", ".join(filter(None, [moment, words]))
+    record = dataset.get("scenario", f"{kind}/{name}")
+    whole = rest[:1] in ([], ["actor"])
+    scene = (
+        scenario_words(record)
+        if whole
+        else ": ".join(filter(None, [scene_words(record), moment_words(dataset, token)]))
+    )
     if isinstance(where, Axes):
         style.setdefault("fontsize", "medium")
-    first = ": ".join(filter(None, [scene_words(dataset, f"{kind}/{name}"), said]))
+    first = ", ".join(filter(None, [scene, words]))
     axes: Any = [where] if isinstance(where, Axes) else where.axes
     absent = "; ".join(_parts(text for ax in axes for text in ax.texts if text.get_gid() == _LACKS))
     set_title(where, "\n".join(filter(None, [first, below, absent])), token=token, **style)

@@ -61,23 +61,25 @@ def draw_ground(
     extent: tuple[float, float, float, float],
     placed: SE3,
     zorder: float,
+    colors: Mapping[str, str] = BEV_COLORS,
 ) -> None:
-    """Render numbers (H, W) in the pale colours of their names, white without one; the limits of the axes stay.
+    """Render numbers (H, W) in the colours of their names, white without one; the limits of the axes stay.
 
     Args:
         cells: the lowest row first.
-        numbers: what lies there → its number; those of `BEV_COLORS` alone have a colour.
+        numbers: what lies there → its number.
         ax: axes to render on.
         extent: left, right, bottom and top of the cells, metres, before they are placed.
         placed: into the frame of the axes.
         zorder: of the picture.
+        colors: what lies there → its colour; pale ones by default.
     """
     from matplotlib.colors import to_rgb
     from matplotlib.transforms import Affine2D
 
     table = np.full((256, 3), 255, dtype=np.uint8)
-    for name in numbers.keys() & BEV_COLORS.keys():
-        table[numbers[name]] = np.rint(np.array(to_rgb(BEV_COLORS[name])) * 255)
+    for name in numbers.keys() & colors.keys():
+        table[numbers[name]] = np.rint(np.array(to_rgb(colors[name])) * 255)
     limits = ax.get_xlim(), ax.get_ylim()
     place = Affine2D().rotate(_yaw(placed)).translate(*placed.translation[:2]) + ax.transData
     how: Any = {"origin": "lower", "interpolation": "nearest", "zorder": zorder}

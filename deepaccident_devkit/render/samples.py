@@ -30,6 +30,7 @@ from deepaccident_devkit.render.captions import (
     write_missing,
 )
 from deepaccident_devkit.render.figures import LAYERS, Layer, figure_or_new, layers_of
+from deepaccident_devkit.render.hidden import hiding
 from deepaccident_devkit.render.styles import AGENT_COLORS, current_style, in_own_settings, text_size
 from deepaccident_devkit.taxonomy import CAMERAS, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes, project_to_image
@@ -229,8 +230,9 @@ def render_calibration(
     """Render the LiDAR points of all agents and all agents' boxes in camera images, to prove the calibration.
 
     Each agent's points have its colour. If the transforms are right, they lie on the kerbs, walls and cars of the
-    image. If an agent's pose or a sensor's place is wrong, all points of its colour are in wrong places. Points and
-    boxes are rendered even if other things hide them.
+    image. If an agent's pose or a sensor's place is wrong, all points of its colour are in wrong places. Points of
+    other agents are left out where the camera's own cloud has something in front of them (`render.hidden`); boxes are
+    rendered even if other things hide them.
 
     Args:
         dataset: the release.
@@ -277,7 +279,7 @@ def render_calibration(
     else:
         draw_legend(fig, agent_handles(clouds))
     write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
-    whose = "each agent" if len(names) > 1 else names[0]
+    whose = "each agent" if len(names) > 1 else short_name(names[0])
     where = record["frame_token"] if is_frame else record["token"]
     set_scene_title(fig, dataset, where, f"LiDAR of {whose}")
     return fig
@@ -302,8 +304,9 @@ def _draw_panel(
     record = dataset.get("sample_data", camera)
     sample = dataset.get("sample", record["sample_token"])
     draw_image(dataset, record, ax, image="image" in layers)
+    seen = hiding(dataset, record)
     for agent, cloud in clouds.items():
-        points = project_to_image(dataset, cloud, sample, record, colors=False)
+        points = seen(project_to_image(dataset, cloud, sample, record, colors=False))
         draw_points_in_image(points.pixels[points.mask], ax, size=1.2, color=AGENT_COLORS[agent])
     own = dataset.get("agent", sample["agent_token"])["actor_id"]
     optical = boxes.transform(dataset.world_from(sample, record["channel"]).inverse(), record["channel"])

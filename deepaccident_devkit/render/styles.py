@@ -69,6 +69,8 @@ BEV_COLORS: Mapping[str, str] = {
     "pedestrian": "#d3d9e0",
 }
 """CARLA's tags in the BEV camera, in pale colours: boxes are rendered over them."""
+MAP_COLORS: Mapping[str, str] = {"road": "#868f98", "road_line": "#ffffff", "sidewalk": "#d8c8a0", "other": "#dde4e0"}
+"""The ground of a town's map that is alone in its picture."""
 GRID_COLOR = "#d0d0d0"
 MISSING_COLOR = "#dddddd"
 """The place of an image that is not there."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote, urlsplit
 
+import numpy as np
 import pytest
 from chromium import Browser
 from evaluation_runs import stored_run
@@ -20,6 +21,7 @@ from deepaccident_devkit.evaluation.runs import save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.explore import Explorer, export_pages, make_app
 from deepaccident_devkit.explore.serving import Served, serving
+from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.safety import twin_of
 
 pytestmark = pytest.mark.slow
@@ -181,9 +183,9 @@ def test_the_keyboard_is_enough(pages: Pages, dataset: DeepAccident) -> None:
     pages.press(Keys.ARROW_LEFT)
     pages.wait(f"location.search === '?frame={last}'")
     pages.press("n")
-    pages.wait(f"document.title.startsWith({json.dumps(second['token'])})")
+    pages.wait(f"document.title.startsWith({json.dumps(scenario_words(second))})")
     pages.driver.back()
-    pages.wait(f"document.title.startsWith({json.dumps(first['token'])})")
+    pages.wait(f"document.title.startsWith({json.dumps(scenario_words(first))})")
     assert pages.frame() == last - 1
     pages.driver.back()
     pages.wait("document.getElementById('query')")
@@ -242,7 +244,7 @@ def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) 
     pages.go(scenario_page(accident(dataset)))
     pages.script("go(2); document.getElementById('layer-trails').click(); enlarge('2')")
     pages.script("document.getElementById('cloud-infrastructure').click(); zoom(2)")
-    for select, value in (("cards[0].select", "Back"), ("byId('scene')", "space"), ("byId('points-by')", "height")):
+    for select, value in (("cards[0].select", "back"), ("byId('scene')", "space"), ("byId('points-by')", "height")):
         pages.script(f"const s = {select}; s.value = '{value}'; s.dispatchEvent(new Event('change'))")
     pages.wait("['changed=', 'pictures=', 'view=', 'points-by='].every((each) => location.search.includes(each))")
     looks = """[state.frame, state.large, state.follow, state.clouds, state.scene, state.pointsBy,
@@ -272,8 +274,10 @@ def test_a_moments_boxes_and_labels(pages: Pages, dataset: DeepAccident) -> None
     pages.wait("location.pathname.endsWith('/moment/infrastructure/3')")
 
 
-def test_a_twin_goes_in_step(pages: Pages, dataset: DeepAccident) -> None:
-    record = next(each for each in dataset.find(collision=True) if twin_of(dataset, each))
+def test_a_twin_goes_in_step(pages: Pages, dataset: DeepAccident, explorer: Explorer) -> None:
+    record, twin = next(
+        (each, twin_of(dataset, each)) for each in dataset.find(collision=True) if twin_of(dataset, each)
+    )
     pages.go(scenario_page(record["token"], "twin"))
     pages.wait("[...document.querySelectorAll('iframe')].every((each) => each.contentWindow.go)")
     shift, last = int(pages.value("document.getElementById('twins').dataset.shift")), record["num_frames"] - 1
@@ -284,10 +288,32 @@ def test_a_twin_goes_in_step(pages: Pages, dataset: DeepAccident) -> None:
         document = f"document.querySelectorAll('iframe')[{1 - leader}].contentDocument"
         return int(pages.value(f"{document}.getElementById('scrubber').value"))
 
+    def of_both(words: str) -> list[Any]:
+        """What an expression gives of each replay's document."""
+        every = "[...document.querySelectorAll('iframe')].map((each) => each.contentDocument)"
+        return list(pages.value(f"{every}.map((document) => {words})"))
+
+    def views() -> Any:
+        """(2, 3) the middle of each map, metres of the world, and the pixels of a metre."""
+        told = of_both("document.getElementById('ground').dataset.view.split(' ').map(Number)")
+        origins = [explorer.recording(each).origin for each in (record["token"], twin["token"])]
+        return np.array(told) + np.pad(origins, ((0, 0), (0, 1)))
+
     assert led(0, 3) == min(last, max(0, 3 + shift))
     assert led(1, 2) == min(last, max(0, 2 - shift))
+    for replay in (1, 0):
+        before = views()
+        np.testing.assert_allclose(before[0], before[1])
+        pages.script(f"document.querySelectorAll('iframe')[{replay}].contentDocument.getElementById('closer').click()")
+        wait_for(lambda old=before: (views()[:, 2] > old[:, 2]).all())
+    hides = "document.defaultView.getComputedStyle(document.getElementById('play')).visibility"
+    assert of_both(hides) == ["visible", "hidden"]
+    pages.script("frames[1].document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ' ', bubbles: true }))")
+    wait_for(lambda: int(of_both("document.getElementById('scrubber').value")[0]) == last)
+    assert of_both("document.getElementById('play').textContent") == ["Play", "Play"]
+    _, stays = of_both("Number(document.getElementById('scrubber').value)")
     pages.click("#step")
-    assert led(0, 5) == 2
+    assert (led(0, 0), of_both(hides)) == (stays, ["visible", "visible"])
 
 
 def test_hostile_names_are_text(pages: Pages, dataset: DeepAccident) -> None:
@@ -345,6 +371,7 @@ def test_a_models_samples_and_two_side_by_side(browser: Browser, judged: tuple[S
     assert (pages.complaints(), pages.elsewhere()) == ([], [])
 
 
+H1 = "(document.querySelector('h1') || document.body).textContent"
 COLUMN = """
 const table = document.querySelector('.sortable');
 const column = [...table.tHead.rows[0].cells].findIndex((each) => each.textContent === '%s');
@@ -413,10 +440,10 @@ def test_keys_lead_from_page_to_page(index: Path, browser: Browser) -> None:
     names = browser.script(COLUMN % "scenario")
     browser.press("j")
     browser.script("document.activeElement.click()")
-    wait_for(lambda: names[0] in browser.driver.title)
+    wait_for(lambda: names[0] in browser.value(H1))
     for key, name in (("n", names[1]), ("p", names[0])):
         browser.press(key)
-        wait_for(lambda name=name: name in browser.driver.title)
+        wait_for(lambda name=name: name in browser.value(H1))
     browser.driver.find_element("link text", "All scenarios").click()
     wait_for(lambda: browser.driver.title.startswith(f"{len(names)} scenarios"))
 
@@ -429,7 +456,7 @@ def test_the_replay_plays_in_its_frame(index: Path, da: DeepAccident, browser: B
     wait_for(lambda: browser.frame() > 0)
     browser.driver.switch_to.default_content()
     browser.driver.find_element("link text", "The replay alone").click()
-    wait_for(lambda: "Accident replay" in browser.driver.title)
+    wait_for(lambda: browser.driver.title == scenario_words(da.scenario.get(accident(da))))
     assert browser.complaints() == []
 
 

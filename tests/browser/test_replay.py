@@ -19,10 +19,10 @@ from wording import holding, lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, box_truth
-from deepaccident_devkit.render.boxes import EDGES, NEAREST_DRAWN, segments_in_image
+from deepaccident_devkit.render.boxes import EDGES, NEAREST_DRAWN, camera_name, segments_in_image
 from deepaccident_devkit.render.replay import recording_of, render_replay, sensors
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 pytestmark = pytest.mark.slow
@@ -223,7 +223,7 @@ def test_every_camera_is_chosen(browser: Browser, recorded: Path) -> None:
         for camera in cameras:
             choose(browser, f'select[aria-label="Camera of {agent["title"]}"]', camera["title"])
             assert browser.value(f"{image}.src").endswith(camera["pictures"][4])
-        assert browser.value(f"{image}.alt") == f"{agent['title']}, camera BackRight, frame 5"
+        assert browser.value(f"{image}.alt") == f"{agent['title']}, camera back right, frame 5"
     click(browser, "layer-points")
     assert (browser.complaints(), len(browser.requests())) == ([], 1)
 
@@ -234,13 +234,13 @@ def test_where_a_frame_has_no_picture_the_one_before_is_shown_with_its_boxes(
     monkeypatch.setattr(sensors, "OTHERS", (2,))
     browser.open(render_replay(da, None, tmp_path / "replay.html"), 1280)
     scrub(browser, 4)
-    choose(browser, 'select[aria-label="Camera of infrastructure"]', "FrontLeft")
+    choose(browser, 'select[aria-label="Camera of infrastructure"]', "front left")
     figure, shown = "document.querySelector('figure[data-agent=infrastructure] {}", []
     for frame in (4, 5):
         scrub(browser, frame)
         parts = (figure.format(part) for part in (".where').textContent", "svg').innerHTML"))
         shown.append([browser.value(part) for part in parts])
-    assert shown == [["FrontLeft", shown[0][1]], ["FrontLeft, 0.1 s earlier", shown[0][1]]]
+    assert shown == [["front left", shown[0][1]], ["front left, 0.1 s earlier", shown[0][1]]]
 
 
 STILL = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()))"
@@ -384,6 +384,7 @@ def test_a_minute_of_play_needs_no_more_memory(browser: Browser, recorded: Path)
     assert sizes[1] - sizes[0] < 1_000_000
 
 
+CHANNELS = {camera_name(channel): channel for channel in CAMERAS}
 LARGE = "return document.querySelector('.agent.large').dataset.agent"
 
 
@@ -426,7 +427,7 @@ def test_boxes_are_where_the_camera_has_them(browser: Browser, da: DeepAccident,
             f"return [...document.querySelectorAll('figure[data-agent={agent}] g')]"
             ".map((g) => [Number(g.dataset.actor), g.querySelectorAll('path')[1].getAttribute('d')])"
         )
-        sample, channel = f"{scenario}/{agent}/006", f"Camera_{cameras[5]}"
+        sample, channel = f"{scenario}/{agent}/006", CHANNELS[cameras[5]]
         optical = tracks.transform(da.world_from(sample, channel).inverse(), channel)
         for actor, path in drawn_:
             (corners,) = optical.select(optical.actor_id == actor).corners()

@@ -18,10 +18,11 @@ from deepaccident_devkit.explore.choices import PAGE, SCORE, SORTS, Choices, Fou
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.models import Model
 from deepaccident_devkit.explore.pages.responses import explorer_of, page, picture, with_slash
-from deepaccident_devkit.explore.scenarios import UNKNOWN, VISIBILITY_RANKS, ending
+from deepaccident_devkit.explore.scenarios import UNKNOWN, VISIBILITY_RANKS
 from deepaccident_devkit.maps import kept_town_map, towns_of
 from deepaccident_devkit.maps.pictures import draw_whole_map
 from deepaccident_devkit.overview import Overview, overview
+from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.render.figures import detached_figure
 from deepaccident_devkit.selection.fields import FIELDS
 from deepaccident_devkit.splits import save_selection
@@ -144,11 +145,8 @@ def entry(
     named = {**measures, **scores, "num_frames": Cell(f"{record['num_frames']} frames", "")}
     return {
         "token": record["token"],
-        "name": record["name"],
-        "type": record["scenario_type"],
+        "name": scenario_words(record),
         "record": record,
-        "ending": ending(record),
-        "weather": ", ".join(filter(None, (record["weather"], record["time_of_day"]))),
         "cells": [*measures.values(), *scores.values()],
         "scores": scores,
         "sorted": named[sort].text if sort in named else "",

@@ -20,6 +20,7 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import Route
 
 from deepaccident_devkit.explore.explorer import Explorer
+from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.render.replay import replay_script, replay_style
 from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.pages import part, path_in_address
@@ -51,7 +52,8 @@ def page(request: Request, template: str, *, status: int = 200, **context: Any) 
 
 def rendered(explorer: Explorer, template: str, root: str, **context: Any) -> str:
     """A template as text, given the relative address of the first page (`root`); all texts are escaped."""
-    addresses = {"asset": asset, "scenario_at": scenario_address, "thumbnail_at": thumbnail_address}
+    addresses: dict[str, Any] = {"asset": asset, "scenario_at": scenario_address, "thumbnail_at": thumbnail_address}
+    addresses["named"] = lambda token: scenario_words(explorer.dataset.scenario.get(token))
     served = {"root": root, "models": [*explorer.models], "static": False, "frame_number": frame_button}
     return filled(template, **addresses, **served, **context)
 

@@ -27,6 +27,7 @@ from deepaccident_devkit.explore.pages.scenario import sample_of
 from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.render.figures import detached_figure
 from deepaccident_devkit.render.outcomes import render_evaluation, render_outcome_in_cameras
+from deepaccident_devkit.render.outcomes.evaluation import SIZES
 from deepaccident_devkit.support.pages import path_in_address
 from deepaccident_devkit.support.text import natural_order
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -40,12 +41,11 @@ ORDERS: Final[Mapping[Order, str]] = {"worst": "worst first", "best": "best firs
 Kind = Literal["above", "cameras"]
 Size = Literal["whole", "half"]
 _SIZES: Final[Mapping[tuple[Kind, Size], tuple[float, float]]] = {
-    ("above", "whole"): (12.4, 6.9),
     ("above", "half"): (7.7, 4.6),
     ("cameras", "whole"): (15.2, 7.4),
     ("cameras", "half"): (7.7, 4.7),
 }
-"""Inches; half is for two side by side."""
+"""Inches; half is for two side by side. A whole picture from above has its task's own size."""
 _OTHER_HORIZON: Final = 2.0
 """Seconds that the pictures of explicit accidents look ahead."""
 SAMPLE = "{type}/{name}/{agent}/{frame:int}"
@@ -259,7 +259,7 @@ def _figure(explorer: Explorer, model: Model, token: str, shown: Shown) -> Any:
     how: dict[str, Any] = {"task": _task(model), "protocol": None if model.setup.task == "warning" else rules}
     if not isinstance(prediction, DetectedBoxes):
         how["label"] = loader.label(token)
-    figure = detached_figure(_SIZES[shown.kind, shown.size])
+    figure = detached_figure(_SIZES.get((shown.kind, shown.size), SIZES[_task(model)]))
     if shown.kind == "above":
         return render_evaluation(explorer.dataset, token, prediction, **how, fig=figure)
     frame = shown.ahead if model.setup.task == "motion" else None
@@ -396,6 +396,7 @@ def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, An
         "number": "" if score is None or score.value is None else f"{name} {score.text}",
         "why_not": why_not(explorer, model, token),
         "rules": rules_words(model),
+        "tall": round(80 * SIZES[_task(model)][1]),
         "remedy": _remedy(model),
     }
 

@@ -126,7 +126,8 @@ def _twin(request: Request) -> Response:
         shift = diff.shift if diff.accident == token else -diff.shift
     except NotAvailableError:
         shift = 0
-    others: dict[str, Any] = {"token": token, "twin": twin["token"], "shift": shift}
+    offset = explorer.recording(twin["token"]).origin - explorer.recording(token).origin
+    others: dict[str, Any] = {"token": token, "twin": twin["token"], "shift": shift, "offset": offset.tolist()}
     return page(request, "twins.html", **others)
 
 

@@ -115,6 +115,11 @@ class Recording:
             data=message.SerializeToString(deterministic=True),
         )
 
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Those that have a message."""
+        return tuple(self._topics)
+
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Add a metadata record: names and their values."""
         self._writer.add_metadata(name, values)

@@ -21,6 +21,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.export.mcap import EXPORTED_CHANNELS, McapConfig, Predictions
+from deepaccident_devkit.export.mcap.layouts import write_layouts
 from deepaccident_devkit.export.mcap.messages import (
     Moment,
     Recording,
@@ -28,6 +29,7 @@ from deepaccident_devkit.export.mcap.messages import (
     above,
     box_segments,
     cloud_message,
+    colored_points,
     cube,
     entity,
     exported_agents,
@@ -49,13 +51,22 @@ from deepaccident_devkit.motion.config import label_config
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.layout import MissingFiles
+from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.boxes import role_colors
-from deepaccident_devkit.render.styles import AGENT_COLORS
+from deepaccident_devkit.render.styles import AGENT_COLORS, MAP_COLORS
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.tables.tokens import frame_token
-from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, LIDAR, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    BEV_CAMERA,
+    CATEGORIES,
+    INFRASTRUCTURE,
+    LIDAR,
+    POLE_HEIGHT,
+    UNTRACKED_ID,
+)
 from deepaccident_devkit.v2x import cooperative_view
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -65,6 +76,10 @@ _LOG_EVERY: Final = 5
 """Frames (0.1 s) between two lines of the countdown."""
 _SHOWN: Final = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
 LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+_LIDAR_STEPS, _INTENSITIES = 32, 32
+"""Into how many steps LiDAR coordinates are rounded in a metre, and intensities from 0 to 1."""
+_ROAD_STEP: Final = 5
+"""Cells of a BEV camera from one point of the road to the next."""
 TRAIL_FRAMES: Final = 20
 """How many frames (2 s) an actor's trail goes back, and its path goes ahead."""
 _PATH_ALPHA: Final = 0.5
@@ -90,6 +105,22 @@ def write_poses(dataset: Dataset, moment: Moment, recording: Recording) -> None:
         recording.write(f"/{agent}/pose", message, moment.index)
 
 
+def write_road(dataset: Dataset, moment: Moment, recording: Recording) -> None:
+    """Write what the agents' BEV cameras see of the ground at this moment as points in world, every 0.5 m."""
+    parts = []
+    for agent, sample in moment.samples.items():
+        if not dataset.sensor_path(f"{sample}/{BEV_CAMERA}").exists():
+            continue
+        image, height = dataset.load_bev(sample), -POLE_HEIGHT if agent == INFRASTRUCTURE else 0.0
+        tags, middle = image.semantic[::_ROAD_STEP, ::_ROAD_STEP], (len(image.semantic) - 1) / 2
+        for name, color in MAP_COLORS.items():
+            ahead, left = (middle - _ROAD_STEP * np.argwhere(tags == TAGS.get(name, -1)).T) * image.resolution
+            ground = np.column_stack([ahead, left, np.full(len(ahead), height)])
+            parts.append(colored_points(dataset.world_from(sample, "ego").apply(ground), color))
+    if parts:
+        recording.write("/road/points", cloud_message(joined(parts), "world", moment.index), moment.index)
+
+
 def write_scenario(
     dataset: Dataset,
     scenario: RowArgument,
@@ -113,10 +144,12 @@ def write_scenario(
         parts.append(_predicted(prediction, moments, token).write)
     with replacing(path) as temporary, temporary.open("wb") as stream, Recording(stream) as recording:
         recording.add_metadata(METADATA, scenario_metadata(dataset, token))
+        write_road(dataset, moments[0], recording)
         for moment in tqdm(moments, desc=path.name, disable=not progress, unit="frame"):
             for write in parts:
                 write(moment, recording)
     sensors.tell_missing()
+    write_layouts(path, recording.topics)
     return path
 
 
@@ -220,8 +253,9 @@ class Sensors:
         cloud = self._dataset.load_point_cloud(sample, "lidar")
         rows = slice(None, None, self._step)
         points = np.zeros(len(cloud.xyz[rows]), dtype=LIDAR_POINT)
-        points["x"], points["y"], points["z"] = cloud.xyz[rows].T
-        points["intensity"] = cloud.intensity[rows]
+        # few digits are small when compressed: clouds are most of a file
+        points["x"], points["y"], points["z"] = (cloud.xyz[rows] * _LIDAR_STEPS).round().T / _LIDAR_STEPS
+        points["intensity"] = (cloud.intensity[rows] * _INTENSITIES).round() / _INTENSITIES
         frame = frame_id(agent, "lidar")
         recording.write(f"/{frame}/points", cloud_message(points, frame, index), index)
 
@@ -303,6 +337,11 @@ class Actors:
                 strip_points(trail, color),
                 strip_points(path, color, _PATH_ALPHA),
             ]
+        for row in np.flatnonzero(np.isfinite(boxes.velocity[:, 0])).tolist():
+            agent = self._roles.agents.get(int(boxes.actor_id[row]))
+            if agent in moment.samples:
+                speed = DoubleValue(value=float(np.linalg.norm(boxes.velocity[row])))
+                recording.write(f"/{agent}/speed", speed, moment.index)
         recording.write("/actors", scene_update(entities, moment.index), moment.index)
         recording.write("/actors/points", cloud_message(joined(points), "world", moment.index), moment.index)
 
@@ -314,10 +353,7 @@ class Actors:
             facts = {**self._facts(boxes, row, actor), "label_id": str(boxes.actor_id[row])}
             name = f"{actor}/{boxes.row[row]}"
             entities.append(entity(name, frame_id(agent, "lidar"), index, facts, lines=[lines(segments[row], color)]))
-        frame = frame_id(agent, "lidar")
         recording.write(f"/{agent}/annotations", scene_update(entities, index), index)
-        points = segment_points(segments.reshape(-1, 2, 3), color)
-        recording.write(f"/{agent}/annotations/points", cloud_message(points, frame, index), index)
 
     def _facts(self, boxes: Boxes, row: int, actor: int) -> dict[str, str]:
         category, velocity = CATEGORIES[boxes.category[row]], boxes.velocity[row]

@@ -8,7 +8,8 @@ from deepaccident_devkit.render.outcomes.above import (
     motion_outcome,
 )
 from deepaccident_devkit.render.outcomes.cameras import draw_outcome_in_camera, render_outcome_in_cameras
-from deepaccident_devkit.render.outcomes.evaluation import Verdict, render_evaluation, sample_verdict
+from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
+from deepaccident_devkit.render.outcomes.verdicts import Verdict, sample_verdict
 
 __all__ = [
     "MotionOutcome",

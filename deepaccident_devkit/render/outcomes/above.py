@@ -38,12 +38,15 @@ from deepaccident_devkit.render.styles import BEYOND_COLOR, COLLIDER_COLOR, OUTC
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray, ShortRepr
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
 ACCIDENT_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "trajectories", "ids", "grid")
-_LEAST: Final = 20.0
+_LEAST: Final = 15.0
 _MOST: Final = 60.0
-"""Metres around an accident that are shown, at least and at most."""
+"""Metres to each side that are shown, at least and at most."""
+_AROUND: Final = 8.0
+"""Metres that are shown around the places of accidents and the actors."""
 _MARK: Final = (-7.0, -7.0, 7.0, 7.0)
 """Points around circles, crosses and the lines between them that no words cover: left, low, right and high."""
 FORESEEN_COLOR: Final = "black"
@@ -77,7 +80,8 @@ def draw_accident_outcome(
     Args:
         compared: what a protocol compares, from `compared_accidents`.
         truth: the actors around, as they are now, and where the pair goes; None renders only the accidents.
-        layers: `boxes` (the actors now), `trajectories` (of the pair) and `grid` are the default; also `ids`.
+        layers: `boxes` (the actors now), `trajectories` (the pair's ways to its boxes at the impact, and dashed where
+            the model has the actors go that it names) and `grid` are the default; also `ids`.
         ax: axes to render on; new ones if None.
 
     Returns:
@@ -88,6 +92,14 @@ def draw_accident_outcome(
     """
     shown = layers_but_ids(layers, ACCIDENT_LAYERS)
     ax = axes_or_new(ax, (6, 6.4))
+    draw_legend(ax, draw_accidents(compared, truth, shown, ax), columns=1, **INSIDE)
+    return ax
+
+
+def draw_accidents(
+    compared: ComparedAccidents, truth: BoxTruth | None, shown: frozenset[Layer], ax: Axes
+) -> list[Artist]:
+    """Render all of `draw_accident_outcome` but the legend; returns what that explains."""
     if truth is not None:
         _draw_actors(truth, compared, shown, ax)
     if compared.true is not None:
@@ -98,15 +110,17 @@ def draw_accident_outcome(
     for alarm in compared.predicted:
         (line,) = ax.plot(*alarm.positions.T, "x--", color=FORESEEN_COLOR, markersize=9, markeredgewidth=2, zorder=6)
         line.set_label("foreseen" if alarm is compared.predicted[0] else "")
+        if truth is not None and "trajectories" in shown:
+            _draw_foreseen_ways(alarm, truth, ax)
         _keep_line_free(*alarm.positions, ax=ax)
         place = alarm.positions.mean(axis=0)
         write_beside(ax, alarm_words(alarm), (float(place[0]), float(place[1])), FORESEEN_COLOR)
         if compared.true is not None:
             _draw_differences(alarm, compared.true, ax)
-    _look_at(compared, ax)
-    handles, _ = ax.get_legend_handles_labels()
-    draw_legend(ax, handles, columns=1, **INSIDE)
-    return titled_from_above(ax, difference_words(compared), grid="grid" in shown)
+    (x, y), half = shown_square(compared, truth)
+    ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    titled_from_above(ax, difference_words(compared), grid="grid" in shown)
+    return ax.get_legend_handles_labels()[0]
 
 
 def alarm_words(alarm: Accident) -> str:
@@ -146,17 +160,8 @@ def count_words(within: AccidentsWithin) -> str:
 
 
 def _draw_actors(truth: BoxTruth, compared: ComparedAccidents, shown: frozenset[Layer], ax: Axes) -> None:
-    present = truth.footprint[0]
-    here = np.isfinite(present[:, 0])
-    x, y, length, width, yaw = present[here].T
-    boxes = Boxes.from_arrays(
-        np.column_stack([x, y, np.zeros(len(x))]),
-        np.column_stack([length, width, np.ones(len(x))]),
-        yaw,
-        frame="ego",
-        actor_id=truth.actor_id[here],
-    )
-    ids = (None if compared.true is None or truth.accident is None else truth.accident.ids) or ()
+    boxes = _boxes_at(truth, 0)
+    ids = _pair_ids(compared, truth)
     pair = np.isin(boxes.actor_id, ids).tolist()
     colors = [COLLIDER_COLOR if collides else OUTCOME_COLORS["missed"] for collides in pair]
     if "boxes" in shown:
@@ -167,6 +172,37 @@ def _draw_actors(truth: BoxTruth, compared: ComparedAccidents, shown: frozenset[
         for column in np.flatnonzero(np.isin(truth.actor_id, ids)).tolist():
             path = truth.footprint[:, column, :2]
             draw_trail(path[np.isfinite(path[:, 0])], ax, COLLIDER_COLOR, linewidths=2.0)
+        if compared.true is not None:
+            at_impact = _boxes_at(truth, int(np.abs(truth.time - compared.true.time).argmin()))
+            pair = at_impact.select(np.isin(at_impact.actor_id, ids))
+            draw_boxes_from_above(pair, ax, [COLLIDER_COLOR] * len(pair), fill=0)
+
+
+def _pair_ids(compared: ComparedAccidents, truth: BoxTruth) -> Sequence[int]:
+    """The actors that collide, if a protocol compares their accident."""
+    return (None if compared.true is None or truth.accident is None else truth.accident.ids) or ()
+
+
+def _boxes_at(truth: BoxTruth, frame: int) -> Boxes:
+    """The boxes of a frame, of those that somebody annotated then; flat, in the present ego frame."""
+    footprint = truth.footprint[frame]
+    there = np.isfinite(footprint[:, 0])
+    x, y, length, width, yaw = footprint[there].T
+    return Boxes.from_arrays(
+        np.column_stack([x, y, np.zeros(len(x))]),
+        np.column_stack([length, width, np.ones(len(x))]),
+        yaw,
+        frame="ego",
+        actor_id=truth.actor_id[there],
+    )
+
+
+def _draw_foreseen_ways(alarm: Accident, truth: BoxTruth, ax: Axes) -> None:
+    """Dashed lines from where the actors that an alarm names are now to where it has them collide."""
+    now = dict(zip(truth.actor_id.tolist(), truth.footprint[0, :, :2], strict=True))
+    for actor, place in zip(alarm.ids or (), alarm.positions, strict=False):
+        if actor in now:
+            ax.plot(*np.stack([now[actor], place]).T, color=FORESEEN_COLOR, linestyle=DASHED, linewidth=1.0, zorder=4)
 
 
 def _draw_differences(alarm: Accident, true: Accident, ax: Axes) -> None:
@@ -189,12 +225,16 @@ def _pairs(places: FloatArray, others: FloatArray) -> list[tuple[FloatArray, Flo
     return list(zip(places, others if straight else others[::-1], strict=True))
 
 
-def _look_at(compared: ComparedAccidents, ax: Axes) -> None:
+def shown_square(compared: ComparedAccidents, truth: BoxTruth | None) -> tuple[tuple[float, float], float]:
+    """The middle of what is shown, and metres to each side: of the accidents, the agent and, if known, the pair now."""
     accidents = [*([] if compared.true is None else [compared.true]), *compared.predicted]
-    places = np.concatenate([each.positions for each in accidents]) if accidents else np.zeros((1, 2))
-    middle = accidents[0].positions.mean(axis=0) if accidents else places[0]
-    half = float(np.clip(np.abs(places - middle).max() + 10, _LEAST, _MOST))
-    ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
+    places = np.concatenate([np.zeros((1, 2)), *(each.positions for each in accidents)])
+    if truth is not None:
+        present = truth.footprint[0, np.isin(truth.actor_id, _pair_ids(compared, truth)), :2]
+        places = np.concatenate([places, present[np.isfinite(present[:, 0])]])
+    low, high = places.min(axis=0), places.max(axis=0)
+    x, y = ((low + high) / 2).tolist()
+    return (x, y), float(np.clip((high - low).max() / 2 + _AROUND, _LEAST, _MOST))
 
 
 @in_own_settings

@@ -16,17 +16,18 @@ from deepaccident_devkit.geometry import SE3, Boxes, PinholeCamera
 from deepaccident_devkit.geometry.cell_outlines import outlines
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image, write_beside
-from deepaccident_devkit.render.camera import draw_image
+from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image
 from deepaccident_devkit.render.captions import draw_legend, is_there, set_scene_title
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, settled
 from deepaccident_devkit.render.motion_maps import MotionMaps
 from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR, alarm_words
-from deepaccident_devkit.render.outcomes.evaluation import (
+from deepaccident_devkit.render.outcomes.verdicts import (
     AccidentVerdict,
     DetectionVerdict,
     MotionVerdict,
     Verdict,
+    boxes_of,
     sample_verdict,
 )
 from deepaccident_devkit.render.samples import CAMERA_GRID
@@ -68,15 +69,15 @@ class CameraView:
     The ground is flat: z = 0 in a vehicle's ego frame, `POLE_HEIGHT` below the infrastructure's.
 
     Attributes:
-        channel: the camera's.
-        sample: token.
-        lens: its intrinsics.
+        camera: token of the image (sample data).
+        sample: token; the image is its own, or that of another agent at its moment.
+        lens: the camera's intrinsics.
         optical_from_ego: of the sample.
         ground: z of the ground in the ego frame, metres.
         ax: in pixels.
     """
 
-    channel: str
+    camera: str
     sample: str
     lens: PinholeCamera
     optical_from_ego: SE3
@@ -125,13 +126,17 @@ class CameraView:
             write_beside(self.ax, words, (u, v), color)
 
 
-def view_of(dataset: Dataset, sample: str, channel: str, ax: Axes) -> CameraView:
-    """The panel of a camera of a sample (a token), to be rendered on axes."""
+def view_of(dataset: Dataset, sample: str, camera: str, ax: Axes, *, image: bool = True) -> CameraView:
+    """A panel with an image of a sample, or of another agent at its moment (both are tokens), or with its absence."""
+    lens = camera_of(dataset, camera)
+    draw_image(dataset, dataset.get("sample_data", camera), ax, image=image)
+    if not is_there(dataset, camera):
+        keep_free(ax, [[(lens.width / 2, 0.0)]], margin=_MISSING)
     return CameraView(
-        channel=channel,
+        camera=camera,
         sample=sample,
-        lens=camera_of(dataset, f"{sample}/{channel}"),
-        optical_from_ego=dataset.world_from(sample, channel).inverse() @ dataset.world_from(sample, "ego"),
+        lens=lens,
+        optical_from_ego=dataset.world_from(*camera.rsplit("/", 1)).inverse() @ dataset.world_from(sample, "ego"),
         ground=-POLE_HEIGHT if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE else 0.0,
         ax=ax,
     )
@@ -152,10 +157,10 @@ def render_outcome_in_cameras(
     """Render a model's prediction over the truth in the cameras of the sample's agent, by a protocol's verdict.
 
     Detections: matched and false boxes, missed true boxes dashed, and thin the true boxes that were found. Motion: the
-    cells of predicted instances on the ground, right or false, and of missed true ones, dashed. Accidents: red rings at
-    the places where two collide, black crosses at the foreseen places, with their times; posts of 1.5 m stand on both.
-    What does not count, such as boxes and instances beyond the protocol's range, is not rendered, nor the agent's own
-    box, which is around its cameras.
+    cells of predicted instances on the ground, right or false, and of missed true ones, dashed. Accidents: boxes of
+    the pair, red rings at the places where two collide, black crosses at the foreseen places, with their times; posts
+    of 1.5 m stand on both. What does not count, such as boxes and instances beyond the protocol's range, is not
+    rendered, nor the agent's own box, which is around its cameras.
 
     The ground is taken to be flat: the plane z = 0 of a vehicle's ego frame, and for the infrastructure 4 m below its
     LiDAR. Occlusion is ignored: boxes and places are rendered even if other things hide them.
@@ -183,16 +188,35 @@ def draw_outcome_in_camera(
     """Render one panel (a channel) of `render_outcome_in_cameras`, in pixels. Raises ChoiceError."""
     channel, number = choice("camera", camera, CAMERAS), _checked_frame(verdict, frame)
     ax = axes_or_new(ax, (8, 5))
-    view = view_of(dataset, verdict.sample, channel, ax)
-    draw_image(dataset, dataset.get("sample_data", f"{verdict.sample}/{channel}"), ax)
-    if not is_there(dataset, f"{verdict.sample}/{channel}"):
-        keep_free(ax, [[(view.lens.width / 2, 0.0)]], margin=_MISSING)
+    token = f"{verdict.sample}/{channel}"
+    if isinstance(verdict, AccidentVerdict):
+        return draw_accidents_in_camera(dataset, verdict, token, ax)
+    view = view_of(dataset, verdict.sample, token, ax)
     if isinstance(verdict, DetectionVerdict):
         _draw_detection(verdict, dataset, view)
-    elif isinstance(verdict, MotionVerdict):
-        _draw_motion(verdict, number, view)
     else:
-        _draw_accidents(verdict, view)
+        _draw_motion(verdict, number, view)
+    return ax
+
+
+def draw_accidents_in_camera(
+    dataset: Dataset, verdict: AccidentVerdict, camera: str, ax: Axes, *, image: bool = True
+) -> Axes:
+    """Render accidents over the truth in an image (a token), of any agent at the moment: places, and boxes of the pair.
+
+    The true accident is below the foreseen ones, and its words find their place first.
+    """
+    view, true = view_of(dataset, verdict.sample, camera, ax, image=image), verdict.compared.true
+    record, boxes = dataset.get("sample_data", camera), boxes_of(dataset, verdict)
+    own = dataset.get("agent", dataset.get("sample", record["sample_token"])["agent_token"])["actor_id"]
+    optical = boxes.transform(dataset.world_from(*camera.rsplit("/", 1)).inverse(), record["channel"])
+    draw_camera_boxes(dataset, record, optical.select(boxes.actor_id != own), {"boxes"}, ax)
+    if true is not None:
+        _draw_places(true.positions, _RING, COLLIDER_COLOR, view)
+        view.write(f"in {true.time:.1f} s", true.positions, COLLIDER_COLOR)
+    for alarm in verdict.compared.predicted:
+        _draw_places(alarm.positions, _CROSS, FORESEEN_COLOR, view)
+        view.write(alarm_words(alarm), alarm.positions, FORESEEN_COLOR)
     return ax
 
 
@@ -210,7 +234,7 @@ def _checked_frame(verdict: Verdict, frame: int | None) -> int:
 
 def _draw_detection(verdict: DetectionVerdict, dataset: Dataset, view: CameraView) -> None:
     """The true boxes that are found below the detections, of which the nearest are on top."""
-    sample, channel, matches = view.sample, view.channel, verdict.matches
+    sample, channel, matches = view.sample, view.camera.rsplit("/", 1)[1], verdict.matches
     own = verdict.truth.actor_id == OWN_ACTOR_ID
     others, missed = ~own[matches.truth], matches.missed[~own[matches.missed]]
     optical = dataset.world_from(sample, channel).inverse() @ dataset.world_from(sample, verdict.rules.frame)
@@ -252,17 +276,6 @@ def _outlines(maps: MotionMaps, frame: int, ids: AnyArray) -> list[FloatArray]:
         part for identity in ids.tolist() for part in outlines(maps.instance[frame] == identity, np.zeros(2), 1.0).geoms
     ]
     return [low + np.asarray(part.exterior.coords) * size for part in polygons]
-
-
-def _draw_accidents(verdict: AccidentVerdict, view: CameraView) -> None:
-    """The true accident is below the foreseen ones, and its words find their place first."""
-    true = verdict.compared.true
-    if true is not None:
-        _draw_places(true.positions, _RING, COLLIDER_COLOR, view)
-        view.write(f"in {true.time:.1f} s", true.positions, COLLIDER_COLOR)
-    for alarm in verdict.compared.predicted:
-        _draw_places(alarm.positions, _CROSS, FORESEEN_COLOR, view)
-        view.write(alarm_words(alarm), alarm.positions, FORESEEN_COLOR)
 
 
 def _draw_places(places: FloatArray, mark: Sequence[FloatArray], color: str, view: CameraView) -> None:

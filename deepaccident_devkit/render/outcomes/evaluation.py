@@ -1,42 +1,20 @@
-"""What a protocol says of a sample's prediction, and `render_evaluation`, which shows it beside the label."""
+"""`render_evaluation`: a sample's truth beside a model's prediction, with the verdict of a protocol."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.evaluation.accident import (
-    AccidentEvaluator,
-    BoxTruth,
-    ComparedAccidents,
-    accident_context,
-    compared_accidents,
-)
-from deepaccident_devkit.evaluation.detection import (
-    DetectedBoxes,
-    DetectionEvaluator,
-    DetectionMatches,
-    DetectionProtocol,
-    detection_matches,
-    detection_protocol,
-    detection_truth,
-)
-from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.predictions import (
-    Accident,
-    MotionOutput,
-    Prediction,
-    checked_prediction,
-    labels_at_present,
-)
-from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels
-from deepaccident_devkit.render.boxes import collider_ids, draw_boxes_from_above
-from deepaccident_devkit.render.captions import set_scene_title
+from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.predictions import Prediction, labels_at_present
+from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
+from deepaccident_devkit.render.bev import BevView, draw_bev
+from deepaccident_devkit.render.boxes import camera_name, collider_ids, draw_boxes_from_above
+from deepaccident_devkit.render.camera import best_view
+from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import Layer, figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.motion_maps import draw_edge, maps_of_labels
@@ -45,192 +23,38 @@ from deepaccident_devkit.render.outcomes.above import (
     DETECTION_LAYERS,
     MOTION_LAYERS,
     WINDOW,
-    MotionOutcome,
-    coming_words,
-    draw_accident_outcome,
+    draw_accidents,
     draw_detection_outcome,
     draw_motion_side,
     draw_true,
     layers_but_ids,
-    motion_outcome,
-    verdict_words,
+    shown_square,
+)
+from deepaccident_devkit.render.outcomes.cameras import draw_accidents_in_camera
+from deepaccident_devkit.render.outcomes.verdicts import (
+    AccidentVerdict,
+    DetectionVerdict,
+    MotionVerdict,
+    boxes_of,
+    judged_as,
+    sample_verdict,
 )
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, in_own_settings
-from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.text import choice
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Judged: TypeAlias = MotionOutput | list[Accident] | DetectedBoxes
-_RELEASED: Final = MotionLabelConfig()
-"""Half a second from frame to frame, two seconds ahead."""
 _POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
     "motion": MOTION_LAYERS,
-    "accident": ACCIDENT_LAYERS,
+    "accident": ("image", "bev", *ACCIDENT_LAYERS),
     "detection": DETECTION_LAYERS,
 }
-_SIZE: Final = (12.4, 6.9)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MotionVerdict(ShortRepr):
-    """Predicted instances against the labels'.
-
-    Attributes:
-        sample: token.
-        label: the truth.
-        outcome: which instances match, frame by frame.
-        words: the numbers of each range.
-    """
-
-    sample: str
-    label: MotionLabels
-    outcome: MotionOutcome
-    words: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AccidentVerdict(ShortRepr):
-    """Foreseen accidents against the one to come.
-
-    Attributes:
-        sample: token.
-        compared: the accidents that the protocol compares, in the present ego frame.
-        truth: the actors around; None if it is not known.
-        words: what the sample counts as, by the allowed distance.
-    """
-
-    sample: str
-    compared: ComparedAccidents
-    truth: BoxTruth | None
-    words: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DetectionVerdict(ShortRepr):
-    """Detected boxes against the true ones.
-
-    Attributes:
-        sample: token.
-        rules: the protocol.
-        detected: in its frame.
-        truth: the true boxes in that frame.
-        matches: at the threshold of the protocol's errors or, if it has none, at the middle one.
-        words: the mean average precision of the sample.
-    """
-
-    sample: str
-    rules: DetectionProtocol
-    detected: DetectedBoxes
-    truth: Boxes
-    matches: DetectionMatches
-    words: str
-
-
-Verdict: TypeAlias = MotionVerdict | AccidentVerdict | DetectionVerdict
-
-
-def judged_as(prediction: object, task: str | None) -> tuple[Judged, str]:
-    """A prediction, explicit accidents as a list, and the task that it is judged in: the one given, or its own.
-
-    Raises ChoiceError if the prediction is not of the task, EvaluationError if it is no prediction.
-    """
-    given = prediction if isinstance(prediction, DetectedBoxes) else checked_prediction(prediction)
-    possible: tuple[str, ...] = ("accident",)
-    if isinstance(given, DetectedBoxes):
-        possible = ("detection",)
-    elif isinstance(given, MotionOutput):
-        possible = ("motion", "accident")
-    return given, possible[0] if task is None else choice("task of this prediction", task, possible)
-
-
-def sample_verdict(
-    dataset: Dataset,
-    sample: RowArgument,
-    prediction: Prediction | DetectedBoxes,
-    *,
-    task: str | None = None,
-    protocol: Any = None,
-    label: MotionLabels | None = None,
-) -> Verdict:
-    """Judge a prediction for a sample; arguments and errors are those of `render_evaluation`."""
-    given, chosen = judged_as(prediction, task)
-    token = dataset.get("sample", sample)["token"]
-    if isinstance(given, DetectedBoxes):
-        return _of_detection(dataset, token, given, protocol or "released")
-    if isinstance(given, MotionOutput) and chosen == "motion":
-        judge = MotionEvaluator(protocol or "released")
-        return _of_motion(token, given, label or _label(dataset, token, given, judge.protocol.labels), judge)
-    default = "released" if isinstance(given, MotionOutput) else "boxes"
-    return _of_accident(dataset, token, given, label, AccidentEvaluator(protocol or default))
-
-
-def _of_motion(token: str, given: MotionOutput, label: MotionLabels, judge: MotionEvaluator) -> MotionVerdict:
-    judge.update(token, given, label)
-    ranges = [
-        f"{name} m: IoU {within.iou:.1f} %, PQ {within.pq:.1f} %, {within.true_positive} TP, "
-        f"{within.false_positive} FP, {within.false_negative} FN"
-        for name, within in judge.compute().ranges.items()
-    ]
-    outcome = motion_outcome(given, label)
-    return MotionVerdict(sample=token, label=label, outcome=outcome, words="; ".join(ranges))
-
-
-def _of_accident(
-    dataset: Dataset, token: str, given: Prediction, label: MotionLabels | None, judge: AccidentEvaluator
-) -> AccidentVerdict:
-    if label is None and hasattr(judge.protocol, "labels"):
-        label = _label(dataset, token, given, judge.protocol.labels)
-    context = accident_context(dataset, token, _horizon(given))
-    judge.update(token, given, label, context)
-    return AccidentVerdict(
-        sample=token,
-        compared=compared_accidents(given, label, context, judge.protocol),
-        truth=context.truth,
-        words=f"accident: {verdict_words(judge.compute())}",
-    )
-
-
-def _of_detection(dataset: Dataset, token: str, given: DetectedBoxes, protocol: Any) -> DetectionVerdict:
-    rules = detection_protocol(protocol)
-    truth = detection_truth(dataset, token, rules)
-    here = dataset.world_from(token, rules.frame).inverse() @ dataset.world_from(token, given.boxes.frame)
-    detected = DetectedBoxes(boxes=given.boxes.transform(here, rules.frame), scores=given.scores)
-    judge = DetectionEvaluator(rules)
-    judge.update(token, detected, truth)
-    return DetectionVerdict(
-        sample=token,
-        rules=rules,
-        detected=detected,
-        truth=truth,
-        matches=detection_matches(detected, truth, rules),
-        words=f"detection: mean average precision of this sample {judge.compute().mean_average_precision:.1f} %",
-    )
-
-
-def _frames(given: Prediction) -> int | None:
-    """How many frames motion has; None for other predictions."""
-    if not isinstance(given, MotionOutput):
-        return None
-    if given.instances is not None:
-        return int(given.instances.shape[1])
-    return len((given.heads or ())[-1].segmentation)
-
-
-def _horizon(given: Prediction) -> float:
-    frames = _frames(given)
-    ahead = _RELEASED.future_frames if frames is None else frames - 1
-    return ahead * _RELEASED.step * FRAME_PERIOD
-
-
-def _label(dataset: Dataset, token: str, given: Prediction, protocol: str | None) -> MotionLabels:
-    config, frames = replace(_RELEASED, protocol=protocol or "released"), _frames(given)
-    if isinstance(given, MotionOutput) and frames is not None:
-        config = replace(config, grid=given.grid, future_frames=frames - 1)
-    return motion_labels(dataset, token, config)
+SIZES: Final = {"motion": (12.4, 6.9), "accident": (12.4, 5.9), "detection": (12.4, 6.9)}
+"""Inches."""
+_CAMERA_BESIDE: Final = (1.4, 1.0)
+"""How wide a camera and what is beside it are."""
 
 
 @in_own_settings
@@ -247,9 +71,10 @@ def render_evaluation(
 ) -> Figure:
     """Render a sample's truth and beside it a model's prediction, with a protocol's verdict in numbers.
 
-    Motion: true instances are found or missed, predicted ones right or false, frame by frame. Accidents: the places
-    where two collide, with the metres between foreseen and true places. Detections: matched, false and missed boxes.
-    The true pair that collides is red.
+    Motion: true instances are found or missed, predicted ones right or false, frame by frame. Detections: matched,
+    false and missed boxes. Accidents: who collides in the camera, of any agent, that shows them best, and from above
+    the road, the actors, and the places where two collide, with the metres between foreseen and true places. The true
+    pair that collides is red.
 
     Args:
         dataset: the release.
@@ -260,12 +85,12 @@ def render_evaluation(
         protocol: of the task, by name, or your own; None for `released`, or `boxes` for explicit accidents.
         label: the motion labels that motion is compared with; None makes the labels that the protocol needs, on the
             prediction's cells and half a second apart.
-        layers: for motion `labels`, `trajectories`, `ids`, `grid`; for accidents `boxes`, `trajectories`, `ids`,
-            `grid`; for detections `boxes`, `ids`, `grid`. All except `ids` are the default.
+        layers: for motion `labels`, `trajectories`, `ids`, `grid`; for accidents `image`, `bev`, `boxes`,
+            `trajectories`, `ids`, `grid`; for detections `boxes`, `ids`, `grid`. All except `ids` are the default.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure: truth to the left, prediction to the right, the verdict above.
+        The figure: truth to the left, prediction to the right, the verdict above; of accidents the camera to the left.
 
     Raises:
         TokenError: no such sample.
@@ -276,8 +101,8 @@ def render_evaluation(
     given, chosen = judged_as(prediction, task)
     shown = layers_but_ids(layers, _POSSIBLE[chosen])
     verdict = sample_verdict(dataset, sample, given, task=chosen, protocol=protocol, label=label)
-    fig = figure_or_new(fig, _SIZE)
-    left, right = fig.subplots(1, 2)
+    fig = figure_or_new(fig, SIZES[chosen])
+    left, right = fig.subplots(1, 2, width_ratios=_CAMERA_BESIDE if chosen == "accident" else None)
     if isinstance(verdict, DetectionVerdict):
         _draw_detection(verdict, collider_ids(dataset, verdict.sample), shown, left, right)
     elif isinstance(verdict, MotionVerdict):
@@ -286,7 +111,7 @@ def render_evaluation(
         if "labels" in shown:
             _edge_pair(verdict.label, collider_ids(dataset, verdict.sample), left)
     else:
-        _draw_accident(verdict, shown, left, right)
+        _draw_accident(dataset, verdict, shown, left, right)
     set_scene_title(fig, dataset, verdict.sample, below=verdict.words, fontsize=11)
     return settled(fig)
 
@@ -298,13 +123,29 @@ def _edge_pair(label: MotionLabels, ids: Collection[int], ax: Axes) -> None:
         draw_edge(maps, label.id_map.get(OWN_BOX_ID if actor == OWN_ACTOR_ID else actor, -1), ax, COLLIDER_COLOR)
 
 
-def _draw_accident(verdict: AccidentVerdict, shown: frozenset[Layer], left: Axes, right: Axes) -> None:
-    true = verdict.compared.true
-    draw_accident_outcome(verdict.compared, verdict.truth, layers=shown, ax=right)
-    limits = right.get_xlim(), right.get_ylim()
-    draw_accident_outcome(ComparedAccidents(true=true, predicted=()), verdict.truth, layers=shown, ax=left)
-    left.set(xlim=limits[0], ylim=limits[1])
-    left.set_title("truth" if true else f"truth: {coming_words(verdict.compared)}", fontsize=SMALLEST_TEXT)
+def _draw_accident(
+    dataset: Dataset, verdict: AccidentVerdict, shown: frozenset[Layer], left: Axes, right: Axes
+) -> None:
+    """The camera that shows the pair best, and from above the road, the agents and the places."""
+    middle, half = shown_square(verdict.compared, verdict.truth)
+    view = BevView(agents=None, view_range=half, center=middle)
+    draw_bev(dataset, verdict.sample, view, shown - {"trajectories"}, right)
+    draw_legend(right.figure, draw_accidents(verdict.compared, verdict.truth, shown & {"trajectories", "grid"}, right))
+    camera = best_camera(dataset, verdict)
+    draw_accidents_in_camera(dataset, verdict, camera, left, image="image" in shown)
+    agent, _, channel = camera.rsplit("/", 3)[1:]
+    left.set_title(f"{short_name(agent)}, {camera_name(channel)}", fontsize=SMALLEST_TEXT)
+
+
+def best_camera(dataset: Dataset, verdict: AccidentVerdict) -> str:
+    """The token of the image, of any agent, that shows best who collides, or whom the first alarm names.
+
+    The front camera of the sample's agent, if no camera shows them.
+    """
+    boxes = boxes_of(dataset, verdict)
+    samples = [each["token"] for each in dataset.samples_of(dataset.get("sample", verdict.sample)["frame_token"])]
+    view = best_view(dataset, samples, boxes) if len(boxes) else None
+    return f"{verdict.sample}/Camera_Front" if view is None else view.camera
 
 
 def _draw_detection(

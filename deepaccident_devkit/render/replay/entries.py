@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLo
 from deepaccident_devkit.geometry import SE3, quaternions, time_to_collision
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.boxes import actor_color, agent_letters, recorders_of
+from deepaccident_devkit.render.boxes import actor_color, agent_letters, camera_name, recorders_of
 from deepaccident_devkit.render.outcomes.above import count_words
 from deepaccident_devkit.render.styles import AGENT_COLORS
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
@@ -196,11 +196,6 @@ def camera_entries(recording: Recording) -> list[list[dict[str, Any]]]:
     return [[_camera(recording, agent, channel) for channel in CAMERAS] for agent in recording.agents]
 
 
-def camera_title(channel: str) -> str:
-    """`Front` of `Camera_Front`."""
-    return channel.removeprefix("Camera_")
-
-
 def _camera(recording: Recording, agent: str, channel: str) -> dict[str, Any]:
     samples = [recording.sample(agent, frame) for frame in recording.frames]
     lens = recording.dataset.camera(samples[0], channel)
@@ -210,7 +205,7 @@ def _camera(recording: Recording, agent: str, channel: str) -> dict[str, Any]:
     places = recording.places([pose.translation[:2] for pose in poses])
     heights = [round(float(pose.translation[2]) * 100) for pose in poses]
     return {
-        "title": camera_title(channel),
+        "title": camera_name(channel),
         "lens": [lens.width, lens.height, *(round(each, 2) for each in (fx, fy, cx, cy))],
         "poses": [[*place, height, *turn] for place, height, turn in zip(places, heights, turns, strict=True)],
     }

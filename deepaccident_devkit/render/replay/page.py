@@ -14,14 +14,14 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
-from deepaccident_devkit.render.captions import has_cloud
+from deepaccident_devkit.render.boxes import camera_name
+from deepaccident_devkit.render.captions import has_cloud, scenario_words
 from deepaccident_devkit.render.replay.entries import (
     Foreseen,
     Recording,
     actor_entries,
     agent_entries,
     camera_entries,
-    camera_title,
     foreseen_entries,
     pair_entries,
     recording_of,
@@ -129,8 +129,7 @@ def render_replay(
     settings, jpegs = camera_pictures(files, followed, free, progress=progress)
     said = notes(recording, files, settings, clouds, most)
     data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], jpegs)}
-    title = f"Accident replay: {recording.scenario['name']}"
-    write_bytes(target, replay_page(title, data).encode())
+    write_bytes(target, replay_page(scenario_words(recording.scenario), data).encode())
     return target
 
 
@@ -213,7 +212,7 @@ def _data(
     followed = follow_pair(recording, seen, there)
     data["automatic"] = {
         "agents": [recording.agents.index(agent) for agent in followed.agents],
-        "cameras": [[camera_title(channel) for channel in followed.channels[agent]] for agent in recording.agents],
+        "cameras": [[camera_name(channel) for channel in followed.channels[agent]] for agent in recording.agents],
     }
     return data, followed
 
@@ -224,7 +223,7 @@ def _with_pictures(
     """For each agent its cameras that have pictures, with one for each frame in base64; null where there is none."""
     shown = []
     for agent, entries in zip(recording.agents, cameras, strict=True):
-        own = {camera_title(channel): each for channel, each in jpegs.get(agent, {}).items()}
+        own = {camera_name(channel): each for channel, each in jpegs.get(agent, {}).items()}
         shown.append(
             [{**entry, "pictures": [*map(_coded, own[entry["title"]])]} for entry in entries if entry["title"] in own]
         )

@@ -75,6 +75,11 @@ class Ground {
     this.y += down / this.scale;
   }
 
+  // The middle in metres and the pixels of a metre, in the order of `data-view`.
+  setView([x, y, scale]) {
+    Object.assign(this, { x, y, scale });
+  }
+
   // Pixels of the page from centimetres.
   at(place) {
     return [

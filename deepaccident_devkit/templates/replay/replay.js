@@ -122,6 +122,14 @@ function follow(value) {
   byId("follow").value = state.follow = value;
 }
 
+// For the pages around: show in a canvas, by its id, what the numbers of such a canvas' `data-view` say.
+const VIEWS = { ground, space };
+function look(id, view) {
+  follow("");
+  VIEWS[id].setView(view);
+  VIEWS[id].draw();
+}
+
 function zoomMap(factor) {
   if (state.follow === "pair") follow(""); // it has its own scale
   ground.zoom(factor);

@@ -77,6 +77,11 @@ class Space {
     this.orbit.closer(factor);
   }
 
+  /** What the eye looks at, from where, in the order of `data-view`. */
+  setView([x, y, z, turn, rise, distance]) {
+    Object.assign(this.orbit, { target: [x, y, z], turn, rise, distance });
+  }
+
   /** Drawn once before the screen's next picture, however often it is asked for. */
   draw() {
     if (this.waits || !this.gpu) return;

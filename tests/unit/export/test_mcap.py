@@ -1,5 +1,6 @@
 """Files of MCAP, read back by the format's own library: what is in them, what goes in, and what errors say."""
 
+import json
 import logging
 import re
 import sys
@@ -33,11 +34,14 @@ from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.export.mcap import EPOCH, McapConfig, export_mcap
 from deepaccident_devkit.motion import MotionHeads, motion_labels
-from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR
+from deepaccident_devkit.release.npz import TAGS
+from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, MAP_COLORS
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperative_boxes, visible_instances
 
 FRAMES = 6
+ONCE = ("/log", "/road/points")
+"""Topics without a message a frame."""
 RED = tuple(bytes.fromhex(COLLIDER_COLOR[1:]))
 
 
@@ -64,14 +68,21 @@ def sample(scenario: str, agent: str, index: int) -> str:
 
 def test_every_topic_has_a_message_a_frame_and_the_schema_of_its_kind(file: McapFile) -> None:
     cloud, update = "PointCloud", "SceneUpdate"
-    of_agent = {"pose": "PoseInFrame", f"{LIDAR}/points": cloud, "annotations": update, "annotations/points": cloud}
+    of_agent = {"pose": "PoseInFrame", f"{LIDAR}/points": cloud, "annotations": update}
     of_agent |= {"motion_labels/points": cloud, **{f"{camera}/image": "CompressedImage" for camera in CAMERAS}}
     of_agent |= {f"{camera}/calibration": "CameraCalibration" for camera in CAMERAS}
-    expected = {"/log": "Log", "/tf": "FrameTransforms", "/actors": update, "/actors/points": cloud}
+    expected = {
+        "/log": "Log",
+        "/tf": "FrameTransforms",
+        "/actors": update,
+        "/actors/points": cloud,
+        "/road/points": cloud,
+    }
     expected |= {f"/{agent}/{name}": kind for agent in AGENTS for name, kind in of_agent.items()}
     wanted = {topic: f"foxglove.{name}" for topic, name in expected.items()}
-    assert file.schemas == {**wanted, "/time_to_impact": "google.protobuf.DoubleValue"}
-    assert {len(messages) for topic, messages in file.messages.items() if topic != "/log"} == {FRAMES}
+    numbers = ["/time_to_impact", *(f"/{agent}/speed" for agent in AGENTS if agent != INFRASTRUCTURE)]
+    assert file.schemas == {**wanted, **dict.fromkeys(numbers, "google.protobuf.DoubleValue")}
+    assert {len(messages) for topic, messages in file.messages.items() if topic not in ONCE} == {FRAMES}
 
 
 def test_the_file_is_compressed_and_indexed_for_seeking(file: McapFile) -> None:
@@ -87,7 +98,7 @@ def test_there_is_one_timeline_of_ten_frames_a_second(file: McapFile) -> None:
     frames = [EPOCH * 10**9 + number * 10**8 for number in range(FRAMES)]
     for topic, messages in file.messages.items():
         assert {record.publish_time - record.log_time for record, _ in messages} == {0}
-        if topic != "/log":
+        if topic not in ONCE:
             assert [(record.sequence, record.log_time) for record, _ in messages] == [*enumerate(frames)]
     assert [image.timestamp.ToNanoseconds() for image in file.only("/ego_vehicle/Camera_Front/image")] == frames
     assert datetime.fromtimestamp(EPOCH, tz=timezone.utc) == datetime(2024, 1, 1, tzinfo=timezone.utc)
@@ -154,8 +165,38 @@ def test_clouds_have_all_points(da: DeepAccident, scenario: str, file: McapFile)
             stored, cloud = da.load_point_cloud(sample(scenario, agent, index), "lidar"), cloud_of(message)
             assert message.frame_id == f"{agent}/{LIDAR}"
             assert len(cloud) == len(stored) > 0
-            np.testing.assert_allclose(xyz_of(cloud), stored.xyz, atol=1e-4)
-            np.testing.assert_array_equal(cloud["intensity"], stored.intensity)
+            np.testing.assert_allclose(xyz_of(cloud), stored.xyz, rtol=0, atol=1 / 64)  # rounded to 1/32
+            np.testing.assert_allclose(cloud["intensity"], stored.intensity, rtol=0, atol=1 / 64)
+
+
+def test_road_and_speeds_are_those_of_bev_camera_and_boxes(da: DeepAccident, scenario: str, file: McapFile) -> None:
+    (message,) = file.only("/road/points")
+    cloud, first = cloud_of(message), sample(scenario, "ego_vehicle", 1)
+    colors = np.column_stack([cloud[name] for name in ("red", "green", "blue")])
+    road = (colors == tuple(bytes.fromhex(MAP_COLORS["road"][1:]))).all(axis=1)
+    near = da.world_from(first, "ego").inverse().apply(xyz_of(cloud)[road])
+    row, column = np.rint(599.5 - near[np.abs(near[:, :2]).max(axis=1) < 50, :2].T / 0.1).astype(int)
+    seen = da.load_bev(first).semantic[row, column]
+    assert (len(seen) > 1000, np.mean(seen == TAGS["road"]) > 0.9) == (True, True)
+    own = da.boxes(first, "world").velocity[da.boxes(first).actor_id == OWN_ACTOR_ID]
+    assert file.only("/ego_vehicle/speed")[0].value == pytest.approx(np.linalg.norm(own), abs=0.1)
+
+
+def test_layouts_beside_the_file_name_its_topics(path: Path, file: McapFile) -> None:
+    layout = json.loads(path.with_suffix(".foxglove.json").read_text())
+    panels, script = layout["configById"], path.with_suffix(".rerun.py").read_text()
+    compile(script, "rerun", "exec")
+    named = {
+        *panels["3D!scene"]["topics"],
+        *(one["value"].removesuffix(".value") for one in panels["Plot!values"]["paths"]),
+    }
+    named |= {
+        panels[f"Image!{number}"]["imageMode"][kind] for number in (0, 1) for kind in ("imageTopic", "calibrationTopic")
+    }
+    named |= {*re.findall(r"'(/[^']+)'", script)}
+    assert named <= {*file.messages}
+    assert {"/road/points", "/actors", "/ego_vehicle/speed", "/time_to_impact"} <= named
+    assert {*re.findall(r'"(\w+![^"]+)"', json.dumps(layout["layout"]))} == {*panels}
 
 
 def test_actors_are_the_union_of_all_annotations(da: DeepAccident, scenario: str, file: McapFile) -> None:
@@ -322,7 +363,7 @@ def test_the_page_lists_every_topic(da: DeepAccident, scenario: str, tmp_path: P
 def test_every_nth_point(da: DeepAccident, scenario: str, tmp_path: Path) -> None:
     (message,) = exported(da, scenario, tmp_path, channels=[LIDAR], points=7).only(f"/ego_vehicle/{LIDAR}/points")
     stored = da.load_point_cloud(f"{scenario}/ego_vehicle/002", "lidar").xyz
-    np.testing.assert_allclose(xyz_of(cloud_of(message)), stored[::7], atol=1e-4)
+    np.testing.assert_allclose(xyz_of(cloud_of(message)), stored[::7], rtol=0, atol=1 / 64)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawing import has_color, new_axes, on_canvas, rendered, title_of
+from drawing import has_color, legend_words, new_axes, on_canvas, rendered, title_of
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from refusals import assert_refused
@@ -19,7 +19,7 @@ from deepaccident_devkit.maps.pictures import draw_town_map, render_town_map
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.captions import missing_words
-from deepaccident_devkit.render.styles import BEV_COLORS
+from deepaccident_devkit.render.styles import BEV_COLORS, MAP_COLORS
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR
 
 
@@ -92,5 +92,6 @@ def test_a_town_as_a_picture(mapped: DeepAccident) -> None:
     ax, made = mapped.render_town_map(town, ax=new_axes()), town_map(mapped, town, workers=1)
     assert (*ax.get_xlim(), *ax.get_ylim()) == made.extent
     assert title_of(ax) == f"{town}: {made.looks} pictures of 2 scenarios"
-    assert {BEV_COLORS[name] for name in ("road", "road_line", "sidewalk")} <= ground_of(ax)[0]
+    assert {*MAP_COLORS.values()} <= ground_of(ax)[0]
+    assert legend_words(ax) == ["road", "road line", "sidewalk", "other"]
     assert_refused((lambda: render_town_map(mapped, "Town99"), ChoiceError, ("'Town99'", town)))

@@ -24,7 +24,7 @@ def test_an_annotation_is_shown_large_from_above_and_in_words(da: DeepAccident, 
     boxes = da.boxes(sample, "ego")
     row = boxes.actor_id.tolist().index(ego)
     camera, above, words = render_annotation(da, f"{sample}/{row}", margin=8, fig=detached_figure((10, 5))).axes
-    assert camera.get_title() == "Camera_Front"
+    assert camera.get_title() == "front"
     assert np.ptp(camera.get_xlim()) <= 64
     np.testing.assert_allclose(np.mean([above.get_xlim(), above.get_ylim()], axis=1), boxes.center[row, :2], atol=1e-9)
     assert np.ptp(above.get_xlim()) == pytest.approx(16)

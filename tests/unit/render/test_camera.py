@@ -15,6 +15,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import render_pointcloud_in_image, render_sample_data
 from deepaccident_devkit.render.camera import best_view, crop_about
+from deepaccident_devkit.render.hidden import hiding
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
@@ -41,7 +42,7 @@ def test_the_image_fills_the_pixels_of_its_calibration(da: DeepAccident, behind:
     (image,) = ax.images
     np.testing.assert_array_equal(image.get_array(), da.load_image(f"{behind}/Camera_Front"))
     assert (tuple(image.get_extent()), ax.get_xlim(), ax.get_ylim()) == ((0, 64, 36, 0), (0, 64), (36, 0))
-    assert title_of(ax) == "Night, wet cloudy, Town02: the impact, ego vehicle behind, Camera_Front"
+    assert title_of(ax) == "Town02, wet cloudy night: the impact, ego behind, front"
     assert plt.get_fignums() == []
 
 
@@ -75,7 +76,7 @@ def test_the_other_sensors_are_drawn_from_above_in_their_frame(
     near = boxes.select((np.abs(boxes.center[:, :2] - center) < 55).all(axis=1))
     assert footprints(of_kind(ax, PolyCollection)[0]) == footprints(near)
     assert (len(of_kind(ax, PathCollection)), len(ax.images)) == ((1, 0) if channel == "lidar01" else (0, 1))
-    assert title_of(ax).endswith(f": the impact, ego vehicle behind, {channel}")
+    assert title_of(ax).endswith(f": the impact, ego behind, {channel}")
 
 
 def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAccident, behind: str) -> None:
@@ -83,14 +84,14 @@ def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAcc
     ax = render_pointcloud_in_image(da, camera, pole, color_by="height", ax=new_axes())
     rendered(ax)
     drawn, cloud = ax.collections[0], da.load_point_cloud(pole, "world")
-    points = project_to_image(da, cloud, pole, camera, colors=False)
+    points = hiding(da, camera)(project_to_image(da, cloud, pole, camera, colors=False))
     height = da.world_from(behind, "ego").inverse().apply(cloud.xyz)[:, 2]
     order = np.flatnonzero(points.mask)[np.argsort(-points.depth[points.mask])]
     assert len(order) > 20
     np.testing.assert_allclose(drawn.get_offsets(), points.pixels[order])
     np.testing.assert_allclose(drawn.get_array(), height[order])
     assert drawn.get_cmap().name == HEIGHT_COLORMAP
-    assert title_of(ax).endswith("ego vehicle behind, Camera_Front LiDAR: the impact, infrastructure")
+    assert title_of(ax).endswith("ego behind, front LiDAR: the impact, infrastructure")
 
 
 def test_points_by_depth_are_the_camera_s_own_unless_told(da: DeepAccident, behind: str) -> None:

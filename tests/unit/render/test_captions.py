@@ -17,7 +17,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, MissingFileError
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.camera import best_view
-from deepaccident_devkit.render.captions import missing_words, moment_words, scene_words, set_scene_title, set_title
+from deepaccident_devkit.render.captions import missing_words, moment_words, scenario_words, set_scene_title, set_title
 from deepaccident_devkit.render.styles import MISSING_COLOR, current_style
 
 
@@ -38,9 +38,17 @@ def test_a_title_is_as_wide_as_its_figure(width: float, fontsize: float | str | 
 
 def test_a_moment_in_words(da: DeepAccident, frame: str) -> None:
     scenario = frame.rsplit("/", 1)[0]
-    assert scene_words(da, scenario) == "Night, wet cloudy, Town02"
+    record = da.scenario.get(scenario)
+    assert scenario_words(record) == "Town02, wet cloudy night: car hits van"
+    for changed, words in (
+        ({"weather": "HardRain"}, "Town02, hard rain at night: car hits van"),
+        ({"collision": {"classes": ["pedestrian", "truck"]}}, "Town02, wet cloudy night: truck hits pedestrian"),
+        ({"collision": None}, "Town02, wet cloudy night: no collision"),
+        ({"weather": None, "time_of_day": None, "collision": None}, "Town02: end unknown"),
+    ):
+        assert scenario_words({**record, **changed}) == words
     normal = next(one["first_frame_token"] for one in da.scenario if one["collision"] is None)
-    tokens = {frame: "0.2 s to the impact", f"{scenario}/ego_vehicle_behind/006": "the impact, ego vehicle behind"}
+    tokens = {frame: "0.2 s to the impact", f"{scenario}/ego_vehicle_behind/006": "the impact, ego behind"}
     assert {token: moment_words(da, token) for token in (*tokens, normal)} == {**tokens, normal: "0.0 s"}
 
 
@@ -51,7 +59,7 @@ def test_the_token_is_beneath_its_title_and_written_once(da: DeepAccident, frame
         set_scene_title(figure, da, frame, "more", below="another line")
         set_scene_title(ax, da, frame)
     assert tokens_of(figure) == [frame, frame]
-    assert title_of(figure) == "Night, wet cloudy, Town02: 0.2 s to the impact, more another line"
+    assert title_of(figure) == "Town02, wet cloudy night: 0.2 s to the impact, more another line"
     figure.draw_without_rendering()
     title: Any = figure._suptitle
     (box,) = (

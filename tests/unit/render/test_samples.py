@@ -11,10 +11,14 @@ from matplotlib.colors import to_hex
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, render_calibration, render_frame, render_sample, style
+from deepaccident_devkit.render.boxes import camera_name
+from deepaccident_devkit.render.hidden import hiding
 from deepaccident_devkit.render.samples import draw_shared_moment
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
 from deepaccident_devkit.v2x import map_pointcloud_to_image
+
+NAMED = {camera_name(channel): channel for channel in CAMERAS}
 
 
 def titles(fig: Any) -> list[str]:
@@ -112,13 +116,13 @@ def test_a_sample_shows_six_cameras_as_they_look_and_the_view_from_above(da: Dee
     sample = da.samples_of(frame)[0]
     fig = drawn(render_sample, da, sample, size=(16, 6))
     panels = dict(zip(titles(fig), (ax.get_window_extent() for ax in fig.axes), strict=True))
-    assert set(panels) == {*CAMERAS, ""}
-    for row in ("Front", "Back"):
-        left, middle, right = (panels[f"Camera_{row}{side}"] for side in ("Left", "", "Right"))
+    assert set(panels) == {*NAMED, ""}
+    for row in ("front", "back"):
+        left, middle, right = (panels[f"{row}{side}"] for side in (" left", "", " right"))
         assert left.x1 <= middle.x0 < middle.x1 <= right.x0 < right.x1 < panels[""].x0
     assert panels["Camera_Back"].y1 < panels["Camera_Front"].y0
     for ax in (ax for ax in fig.axes if ax.get_title()):
-        np.testing.assert_array_equal(picture(ax), da.load_image(f"{sample['token']}/{ax.get_title()}"))
+        np.testing.assert_array_equal(picture(ax), da.load_image(f"{sample['token']}/{NAMED[ax.get_title()]}"))
 
 
 @pytest.mark.slow
@@ -126,9 +130,9 @@ def test_each_panel_draws_the_layers_that_it_has(da: DeepAccident, frame: str) -
     sample, fig = da.samples_of(frame)[0], detached_figure((16, 6))
     points = render_sample(da, sample, agents=None, layers=["points"], fig=fig)
     plain = render_sample(da, sample, fig=detached_figure((16, 6)))
-    assert clouds(points) == {**dict.fromkeys(CAMERAS, 1), "": 5}
+    assert clouds(points) == {**dict.fromkeys(NAMED, 1), "": 5}
     assert not any(ax.images for ax in points.axes)
-    assert clouds(plain) == {**dict.fromkeys(CAMERAS, 0), "": 1}
+    assert clouds(plain) == {**dict.fromkeys(NAMED, 0), "": 1}
 
 
 @pytest.fixture(scope="module")
@@ -139,10 +143,11 @@ def calibrated(da: DeepAccident) -> str:
 def test_of_a_sample_all_agents_points_are_in_its_six_cameras(da: DeepAccident, calibrated: str) -> None:
     scenario, _, number = calibrated.rsplit("/", 2)
     fig = render_calibration(da, calibrated, fig=detached_figure((15, 7)))
-    assert sorted(titles(fig)) == sorted(CAMERAS)
+    assert sorted(titles(fig)) == sorted(NAMED)
     for ax, (agent, cloud) in ((ax, each) for ax in fig.axes for each in zip(AGENTS, range(5), strict=True)):
-        camera, sample = f"{calibrated}/{ax.get_title()}", f"{scenario}/{agent}/{number}"
+        camera, sample = f"{calibrated}/{NAMED[ax.get_title()]}", f"{scenario}/{agent}/{number}"
         points, shown = map_pointcloud_to_image(da, camera, sample, colors=False), of_kind(ax, PathCollection)[cloud]
+        points = hiding(da, camera)(points)
         np.testing.assert_allclose(np.reshape(shown.get_offsets(), (-1, 2)), points.pixels[points.mask], atol=1e-6)
         assert {to_hex(color) for color in shown.get_facecolor()} <= {AGENT_COLORS[agent]}
     assert [len(ax.images) for ax in fig.axes] == [1] * 6
@@ -159,7 +164,7 @@ def test_of_a_frame_the_front_cameras_of_its_agents_are_shown(da: DeepAccident, 
 
 def test_boxes_are_those_of_all_agents_but_the_camera_s_own_vehicle(da: DeepAccident, calibrated: str) -> None:
     fig = render_calibration(da, calibrated, layers=["boxes"], fig=detached_figure((15, 7)))
-    front = next(ax for ax in fig.axes if ax.get_title() == "Camera_Front")
+    front = next(ax for ax in fig.axes if ax.get_title() == "front")
     boxes = da.cooperative_boxes(calibrated, frame="Camera_Front")
     own = da.get("agent", calibrated.rsplit("/", 1)[0])["actor_id"]
     near = (np.linalg.norm(boxes.center, axis=1) < 60) & (boxes.actor_id != own)

@@ -195,6 +195,7 @@ def test_the_measures_agree_with_known_values(script: ModuleType) -> None:
         ("classes by choice, and the pair", 33),
         ("series", 16),
         ("splits", 17),
+        ("a town's ground", 9),
     ],
 )
 def test_colours_that_stand_together_are_distinguished(script: ModuleType, group: str, bound: float, eye: str) -> None:

@@ -20,7 +20,7 @@ from deepaccident_devkit.explore import Explorer, make_app
 from deepaccident_devkit.explore.pages.scenario import PARTS
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render.outcomes.above import difference_words
-from deepaccident_devkit.render.outcomes.evaluation import sample_verdict
+from deepaccident_devkit.render.outcomes.verdicts import sample_verdict
 from deepaccident_devkit.safety import avoidability_report, describe, lead_time_ledger
 from deepaccident_devkit.safety.prevention import prevention_evaluator
 from deepaccident_devkit.statistics import dataset_statistics

@@ -184,7 +184,7 @@ def test_samples_of_stored_results_are_ranked_and_drawn(task: Any, da_motion: De
         figure = complete_figure(run, each)
         (token,) = tokens_of(figure)
         assert (text_faults(figure), token in each.caption) == ([], True)
-        words = f"{scene_words(da_motion, token.rsplit('/', 2)[0])}: {moment_words(da_motion, token)} "
+        words = f"{scene_words(da_motion.scenario.get(token.rsplit('/', 2)[0]))}: {moment_words(da_motion, token)} "
         assert title_of(figure.axes[0]).startswith(words)
     if task == "accident":
         page = page_of(save_report(run, tmp_path / "report", dataset=da_motion, results=results))

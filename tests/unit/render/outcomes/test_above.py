@@ -40,7 +40,10 @@ def test_accidents_without_truth(da_motion: DeepAccident) -> None:
     alarm = Accident(positions=np.array([[5.0, 0.0], [7.0, 0.0]]), time=1.0)
     figure = render_evaluation(da_motion, token, [alarm], fig=detached_figure((9, 5)))
     assert title_of(figure).endswith("5 m: FP, 10 m: FP, 15 m: FP")
-    assert figure.axes[0].get_title() == "truth: no accident comes"
+    assert [ax.get_title() for ax in figure.axes] == [
+        "ego, front",
+        "no accident comes, one is foreseen in 1.0 s",
+    ]
     nothing = ComparedAccidents(true=None, predicted=())
     assert difference_words(nothing) == "no accident comes, none is foreseen"
     assert not draw_accident_outcome(nothing, ax=new_axes()).lines

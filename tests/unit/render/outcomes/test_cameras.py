@@ -25,7 +25,7 @@ from deepaccident_devkit.evaluation import (
 from deepaccident_devkit.evaluation.accident.scoring import ComparedAccidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
-from deepaccident_devkit.render.boxes import NEAREST_DRAWN
+from deepaccident_devkit.render.boxes import NEAREST_DRAWN, camera_name
 from deepaccident_devkit.render.outcomes import (
     draw_outcome_in_camera,
     render_evaluation,
@@ -33,7 +33,7 @@ from deepaccident_devkit.render.outcomes import (
     sample_verdict,
 )
 from deepaccident_devkit.render.outcomes.above import FORESEEN_COLOR
-from deepaccident_devkit.render.outcomes.evaluation import AccidentVerdict
+from deepaccident_devkit.render.outcomes.verdicts import AccidentVerdict
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.poses import camera_of
@@ -252,7 +252,7 @@ def test_places_of_accidents_are_on_the_ground(da: DeepAccident, approach: str, 
         np.testing.assert_allclose(np.linalg.norm(ring - place, axis=1), 1.0)
         np.testing.assert_allclose(ring.min(axis=0), place - 1)
     joined = [grounded(line) for line in lines if len(line) == 2 and abs(line[0, 0] - line[1, 0]) > 0.5]
-    np.testing.assert_allclose(joined[0], true.positions)
+    np.testing.assert_allclose(joined[-1], true.positions)  # the edges of the pair's boxes are below
     crosses = np.array([grounded(line) for line in lines_in(ax, FORESEEN_COLOR) if len(line) == 2][-4:])
     np.testing.assert_allclose(crosses.mean(axis=1), np.repeat(alarm.positions, 2, axis=0), atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(np.diff(crosses, axis=1), axis=-1), 2.0)
@@ -289,7 +289,7 @@ def test_the_verdict_is_that_of_the_views_from_above(
         beside = render_evaluation(da_motion, sample, given, fig=detached_figure((12, 7)), **how)
         over = render_outcome_in_cameras(da_motion, sample, given, fig=detached_figure((15, 7)), **how)
         assert title_of(over) == title_of(beside)
-        assert [ax.get_title() for ax in over.axes] == IN_ORDER
+        assert [ax.get_title() for ax in over.axes] == [*map(camera_name, IN_ORDER)]
 
 
 def test_frames_and_legends_are_named(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:

@@ -5,40 +5,33 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import texts, title_of
+from drawing import legend_words, of_kind, texts, title_of
 from matplotlib import pyplot as plt
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.contour import ContourSet
 from picture_texts import text_faults
-from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import (
     Accident,
     AccidentEvaluator,
     DetectedBoxes,
-    MotionEvaluator,
     accident_context,
     box_truth,
-    detection_truth,
     instances_of,
 )
 from deepaccident_devkit.evaluation.accident import PROTOCOLS, compared_accidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
-from deepaccident_devkit.render.boxes import collider_ids
-from deepaccident_devkit.render.outcomes import sample_verdict
+from deepaccident_devkit.render.boxes import camera_name, collider_ids
+from deepaccident_devkit.render.camera import best_view
 from deepaccident_devkit.render.outcomes.above import verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import (
-    AccidentVerdict,
-    DetectionVerdict,
-    MotionVerdict,
-    judged_as,
     render_evaluation,
 )
-from deepaccident_devkit.render.styles import COLLIDER_COLOR
+from deepaccident_devkit.render.styles import BEV_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.taxonomy import short_name
 
 
 def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample: str) -> None:
@@ -47,14 +40,15 @@ def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample
     figure, silent = (
         render_evaluation(da_motion, sample, given, fig=detached_figure((10, 6))) for given in ([near], [])
     )
-    left, right = figure.axes
+    camera, above = figure.axes
     assert title_of(figure).endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
-    assert right.get_title() == f"an accident comes in {true.time:.1f} s;\nforeseen 6.0 m off in sum, +0.5 s"
-    assert (texts(left), texts(right)) == ([], [f"in {near.time:.1f} s, score 0.9", "3.0 m", "3.0 m"])
-    np.testing.assert_allclose(
-        [left.lines[0].get_xydata(), right.lines[1].get_xydata()], [true.positions, near.positions]
-    )
-    assert left.get_xlim() == right.get_xlim()
+    assert above.get_title() == f"an accident comes in {true.time:.1f} s;\nforeseen 6.0 m off in sum, +0.5 s"
+    alarm = f"in {near.time:.1f} s, score 0.9"
+    assert {f"in {true.time:.1f} s", alarm} <= {*texts(camera)}
+    assert {alarm, "3.0 m", "ego", "other"} <= {*texts(above)}
+    marked = {line.get_marker(): line.get_xydata() for line in above.lines if line.get_marker() in ("o", "x")}
+    np.testing.assert_allclose([marked["o"], marked["x"]], [true.positions, near.positions])
+    assert legend_words(figure) == ["to come", "foreseen"]
     assert title_of(silent).endswith("5 m: FN, 10 m: FN, 15 m: FN")
     assert silent.axes[1].get_title().endswith("none is foreseen")
 
@@ -76,9 +70,31 @@ def test_motion_is_seen_as_accidents_by_every_protocol(
     compared = compared_accidents(output, labels, context, PROTOCOLS[protocol])
     marks = [(line.get_marker(), line.get_xydata()) for ax in figure.axes for line in ax.lines]
     drawn = {marker: [places for each, places in marks if each == marker] for marker in ("o", "x")}
-    np.testing.assert_allclose(drawn["o"], 2 * [compared.true.positions] if compared.true else [])
+    np.testing.assert_allclose(drawn["o"], [compared.true.positions] if compared.true else [])
     (predicted,) = compared.predicted
     np.testing.assert_allclose(drawn["x"], [predicted.positions])
+
+
+def test_an_accident_is_shown_on_the_road_and_in_the_camera_that_sees_both_best(
+    da: DeepAccident, approach: str
+) -> None:
+    true: Any = box_truth(da, approach).accident
+    named = Accident(positions=true.positions + 2.0, time=true.time, ids=true.ids)
+    camera, above = render_evaluation(da, approach, [named], fig=detached_figure((12, 6))).axes
+    own = da.boxes(approach, "world")
+    pair = own.select(np.isin(own.actor_id, [*collider_ids(da, approach)]))
+    moment = da.get("sample", approach)["frame_token"]
+    best: Any = best_view(da, [each["token"] for each in da.samples_of(moment)], pair)
+    agent, _, channel = best.camera.rsplit("/", 3)[1:]
+    assert camera.get_title() == f"{short_name(agent)}, {camera_name(channel)}"
+    np.testing.assert_array_equal(camera.images[0].get_array(), da.load_image(best.camera))
+    (road,) = above.images
+    assert BEV_COLORS["road"] in {to_hex(color / 255) for color in np.unique(road.get_array().reshape(-1, 3), axis=0)}
+    corners = [path.vertices[:4] for each in of_kind(above, PolyCollection) for path in each.get_paths()]
+    middles = np.mean(corners, axis=1)
+    assert np.linalg.norm(middles[:, None] - true.positions, axis=-1).min(axis=0).max() < 1.0
+    ways = [line.get_xydata()[-1] for line in above.lines if line.get_zorder() == 4 and line.get_linestyle() == "--"]
+    np.testing.assert_allclose(ways, named.positions)
 
 
 def test_the_pair_that_collides_is_red_in_every_task(
@@ -87,11 +103,12 @@ def test_the_pair_that_collides_is_red_in_every_task(
     assert len(collider_ids(da_motion, sample)) == 2
     accident, boxes = box_truth(da_motion, sample).accident, da_motion.boxes(sample)
     detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
-    for prediction in (detected, [accident], instances_of(labels.instance, labels.config.grid)):
-        left = render_evaluation(da_motion, sample, prediction, fig=detached_figure((10, 6))).axes[0]
-        edges = [each for each in left.collections if isinstance(each, (ContourSet, PolyCollection))]
+    motion = instances_of(labels.instance, labels.config.grid)
+    for prediction, panel, count in ((detected, 0, 2), ([accident], 1, 4), (motion, 0, 2)):
+        ax = render_evaluation(da_motion, sample, prediction, fig=detached_figure((10, 6))).axes[panel]
+        edges = [each for each in ax.collections if isinstance(each, (ContourSet, PolyCollection))]
         colors = [to_hex(color) for each in edges for color in each.get_edgecolor()]
-        assert colors.count(COLLIDER_COLOR) == 2
+        assert colors.count(COLLIDER_COLOR) == count  # of an accident also at the impact
 
 
 def faults_of_predictions(dataset: DeepAccident, token: str) -> list[str]:
@@ -123,59 +140,3 @@ def test_words_of_twelve_scenes_are_apart(da_designs: DeepAccident) -> None:
     assert len(tokens) == 12
     found = {token: faults_of_predictions(da_designs, token) for token in tokens}
     assert {token: faults for token, faults in found.items() if faults} == {}
-
-
-def test_a_prediction_is_judged_in_its_own_task(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
-    motion, boxes = instances_of(labels.instance, labels.config.grid), da_motion.boxes(sample)
-    detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
-    for given, task, judged in (
-        (motion, None, (motion, "motion")),
-        (motion, "accident", (motion, "accident")),
-        (iter([]), None, ([], "accident")),
-        (detected, None, (detected, "detection")),
-    ):
-        assert judged_as(given, task) == judged
-    assert_refused(
-        (lambda: judged_as(detected, "motion"), ChoiceError, ("task", "detection", "'motion'")),
-        (lambda: judged_as(boxes, None), EvaluationError, ("prediction", "a MotionOutput or a list of Accidents")),
-    )
-
-
-def test_motion_is_judged_by_the_released_rules(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
-    output, context = instances_of(np.roll(labels.instance, 2, axis=-1), labels.config.grid), accident_context
-    counted, alarms = MotionEvaluator("released"), AccidentEvaluator("released")
-    counted.update(sample, output, da_motion.motion_labels(sample))
-    alarms.update(sample, output, labels, context(da_motion, sample, 2.0))
-    verdict, within = sample_verdict(da_motion, sample, output), counted.compute().ranges["100x100"]
-    counts = f"{within.true_positive} TP, {within.false_positive} FP, {within.false_negative} FN"
-    assert isinstance(verdict, MotionVerdict)
-    assert verdict.words.split("; ")[1].endswith(f"PQ {within.pq:.1f} %, {counts}")
-    assert len(verdict.outcome.matches) == within.true_positive
-    how = {"task": "accident", "label": labels}
-    seen, other = (sample_verdict(da_motion, sample, output, **how, **more) for more in ({}, {"protocol": "boxes"}))
-    assert {type(seen), type(other)} == {AccidentVerdict}
-    assert seen.words == f"accident: {verdict_words(alarms.compute())}"
-    assert [each.compared.true.ids is not None for each in (seen, other)] == [False, True]
-
-
-def test_explicit_accidents_are_judged_by_boxes(da_motion: DeepAccident, sample: str) -> None:
-    context, counted = accident_context(da_motion, sample, 2.0), AccidentEvaluator("boxes")
-    true: Any = context.truth.accident
-    near = Accident(positions=true.positions + 1.5, time=true.time)
-    counted.update(sample, [near], None, context)
-    verdict = sample_verdict(da_motion, sample, [near])
-    assert isinstance(verdict, AccidentVerdict)
-    assert verdict.words == f"accident: {verdict_words(counted.compute())}"
-    assert verdict.compared.true is not None
-
-
-def test_detections_are_judged_in_the_frame_of_the_protocol(da_motion: DeepAccident, sample: str) -> None:
-    truth = detection_truth(da_motion, sample, "paper")
-    world = truth.transform(da_motion.world_from(sample, truth.frame), "world")
-    given = DetectedBoxes(boxes=world, scores=np.ones(len(world)))
-    verdict = sample_verdict(da_motion, sample, given, protocol="paper")
-    assert isinstance(verdict, DetectionVerdict)
-    assert verdict.detected.boxes.frame == verdict.rules.frame == truth.frame
-    np.testing.assert_allclose(verdict.detected.boxes.center, truth.center, atol=1e-6)
-    assert verdict.matches.detection.tolist() == verdict.matches.truth.tolist()
-    assert len(verdict.matches.truth) > 5

@@ -20,6 +20,7 @@ from deepaccident_devkit.evaluation.predictions import labels_at_present
 from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
+from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.replay import recording_of, render_replay
 from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
@@ -83,9 +84,10 @@ def test_cameras_are_where_they_record(da: DeepAccident, data: dict[str, Any]) -
     scenario, ahead = accident(da), np.array([[3.0, -2.0, 20.0]])
     origin = np.array([*recording_of(da, scenario, None).origin, 0.0])
     for agent, cameras in zip(AGENTS, data["cameras"], strict=True):
-        assert [f"Camera_{camera['title']}" for camera in cameras] == list(CAMERAS)
-        for camera, (frame, pose) in ((each, at) for each in cameras for at in enumerate(each["poses"], 1)):
-            sample, channel = f"{scenario}/{agent}/{frame:03d}", f"Camera_{camera['title']}"
+        assert [camera["title"] for camera in cameras] == [*map(camera_name, CAMERAS)]
+        moments = ((*each, *at) for each in zip(CAMERAS, cameras, strict=True) for at in enumerate(each[1]["poses"], 1))
+        for channel, camera, frame, pose in moments:
+            sample = f"{scenario}/{agent}/{frame:03d}"
             lens, there = da.camera(sample, channel), da.world_from(sample, channel)
             np.testing.assert_allclose(np.array(pose[:3]) / 100 + origin, there.translation, atol=0.00501)
             turned = quaternions.to_matrix(np.array(pose[3:]) / 10_000) @ ahead[0]

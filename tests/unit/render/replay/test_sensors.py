@@ -18,6 +18,7 @@ from wording import lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
+from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.replay import render_replay, sensors
 from deepaccident_devkit.render.replay.entries import Recording, actor_entries, recording_of
 from deepaccident_devkit.render.replay.sensors import (
@@ -52,11 +53,10 @@ def test_points_lie_on_those_of_the_lidar(da: DeepAccident, data: dict[str, Any]
 
 def test_each_agent_has_six_cameras(da: DeepAccident, data: dict[str, Any]) -> None:
     shown = {
-        f"{accident(da)}/{agent}/006/Camera_{camera['title']}": np.asarray(picture(camera["pictures"][5]), dtype=float)
+        f"{accident(da)}/{agent}/006/{channel}": np.asarray(picture(camera["pictures"][5]), dtype=float)
         for agent, cameras in zip(AGENTS, data["cameras"], strict=True)
-        for camera in cameras
+        for channel, camera in zip(CAMERAS, cameras, strict=True)
     }
-    assert [token.rsplit("/", 1)[1] for token in shown] == [*CAMERAS] * 5
     true = {token: da.load_image(token) for token in shown}
     nearest = {token: min(true, key=lambda each: np.abs(true[each] - shown[token]).mean()) for token in shown}
     assert nearest == {token: token for token in shown}
@@ -66,7 +66,7 @@ def test_each_agent_has_six_cameras(da: DeepAccident, data: dict[str, Any]) -> N
 def test_agents_are_as_asked(da: DeepAccident, tmp_path: Path) -> None:
     data = data_of(render_replay(da, accident(da), tmp_path / "a.html", agents=["infrastructure"]))
     assert [agent["name"] for agent in data["agents"]] == ["infrastructure"]
-    assert [f"Camera_{camera['title']}" for camera in data["cameras"][0]] == list(CAMERAS)
+    assert [camera["title"] for camera in data["cameras"][0]] == [*map(camera_name, CAMERAS)]
     absent = "Agents not shown: ego, ego behind, other, other behind."
     assert not lacking(data["notes"], "Pictures are up to 960 pixels wide, of JPEG quality 80.", absent)
 

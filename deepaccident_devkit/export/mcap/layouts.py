@@ -1,0 +1,77 @@
+"""What viewers show at first of a file: a layout for Foxglove, and a script that opens it in rerun with a blueprint."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.taxonomy import LIDAR
+
+_RERUN = '''"""Open {file} in rerun (0.41) with a layout: pip install rerun-sdk, then python {script}."""
+
+from pathlib import Path
+
+import rerun
+from rerun import blueprint as show
+from rerun.blueprint import encodings
+
+scene = show.Spatial3DView(
+    name="scene", contents={scene}, spatial_information=show.SpatialInformation(target_frame="world")
+)
+cameras = [
+    show.Spatial2DView(
+        name=each, origin=each, spatial_information=show.SpatialInformation(target_frame=f"{{each[1:-6]}}_image_plane")
+    )
+    for each in {cameras}
+]
+number = encodings.VisualizerComponentMapping(
+    "Scalars:scalars",
+    encodings.ComponentSourceKind.SourceComponent,
+    source_component="google.protobuf.DoubleValue:message",
+    selector=".value",
+)
+curves = {{each: rerun.SeriesLines().visualizer(mappings=[number]) for each in {values}}}
+values = show.TimeSeriesView(name="speeds (m/s), time to impact (s)", contents=list(curves), overrides=curves)
+blueprint = show.Blueprint(show.Horizontal(scene, show.Vertical(*cameras, values), column_shares=[3, 2]))
+if __name__ == "__main__":
+    rerun.init("deepaccident", spawn=True, default_blueprint=blueprint)
+    rerun.log_file_from_path(Path(__file__).with_name("{file}"))
+'''
+
+
+def write_layouts(path: Path, topics: Sequence[str]) -> None:
+    """Write the layouts beside an MCAP file with these topics: `.foxglove.json` and `.rerun.py` in place of its suffix.
+
+    They show the road, clouds and actors, the front cameras, and the speeds and the time to the impact as curves.
+    """
+    clouds = [topic for topic in topics if topic.endswith(f"/{LIDAR}/points")]
+    cameras = [topic for topic in topics if topic.endswith("/Camera_Front/image")][:2]
+    values = [topic for topic in topics if topic.endswith("/speed") or topic == "/time_to_impact"]
+    panels: dict[str, Any] = {
+        "3D!scene": {
+            "followMode": "follow-none",
+            "followTf": "world",
+            "topics": {
+                "/road/points": {"visible": True, "colorMode": "rgba-fields", "pointSize": 4},
+                "/actors": {"visible": True},
+                **{topic: {"visible": True, "colorMode": "colormap", "colorField": "z"} for topic in clouds},
+            },
+        },
+        "Plot!values": {"paths": [{"value": f"{topic}.value", "enabled": True} for topic in values]},
+    }
+    side: Any = "Plot!values"
+    for number, topic in enumerate(cameras):
+        panels[f"Image!{number}"] = {
+            "imageMode": {"imageTopic": topic, "calibrationTopic": topic.replace("/image", "/calibration")}
+        }
+        side = {"direction": "column", "first": f"Image!{number}", "second": side}
+    layout = {"direction": "row", "first": "3D!scene", "second": side, "splitPercentage": 60}
+    foxglove = {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": layout}
+    write_bytes(path.with_suffix(".foxglove.json"), json.dumps(foxglove, indent=1).encode())
+    script = path.with_suffix(".rerun.py")
+    scene = ["/road/points", "/actors/points", "/tf", *clouds]
+    text = _RERUN.format(file=path.name, script=script.name, scene=scene, cameras=cameras, values=values)
+    write_bytes(script, text.encode())
