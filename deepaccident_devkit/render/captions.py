@@ -294,7 +294,7 @@ def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
     ax.set_facecolor(MISSING_COLOR)
     words = absence_text(dataset, sample_data)
     how: dict[str, Any] = {"ha": "center", "va": "top", "clip_on": True, "in_layout": False, "gid": _MISSING}
-    told = f"{agent} {channel}: {words}"
+    told = f"_{agent} {channel}: {words}"
     ax.text(0.5, 0.97, words, label=told, fontsize=text_size(), transform=ax.transAxes, zorder=0, **how)
 
 
@@ -307,7 +307,7 @@ def absence_text(dataset: Dataset, sample_data: str) -> str:
 def write_missing(ax: Axes, words: str) -> None:
     """Have the title of axes or of their figure, which is set later, say what is not in the picture; or nothing."""
     if words:
-        ax.text(0, 0, "", label=words, gid=_LACKS, visible=False)
+        ax.text(0, 0, "", label=f"_{words}", gid=_LACKS, visible=False)
 
 
 def missing_clouds_text(agents: Collection[str]) -> str:
@@ -322,8 +322,11 @@ def missing_words(drawn: Axes | Figure) -> list[str]:
 
 
 def _parts(texts: Iterable[Any]) -> list[str]:
-    """What texts say of files that are not there, each once; whose clouds in one part."""
-    parts = list(dict.fromkeys(part for text in texts for part in text.get_label().split("; ") if part))
+    """What texts say of files that are not there, each once; whose clouds in one part.
+
+    Their labels say it, after a `_`, with which no legend has them.
+    """
+    parts = list(dict.fromkeys(part for text in texts for part in text.get_label()[1:].split("; ") if part))
     clouds = [part.removeprefix(_NO_CLOUD) for part in parts if part.startswith(_NO_CLOUD)]
     others = [part for part in parts if not part.startswith(_NO_CLOUD)]
     return [*others, *filter(None, [missing_clouds_text({*filter(None, ", ".join(clouds).split(", "))})])]

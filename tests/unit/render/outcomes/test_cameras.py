@@ -309,7 +309,7 @@ def test_a_missing_image_is_a_grey_panel_with_the_prediction(da_partial: DeepAcc
     figure = render_outcome_in_cameras(da_partial, approach, given, fig=detached_figure((10, 4)))
     front, back = (figure.axes[IN_ORDER.index(f"Camera_{place}")] for place in ("Front", "Back"))
     assert (len(front.images), len(back.images), to_hex(front.get_facecolor())) == (0, 1, MISSING_COLOR)
-    assert words(front) == "Camera_Front\nnot downloaded"
+    assert words(front) == "front\nnot downloaded"
     assert len(lines_in(front, OUTCOME_COLORS["right"])) >= 12
 
 
