@@ -109,7 +109,8 @@ def test_every_option_with_words_takes_them_in_any_case() -> None:
         words = list(option.type.choices)
         assert [option.type.convert(word.upper(), option, context) for word in words] == words
         long = max(words, key=len)
-        with pytest.raises(click.BadParameter, match=rf" is not (one of .*|'{re.escape(long)}'); did you mean '{re.escape(long)}'\?$"):
+        meant = re.escape(repr(long))
+        with pytest.raises(click.BadParameter, match=rf" is not (one of .*|{meant}); did you mean {meant}\?$"):
             option.type.convert(f"{long}s", option, context)
 
 
