@@ -55,6 +55,8 @@ _LOOKED_AT: Final = 2_000_000
 OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
 """Renders a moment, given by its record, on an empty figure; its result is not used."""
 _DPI: Final = 100.0
+_EDGE: Final = 5
+"""Pixels that stay free beside a view."""
 _DPI_AT: Final = 1280 * 720
 """A picture with so many pixels has `_DPI` pixels an inch; larger ones have more, so words keep their share."""
 
@@ -252,7 +254,8 @@ class Scene:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         dpi = min(_DPI * (self.width * self.height / _DPI_AT) ** 0.5, width / view.inches)
-        fig = figure_of_pixels(width, self.height, dpi=dpi)
+        fig: Any = figure_of_pixels(width, self.height, dpi=dpi)
+        fig.get_layout_engine().set(w_pad=_EDGE / dpi)
         view.on(fig, self.dataset, frame, agents, layers)
         canvas: Any = FigureCanvasAgg(fig)
         canvas.draw()

@@ -231,10 +231,10 @@ def test_a_picture_of_another_moment_is_veiled(pages: Pages, dataset: DeepAccide
         where = "(each) => [each.figure.classList.contains('veiled'), each.where.textContent]"
         told[frame] = pages.value(f"[cards[0], everyCamera[0]].map({where})")
     veiled = {
-        3: [False, "Front"],
-        5: [True, "Front, 0.2 s earlier"],
-        1: [True, "Front, 0.2 s later"],
-        6: [False, "Front"],
+        3: [False, "front"],
+        5: [True, "front, 0.2 s earlier"],
+        1: [True, "front, 0.2 s later"],
+        6: [False, "front"],
     }
     assert told == {frame: [each, each] for frame, each in veiled.items()}
 

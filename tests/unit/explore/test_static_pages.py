@@ -22,6 +22,7 @@ from deepaccident_devkit.evaluation.runs import save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.explore import Explorer, export_pages, static_pages
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_html
+from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.render.replay import render_replay
 
 pytestmark = pytest.mark.slow
@@ -109,10 +110,10 @@ def test_the_list_has_the_scenarios_and_their_values(made: Made, da_motion: Deep
     for record in da_motion.scenario:
         place = explorer.scenarios.row_of[record["token"]]
         visibility, lead = (explorer.scenarios.values(name)[place] for name in ("accident_visibility", "lead"))
-        where = [record["token"], record["town"], f"{record['weather']}, {record['time_of_day']}", "train", "35"]
+        where = [record["token"], scenario_words(record), "train", "35"]
         expected.append([*where, visibility or "–", "–" if lead is None else f"{lead:.1f}"])
     explorer.jobs.end()
-    assert [[row[0], *row[2:8]] for row in told.table("scenario")] == expected
+    assert [row[:6] for row in told.table("scenario")] == expected
     keys = [each["data-key"] for each in told.all("td") if "data-key" in each]
     assert (len(keys), all(not key or float(key) >= 0 for key in keys)) == (2 * 4, True)
 

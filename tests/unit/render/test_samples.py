@@ -120,7 +120,7 @@ def test_a_sample_shows_six_cameras_as_they_look_and_the_view_from_above(da: Dee
     for row in ("front", "back"):
         left, middle, right = (panels[f"{row}{side}"] for side in (" left", "", " right"))
         assert left.x1 <= middle.x0 < middle.x1 <= right.x0 < right.x1 < panels[""].x0
-    assert panels["Camera_Back"].y1 < panels["Camera_Front"].y0
+    assert panels["back"].y1 < panels["front"].y0
     for ax in (ax for ax in fig.axes if ax.get_title()):
         np.testing.assert_array_equal(picture(ax), da.load_image(f"{sample['token']}/{NAMED[ax.get_title()]}"))
 

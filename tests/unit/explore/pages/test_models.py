@@ -260,7 +260,7 @@ def test_other_verdicts_are_those_of_the_evaluator(site: Site) -> None:
     for token in site.runs["motion"].evaluator.tokens:
         widest = site.runs["motion"].evaluator.compute([token]).ranges["100x100"]
         counts = f"{widest.true_positive} TP, {widest.false_positive} FP, {widest.false_negative} FN"
-        expected = f"100x100 m: PQ {widest.pq:.1f} %, IoU {widest.iou:.1f} %, {counts}"
+        expected = f"100x100 m: VPQ {widest.pq:.1f} %, IoU {widest.iou:.1f} %, {counts}"
         assert verdict("motion", site.rows("motion")[token]) == expected
     for token, counted in site.runs["detection"].evaluator.counts.items():
         start = f"{sum(counted['truths'])} true boxes, {len(counted['detections'][0])} detections, "
