@@ -322,8 +322,9 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         if looks:
             choices["style"] = looks[-1]
         places = [cast(StyleName, word) for word in styles if word not in picture.styles]
-        by_class = choices.get("color_by") == "class" and choices.pop("color_by")
-        with style(places[-1] if places else None, title=not no_title, color_by=by_class or "role"):
+        # what else a view colours by is its own choice
+        boxes_by = choices.pop("color_by") if choices.get("color_by") == "class" else "role"
+        with style(places[-1] if places else None, title=not no_title, color_by=boxes_by):
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
                 drawn = picture.drawn(dataset, row, size, dpi or current_style().dpi, choices)
                 save_picture(drawn, path, dpi=dpi)

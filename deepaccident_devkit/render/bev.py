@@ -98,6 +98,7 @@ class BevView:
         seconds: how far trajectories reach back and ahead.
         center: of the picture, metres of `frame`; None for the agent's place.
         wide: how much farther it shows to the left and the right of the picture than up and down.
+        beside: whether a picture beside it shows the surroundings, so that nobody misses the BEV camera's.
     """
 
     view_range: float = 50.0
@@ -108,6 +109,7 @@ class BevView:
     seconds: tuple[float, float] = (1.0, 3.0)
     center: tuple[float, float] | None = None
     wide: float = 1.0
+    beside: bool = False
 
     @property
     def half(self) -> FloatArray:
@@ -225,7 +227,8 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
             _name_pair(dataset, record, boxes, ax, named=names if len(names) > 1 else ())
         colored = frozenset(colors)
     shown = tuple(agent for agent, cloud in clouds.items() if cloud is not None and len(cloud))
-    absent += _absent_ground(dataset, ground, layers, seen=has_ground or town is not None, other=bool(shown))
+    seen, other = has_ground or town is not None, view.beside or bool(shown)
+    absent += _absent_ground(dataset, ground, layers, seen=seen, other=other)
     _draw_marks(dataset, record, view.frame, names, ax)
     x_words, y_words = axis_words(view.frame)
     ax.set(xlabel=x_words, ylabel=y_words)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
@@ -55,6 +55,7 @@ _LATTICE: Final = ((1 + CORNER_SIGNS * _STEPS) / 2).prod(axis=2)
 """(125, 8) weights of a box's corners, of points spread evenly over it."""
 CAMERA_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids", "velocities")
 CAMERA_DEFAULT: Final[tuple[Layer, ...]] = ("image", "boxes")
+_Seen = Callable[[ImagePoints], ImagePoints]
 ColorBy = Literal["depth", "height", "agent"]
 _DEPTHS: Final = (0.0, 50.0)
 """Metres from the camera at which the colours of depth begin and end."""
@@ -213,29 +214,37 @@ def render_pointcloud_in_image(
     ax = axes_or_new(ax, (8, 5))
     draw_image(dataset, record, ax)
     write_missing(ax, missing_clouds_text(absent))
+    seen: _Seen = lambda points: points  # noqa: E731 - the camera's own cloud hides nothing of itself
+    if any(source["token"] != own["token"] for source in sources):
+        seen = hiding(dataset, record)
     if color_by == "agent":
         for source in sources:
-            _draw_agent(dataset, source, record, ax)
+            _draw_agent(dataset, source, record, seen, ax)
         handles = agent_handles([source["agent"] for source in sources])
         draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0))
     elif sources:
-        _draw_metres(dataset, sources[0], record, color_by, ax)
+        _draw_metres(dataset, sources[0], record, seen, color_by, ax)
     set_scene_title(ax, dataset, record["token"], camera_name(record["channel"]), below=f"LiDAR: {whose}")
     return ax
 
 
-def _draw_agent(dataset: Dataset, source: SampleRecord, camera: RowArgument, ax: Axes) -> None:
+def _draw_agent(dataset: Dataset, source: SampleRecord, camera: RowArgument, seen: _Seen, ax: Axes) -> None:
     cloud = dataset.load_point_cloud(source, "lidar")
-    points = hiding(dataset, camera)(project_to_image(dataset, cloud, source, camera, colors=False))
+    points = seen(project_to_image(dataset, cloud, source, camera, colors=False))
     draw_points_in_image(points.pixels[points.mask], ax, color=AGENT_COLORS[source["agent"]])
 
 
 def _draw_metres(
-    dataset: Dataset, source: SampleRecord, camera: RowArgument, color_by: Literal["depth", "height"], ax: Axes
+    dataset: Dataset,
+    source: SampleRecord,
+    camera: RowArgument,
+    seen: _Seen,
+    color_by: Literal["depth", "height"],
+    ax: Axes,
 ) -> None:
     """Points coloured by depth or height, and a colour bar."""
     cloud = dataset.load_point_cloud(source, "world")
-    points = hiding(dataset, camera)(project_to_image(dataset, cloud, source, camera, colors=False))
+    points = seen(project_to_image(dataset, cloud, source, camera, colors=False))
     values, limits, colormap = points.depth, _DEPTHS, DEPTH_COLORMAP
     if color_by == "height":
         ego_from_world = dataset.world_from(dataset.get("sample_data", camera)["sample_token"], "ego").inverse()

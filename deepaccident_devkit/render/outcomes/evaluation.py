@@ -14,7 +14,7 @@ from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.render.bev import BevView, draw_bev
 from deepaccident_devkit.render.boxes import camera_name, collider_ids, draw_boxes_from_above
 from deepaccident_devkit.render.camera import best_view
-from deepaccident_devkit.render.captions import draw_legend, is_there, set_scene_title
+from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.figures import Layer, figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.motion_maps import draw_edge, maps_of_labels
@@ -40,7 +40,7 @@ from deepaccident_devkit.render.outcomes.verdicts import (
     sample_verdict,
 )
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, in_own_settings
-from deepaccident_devkit.taxonomy import BEV_CAMERA, OWN_ACTOR_ID, short_name
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -128,9 +128,8 @@ def _draw_accident(
 ) -> None:
     """The camera that shows the pair best, and from above the road, the agents and the places."""
     middle, half = shown_square(verdict.compared, verdict.truth)
-    view = BevView(agents=None, view_range=half, center=middle)
-    road = {"bev"} if is_there(dataset, f"{verdict.sample}/{BEV_CAMERA}") else set()  # nobody asked for it
-    draw_bev(dataset, verdict.sample, view, shown - {"trajectories", "bev"} | (shown & road), right)
+    view = BevView(agents=None, view_range=half, center=middle, beside=True)
+    draw_bev(dataset, verdict.sample, view, shown - {"trajectories"}, right)
     draw_legend(right.figure, draw_accidents(verdict.compared, verdict.truth, shown & {"trajectories", "grid"}, right))
     camera = best_camera(dataset, verdict)
     draw_accidents_in_camera(dataset, verdict, camera, left, image="image" in shown)

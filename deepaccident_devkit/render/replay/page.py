@@ -15,7 +15,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
 from deepaccident_devkit.render.boxes import camera_name
-from deepaccident_devkit.render.captions import has_cloud, scenario_words
+from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.render.replay.entries import (
     Foreseen,
     Recording,
@@ -52,7 +52,7 @@ from deepaccident_devkit.render.styles import (
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.pages import document, part, source_hash
 from deepaccident_devkit.support.text import path_of
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, short_name
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
 from deepaccident_devkit.v2x import Agents
 from deepaccident_devkit.v2x.collisions import contact_words
 
@@ -166,10 +166,8 @@ def served_replay(
 
 def lidar_files(recording: Recording) -> list[list[bool]]:
     """For each agent and frame whether the LiDAR file is there."""
-    return [
-        [has_cloud(recording.dataset, recording.sample(agent, frame)) for frame in recording.frames]
-        for agent in recording.agents
-    ]
+    there = recording.dataset.sensor_frames(recording.scenario["token"])
+    return [[frame in there[agent, LIDAR] for frame in recording.frames] for agent in recording.agents]
 
 
 def _data(

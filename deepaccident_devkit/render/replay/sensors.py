@@ -183,8 +183,12 @@ _Images = dict[tuple[str, str], list[_Image | None]]
 
 def camera_files(recording: Recording) -> CameraFiles:
     """The image files of all cameras of the agents."""
+    there = recording.dataset.sensor_frames(recording.scenario["token"])
     return {
-        (agent, channel): [path if path.exists() else None for path in _paths(recording, agent, channel)]
+        (agent, channel): [
+            path if frame in there[agent, channel] else None
+            for frame, path in zip(recording.frames, _paths(recording, agent, channel), strict=True)
+        ]
         for agent in recording.agents
         for channel in CAMERAS
     }
