@@ -323,7 +323,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
             choices["style"] = looks[-1]
         places = [cast(StyleName, word) for word in styles if word not in picture.styles]
         # what else a view colours by is its own choice
-        boxes_by = choices.pop("color_by") if choices.get("color_by") == "class" else "role"
+        boxes_by: Any = choices.pop("color_by") if choices.get("color_by") == "class" else "role"
         with style(places[-1] if places else None, title=not no_title, color_by=boxes_by):
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
                 drawn = picture.drawn(dataset, row, size, dpi or current_style().dpi, choices)
