@@ -217,6 +217,14 @@ def _checked_heads(heads: object, grid: BevGrid) -> tuple[MotionHeads, ...]:
     return tuple(given)
 
 
+def ascending_times(values: ArrayLike) -> FloatArray:
+    """(T,) seconds after the present of a predicted path, a copy; raises GeometryError if they are not ascending."""
+    times = checked("times", values, (None,)).copy()
+    if not (len(times) and np.isfinite(times).all() and times[0] >= 0 and (np.diff(times) > 0).all()):
+        raise GeometryError(f"times: expected ascending seconds after the present, found {times.tolist()}")
+    return times
+
+
 def _checked_ids(ids: object) -> tuple[int, int] | None:
     if ids is None:
         return None

@@ -20,7 +20,7 @@ from deepaccident_devkit.support.text import choice, meant_text, possible_text
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-TaskName = Literal["motion", "accident", "detection", "warning"]
+TaskName = Literal["motion", "accident", "detection", "warning", "planning", "forecasting"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +40,7 @@ class Task:
         summary: result → its numbers by name, as JSON holds them.
         whole_recordings: whether whole recordings are followed, so that attributes within them are of no use.
         needs_meta: whether the truth is in the scenarios' meta files.
+        vehicles_alone: whether the roadside has no such predictions.
     """
 
     name: TaskName
@@ -53,6 +54,7 @@ class Task:
     summary: Callable[[Any], dict[str, Any]]
     whole_recordings: bool = False
     needs_meta: bool = False
+    vehicles_alone: bool = False
 
 
 Kind = TypeVar("Kind")
@@ -263,7 +265,7 @@ def headlines(task: str, result: object) -> tuple[Headline, ...]:
     """The headline numbers of a result, the most important first.
 
     Args:
-        task: `motion`, `accident`, `detection` or `warning`.
+        task: of `TaskName`.
         result: of that task's evaluator.
 
     Returns:

@@ -20,8 +20,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.errors import ResultsError, TokenError, shortened
+from deepaccident_devkit.errors import GeometryError, ResultsError, TokenError, shortened
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
+from deepaccident_devkit.evaluation.planning.scene import Plan
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results.motion import MotionContents, MotionForm
 from deepaccident_devkit.evaluation.results.records import (
@@ -30,7 +32,9 @@ from deepaccident_devkit.evaluation.results.records import (
     AccidentEntry,
     BoxEntry,
     ContentError,
+    ForecastEntry,
     MotionFile,
+    PlanEntry,
     ResultsTask,
     at,
     check_token,
@@ -49,7 +53,7 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.parallel import Engine
 
-Prediction = MotionOutput | list[Accident] | DetectedBoxes
+Prediction = MotionOutput | list[Accident] | DetectedBoxes | list[Plan] | list[Forecast]
 Columns = dict[str, AnyArray]
 _UNIT_TOLERANCE: Final = 1e-3
 """How far from 1 a quaternion's norm may be; `Boxes` brings it there."""
@@ -109,8 +113,8 @@ class Results:
         """The prediction of a sample.
 
         Returns:
-            For motion a MotionOutput; of accidents a list, empty if none is foreseen; of detection the boxes, in the
-            world frame.
+            For motion a MotionOutput; of accidents, plans and forecasts a list, empty if there is none; of detection
+            the boxes, in the world frame.
 
         Raises:
             TokenError: the sample is not here.
@@ -364,8 +368,49 @@ def _floats(values: Sequence[Iterable[float]], *shape: int) -> FloatArray:
     return flat.reshape(len(values), *shape)
 
 
+def plan_columns(results: Mapping[str, Sequence[PlanEntry]]) -> Columns:
+    """(N,) plans; raises ContentError for one whose lists do not go together."""
+    return _objects(results, lambda each: Plan(times=each.times, path=each.path, score=each.score, yaw=each.yaw or None))
+
+
+def forecast_columns(results: Mapping[str, Sequence[ForecastEntry]]) -> Columns:
+    """(N,) forecasts; raises ContentError for one whose lists do not go together, or an actor that comes twice."""
+    for token, given in results.items():
+        again = [number for number, each in enumerate(given) if each.id in {other.id for other in given[:number]}]
+        if again:
+            raise ContentError(f"{entry_place(token, again[0])}.id: actor {given[again[0]].id} comes twice")
+    return _objects(
+        results,
+        lambda each: Forecast(
+            actor_id=each.id, times=each.times, paths=each.paths, probabilities=each.probabilities
+        ),
+    )
+
+
+def _objects(results: Mapping[str, Sequence[Any]], made: Callable[[Any], Any]) -> Columns:
+    objects = []
+    for token, given in results.items():
+        for number, each in enumerate(given):
+            try:
+                objects.append(made(each))
+            except GeometryError as error:
+                raise ContentError(f"{entry_place(token, number)}: {error}") from error
+    column = np.empty(len(objects), dtype=object)
+    column[:] = objects
+    return {_OBJECT: column}
+
+
+def objects_at(entries: Entries, token: str) -> list[Any]:
+    """The plans or forecasts of a sample; KeyError for one that is not here."""
+    found: list[Any] = entries.of(token)[_OBJECT].tolist()
+    return found
+
+
+_OBJECT: Final = "object"
 ENTRIES: Final[Mapping[str, tuple[Callable[..., Columns], Callable[[Entries, str], Any]]]] = {
     "accident": (accident_columns, accidents_at),
     "detection": (detection_columns, boxes_at),
+    "planning": (plan_columns, objects_at),
+    "forecasting": (forecast_columns, objects_at),
 }
 """Task → what makes the columns of its records by token, and of the columns a sample's prediction."""

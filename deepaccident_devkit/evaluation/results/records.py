@@ -24,7 +24,7 @@ from deepaccident_devkit.support import json_text
 from deepaccident_devkit.support.reading import fault_text
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-ResultsTask = Literal["motion", "accident", "detection"]
+ResultsTask = Literal["motion", "accident", "detection", "planning", "forecasting"]
 Stored = Literal["instances", "heads"]
 Format = Literal["DeepAccident results"]
 Version = Literal[1]
@@ -32,7 +32,7 @@ Version = Literal[1]
 FORMAT: Final = get_args(Format)[0]
 FORMAT_VERSION: Final = get_args(Version)[0]
 RESULTS_NAMES: Final[Mapping[ResultsTask, str]] = MappingProxyType(
-    {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}
+    {name: name if name == "motion" else f"{name}.json" for name in get_args(ResultsTask)}
 )
 """Task → the name of its file, of motion a folder, where results of all tasks are written into one folder."""
 RESULTS_FILE: Final = "results.json"
@@ -103,7 +103,52 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     num_pts: Ignored = UNSET
 
 
-ENTRY_RECORDS: Final[Mapping[str, type[msgspec.Struct]]] = {"accident": AccidentEntry, "detection": BoxEntry}
+Place = tuple[Measure, Measure]
+Times = Annotated[list[FromZero], Meta(min_length=1, description="Seconds after the present, ascending.")]
+
+
+class PlanEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
+    """A path that the sample's agent plans to drive."""
+
+    times: Times
+    path: Annotated[
+        list[Place],
+        Meta(
+            min_length=1,
+            description="Where its ego frame is at these times: x forward, y left, metres, in the present ego frame.",
+        ),
+    ]
+    score: Annotated[float, Meta(description="How good the plan is; the one with the highest is evaluated.")]
+    yaw: Annotated[
+        list[Measure] | UnsetType | None,
+        Meta(description="Its headings at these times, radians, counter-clockwise; null for those of the steps."),
+    ] = UNSET
+
+
+class ForecastEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
+    """How an actor may go on."""
+
+    id: Annotated[ActorId, Meta(description="Its actor id.")]
+    times: Times
+    paths: Annotated[
+        list[list[Place]],
+        Meta(
+            min_length=1,
+            description="Of each mode where its box's centre is at these times: x forward, y left, metres, in the "
+            "present ego frame of the sample's agent.",
+        ),
+    ]
+    probabilities: Annotated[
+        list[Annotated[float, Meta(ge=0, le=1)]], Meta(min_length=1, description="Of the modes; not normalised.")
+    ]
+
+
+ENTRY_RECORDS: Final[Mapping[str, type[msgspec.Struct]]] = {
+    "accident": AccidentEntry,
+    "detection": BoxEntry,
+    "planning": PlanEntry,
+    "forecasting": ForecastEntry,
+}
 """Task → record of an entry."""
 
 
@@ -168,6 +213,18 @@ class DetectionFile(_File, tag="detection"):
     results: Annotated[dict[Token, list[BoxEntry]], _BY_TOKEN]
 
 
+class PlanningFile(_File, tag="planning"):
+    """Planned paths of many samples."""
+
+    results: Annotated[dict[Token, list[PlanEntry]], _BY_TOKEN]
+
+
+class ForecastingFile(_File, tag="forecasting"):
+    """Actors' paths of many samples."""
+
+    results: Annotated[dict[Token, list[ForecastEntry]], _BY_TOKEN]
+
+
 class MotionFile(_File, tag="motion"):
     """The manifest of motion maps."""
 
@@ -175,7 +232,7 @@ class MotionFile(_File, tag="motion"):
     shards: Annotated[list[Shard], Meta(min_length=1)]
 
 
-ResultsFile: TypeAlias = MotionFile | AccidentFile | DetectionFile
+ResultsFile: TypeAlias = MotionFile | AccidentFile | DetectionFile | PlanningFile | ForecastingFile
 
 
 def _schema(kind: type[_File]) -> dict[str, Any]:
@@ -331,7 +388,7 @@ def _strict_meta(content: bytes, document: ResultsFile) -> object:
     if not isinstance(document, MotionFile):
         record = ENTRY_RECORDS[document.task]
         entries = list(chain.from_iterable(document.results.values()))
-        optional = record.__struct_fields__[-len(record.__struct_defaults__) :]
+        optional = record.__struct_fields__[len(record.__struct_fields__) - len(record.__struct_defaults__) :]
         kinds = Counter(chain.from_iterable(map(type, map(attrgetter(name), entries)) for name in optional))
         ignored = [getattr(each, name) for each in entries for name in optional] if kinds[msgspec.Raw] else []
         unread = b"[%s]" % b",".join([document.meta, *(each for each in ignored if isinstance(each, msgspec.Raw))])

@@ -19,6 +19,8 @@ import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError, ResultsError, shortened
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
+from deepaccident_devkit.evaluation.planning.scene import Plan
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, checked_prediction
 from deepaccident_devkit.evaluation.results.motion import HEADS, MEMBER, MotionForm
 from deepaccident_devkit.evaluation.results.reader import Results, contents_of, read_results
@@ -30,6 +32,7 @@ from deepaccident_devkit.evaluation.results.records import (
     RESULTS_FILE,
     ContentError,
     ResultsTask,
+    Kind,
     Shard,
     Stored,
     check_token,
@@ -77,7 +80,7 @@ class ResultsWriter:
 
         Args:
             path: a file that is not there yet; for motion a folder that is not there, or empty.
-            task: `motion`, `accident` or `detection`.
+            task: of `RESULTS_NAMES`.
             meta: what readers should know: method, training, author; as JSON holds it.
             grid: of motion, that of all predictions; None takes the first one's.
             step: of motion, seconds between two frames.
@@ -136,13 +139,18 @@ class ResultsWriter:
                 raise ResultsError("a prediction could not be written, so that none is kept; write all of them again")
             body.finish()
 
-    def add(self, token: str, prediction: MotionOutput | Iterable[Accident] | DetectedBoxes) -> None:
+    def add(
+        self,
+        token: str,
+        prediction: MotionOutput | Iterable[Accident] | DetectedBoxes | Iterable[Plan] | Iterable[Forecast],
+    ) -> None:
         """Write the prediction of a sample.
 
         Args:
             token: of the sample; each one once.
             prediction: of motion a MotionOutput, all of one grid and number of frames; of accidents those that are
-                foreseen, [] for none; of detection the boxes, in the world frame.
+                foreseen, [] for none; of detection the boxes, in the world frame; of planning one or more Plans; of
+                forecasting the Forecasts, one an actor.
 
         Raises:
             ResultsError: the prediction is of another kind, grid or frame, the sample was added before, or nothing can
@@ -309,9 +317,41 @@ def detection_entries(token: str, detected: DetectedBoxes) -> list[dict[str, Any
     ]
 
 
+def _plans(token: str, prediction: object) -> list[dict[str, Any]]:
+    del token
+    return [
+        {"times": each.times.tolist(), "path": each.path.tolist(), "score": each.score}
+        | ({} if each.yaw is None else {"yaw": each.yaw.tolist()})
+        for each in _all_of(Plan, prediction)
+    ]
+
+
+def _forecasts(token: str, prediction: object) -> list[dict[str, Any]]:
+    del token
+    return [
+        {
+            "id": each.actor_id,
+            "times": each.times.tolist(),
+            "paths": each.paths.tolist(),
+            "probabilities": each.probabilities.tolist(),
+        }
+        for each in _all_of(Forecast, prediction)
+    ]
+
+
+def _all_of(kind: type[Kind], prediction: object) -> list[Kind]:
+    given = list(prediction) if isinstance(prediction, Iterable) else [prediction]
+    others = [each for each in given if not isinstance(each, kind)]
+    if others:
+        raise ResultsError(f"expected a list of {kind.__name__}s, found {type(others[0]).__name__} in it")
+    return given
+
+
 _ENTRIES: Final[Mapping[str, Callable[[str, object], list[dict[str, Any]]]]] = {
     "accident": _accidents,
     "detection": _boxes,
+    "planning": _plans,
+    "forecasting": _forecasts,
 }
 """Task → the entries of a sample as a file has them, of its token and prediction."""
 

@@ -22,7 +22,9 @@ from deepaccident_devkit.errors import (
 from deepaccident_devkit.evaluation.accident import ACCIDENT
 from deepaccident_devkit.evaluation.detection import DETECTION
 from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.forecasting import FORECASTING
 from deepaccident_devkit.evaluation.motion import MOTION
+from deepaccident_devkit.evaluation.planning import PLANNING
 from deepaccident_devkit.evaluation.predictions import compared_labels
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.task import FrozenDict, Task, TaskName, switched
@@ -34,7 +36,7 @@ from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in
 from deepaccident_devkit.support.text import choice, path_of, settle_choices, spelled
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLITS
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLITS, VEHICLE_AGENTS
 
 __all__ = ["TASKS", "TASK_PROTOCOLS", "TASK_RESULTS", "EvaluationSetup", "SampleLoader", "TaskName"]
 
@@ -255,7 +257,7 @@ def _named(tokens: Sequence[str], what: str) -> str:
 
 
 TASKS: Final[Mapping[str, Task]] = MappingProxyType(
-    {task.name: task for task in (MOTION, ACCIDENT, DETECTION, WARNING)}
+    {task.name: task for task in (MOTION, ACCIDENT, DETECTION, WARNING, PLANNING, FORECASTING)}
 )
 """All tasks by name; a new one has a line here, and its name in `TaskName`."""
 TASK_PROTOCOLS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
@@ -275,7 +277,7 @@ class EvaluationSetup:
     """What is evaluated, and by which rules; two of equal ones give comparable numbers.
 
     Attributes:
-        task: `motion`, `accident`, `detection` or `warning`.
+        task: of `TaskName`.
         protocol: the name of one of the task's (`TASK_PROTOCOLS`).
         switches: choices of the protocol that are changed, by name (`task.switch_names`).
         horizon: seconds that the predictions look ahead; detection has none.
@@ -330,13 +332,15 @@ def default_selection(
     Args:
         setup: its task and horizon.
         split: `train`, `val`, … or the path of a split file.
-        samples: None for `all` of the task `warning`, which follows whole recordings, and else `evaluate`.
+        samples: None for `all` of tasks that follow whole recordings, and else `evaluate`.
         scope: None for `all` where all samples are evaluated, and else `accident`.
-        agents: whose; None for all.
+        agents: whose; None for all that the task is for.
 
     Raises:
         ChoiceError: no such list, scope or agent.
     """
+    if agents is None and TASKS[setup.task].vehicles_alone:
+        agents = VEHICLE_AGENTS
     listed: SampleList = samples or ("all" if TASKS[setup.task].whole_recordings else "evaluate")
     return SampleSelection(
         split=os.fspath(split),
