@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
@@ -24,7 +24,7 @@ class Column(NamedTuple):
     Attributes:
         unit: of its numbers.
         better: which numbers are better.
-        is_headline: whether its numbers in the first row of each table are headlines.
+        is_headline: whether its numbers in the main row of the main tables are headlines.
     """
 
     unit: Unit
@@ -39,23 +39,25 @@ class MeansResult(TaskResult):
     Attributes:
         samples: that were counted.
         means: table → row → column → mean; NaN where there is nothing to count.
-        counts: table → row → column → of how many.
+        counted: table → row → column → of how many.
         notes: sentences on what was left out.
     """
 
     columns: ClassVar[Mapping[str, Column]] = {}
-    main_row: ClassVar[str]
+    main_tables: ClassVar[Sequence[str]] = ()
+    main_row: ClassVar[str] = ""
 
     samples: int
     means: Numbers
-    counts: Whole
+    counted: Whole
     notes: tuple[str, ...]
 
     def __init_subclass__(cls) -> None:
         """Make headlines of the columns, and the units of all numbers known."""
         cls.rows = tuple(
-            Row(f"means/*/{cls.main_row}/{name}", f"{name} *", each.unit, each.better)
+            Row(f"means/{table}/{cls.main_row}/{name}", f"{name} {table}", each.unit, each.better)
             for name, each in cls.columns.items()
+            for table in cls.main_tables
             if each.is_headline
         )
         super(MeansResult, cls).__init_subclass__()
@@ -108,14 +110,12 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
             ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
-        first = next(iter(self.protocols.values()))
-        self.protocol = protocol_of(protocol, type(first), self.protocols) if protocol else first
+        kinds: Any = tuple({type(each) for each in self.protocols.values()})
+        self.protocol = protocol_of(protocol or next(iter(self.protocols)), kinds, self.protocols)
 
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices."""
-        from dataclasses import asdict
-
         return asdict(self.protocol)
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
@@ -133,7 +133,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
             means.setdefault(table, {}).setdefault(row, {})[column] = ratio(value, count)
             numbers.setdefault(table, {}).setdefault(row, {})[column] = count
         notes = tuple(text.format(f"{count:,}") for text, count in sorted(pooled[NOTES].items()))
-        return self.result_class(samples=pooled[SAMPLES], means=means, counts=numbers, notes=notes)
+        return self.result_class(samples=pooled[SAMPLES], means=means, counted=numbers, notes=notes)
 
     def _place(self, path: str) -> tuple[Any, ...]:
         """Where a number comes: by the given order, and columns by that of the result's."""
