@@ -27,7 +27,7 @@ _FAR: Final = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleanPlanning:
-    """What is counted; planning.md, sections 3 and 4 (docs/protocols.md, Planning).
+    """What is counted; docs/protocols.md, Planning, defines it.
 
     Attributes:
         leads: seconds before the accident at which plans are judged.
@@ -98,7 +98,7 @@ def box_path(poses: FloatArray, offset: FloatArray) -> FloatArray:
 
 
 def margin_of(scene: PlanningScene) -> float:
-    """The gap between the recorded pair at the end, which counts as contact (safety.md, 2.2); NaN without a partner."""
+    """The gap between the recorded pair at the end, which counts as contact; NaN without a partner."""
     partner = np.flatnonzero(scene.actor_id == scene.partner)
     if not len(partner):
         return np.nan

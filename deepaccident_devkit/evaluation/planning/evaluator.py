@@ -33,6 +33,11 @@ PLANNING_PROTOCOLS: Final[Mapping[str, Protocol]] = MappingProxyType({"clean": C
 GIVEN: Final = "given"
 TRIVIAL: Final = ("recorded", "standing", "constant velocity", "full braking")
 _MEAN: Final = "mean"
+_LEFT_OUT: Final = (
+    "by these rules a plan that repeats the recorded accident has 0 % collisions: steps at which the recorded path "
+    "touches, or is not recorded, are left out; left_out is their share"
+)
+_FAR_OFF: Final = "point_collision looks 25 m beside the path, as the code does; ignore it"
 _BY_HORIZON: Final = tuple(f"{horizon} s" for horizon in HORIZONS)
 _BY_LEAD: Final = tuple(f"lead {lead:g} s" for lead in CleanPlanning().leads)
 
@@ -139,6 +144,9 @@ def _add_clean(sums: Sums, rows: Mapping[str, Plan], scene: PlanningScene, rules
 
 
 def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: PlanningScene, rules: CellRules) -> None:
+    sums.note(_LEFT_OUT)
+    if rules.point_far_off:
+        sums.note(_FAR_OFF)
     times = np.arange(1, STEPS + 1) * STEP
     if rows[GIVEN].times[-1] < times[-1] - FRAME_PERIOD / 2:
         raise EvaluationError(
@@ -148,8 +156,12 @@ def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: Planning
     frames = np.rint(times / FRAME_PERIOD).astype(np.int64)
     valid = frames < len(scene.recorded)
     drawn = _drawn(scene, rules)
-    footprints = [scene.footprint[frame, drawn] if there else np.zeros((0, 5)) for frame, there in zip(frames, valid, strict=True)]
-    corners = [corner_offsets(each) + each[:, None, :2] for each in (each[np.isfinite(each[:, 0])] for each in footprints)]
+    footprints = [
+        scene.footprint[frame, drawn] if there else np.zeros((0, 5)) for frame, there in zip(frames, valid, strict=True)
+    ]
+    corners = [
+        corner_offsets(each) + each[:, None, :2] for each in (each[np.isfinite(each[:, 0])] for each in footprints)
+    ]
     cells = np.stack([occupied(each, rules) for each in corners])
     paths = {name: plan.poses(times)[:, :2] for name, plan in rows.items()}
     ego = float(scene.size[0]), float(scene.size[1])

@@ -52,14 +52,19 @@ class Plan(FrozenArrays):
         yaw = None if self.yaw is None else checked("yaw", self.yaw, (len(times),)).copy()
         if not np.isfinite(path).all() or (yaw is not None and not np.isfinite(yaw).all()):
             raise GeometryError("path: not all numbers are finite; leave out what is not planned")
-        for name, value in {"times": times, "path": path, "yaw": yaw, "score": checked_number("score", self.score)}.items():
+        for name, value in {
+            "times": times,
+            "path": path,
+            "yaw": yaw,
+            "score": checked_number("score", self.score),
+        }.items():
             object.__setattr__(self, name, value)
         FrozenArrays.__post_init__(self)
 
     def poses(self, times: FloatArray) -> FloatArray:
         """(N, 3) x, y, yaw at times (N,): linear from the present on, straight on after the last stated one.
 
-        Without yaw, it is the direction of the step, kept where that is shorter than 0.1 m (planning.md, section 3).
+        Without yaw, it is the direction of the step, kept where that is shorter than 0.1 m (docs/protocols.md, Planning).
         """
         moments, path = self.times, self.path
         if moments[0] > 0:
@@ -167,7 +172,9 @@ def planning_scene(dataset: Dataset, sample: RowArgument) -> PlanningScene:
     moved = tracks.boxes.select(rows).transform(dataset.world_from(token, "ego").inverse(), "ego")
     actors, first, which = np.unique(moved.actor_id, return_index=True, return_inverse=True)
     footprint = np.full((last - present + 1, len(actors), 5), np.nan)
-    footprint[tracks.index[rows] - present, which] = np.column_stack([moved.center[:, :2], moved.size[:, :2], moved.yaw])
+    footprint[tracks.index[rows] - present, which] = np.column_stack(
+        [moved.center[:, :2], moved.size[:, :2], moved.yaw]
+    )
     is_collider = accident is not None and agent["name"] in accident.agents
     ids = accident.actor_ids if accident is not None and kind == "accident" else ()
     end = np.nan if accident is None else (accident.last_frame - present) * FRAME_PERIOD
