@@ -370,7 +370,9 @@ def _floats(values: Sequence[Iterable[float]], *shape: int) -> FloatArray:
 
 def plan_columns(results: Mapping[str, Sequence[PlanEntry]]) -> Columns:
     """(N,) plans; raises ContentError for one whose lists do not go together."""
-    return _objects(results, lambda each: Plan(times=each.times, path=each.path, score=each.score, yaw=each.yaw or None))
+    return _objects(
+        results, lambda each: Plan(times=each.times, path=each.path, score=each.score, yaw=each.yaw or None)
+    )
 
 
 def forecast_columns(results: Mapping[str, Sequence[ForecastEntry]]) -> Columns:
@@ -381,9 +383,7 @@ def forecast_columns(results: Mapping[str, Sequence[ForecastEntry]]) -> Columns:
             raise ContentError(f"{entry_place(token, again[0])}.id: actor {given[again[0]].id} comes twice")
     return _objects(
         results,
-        lambda each: Forecast(
-            actor_id=each.id, times=each.times, paths=each.paths, probabilities=each.probabilities
-        ),
+        lambda each: Forecast(actor_id=each.id, times=each.times, paths=each.paths, probabilities=each.probabilities),
     )
 
 
@@ -393,7 +393,7 @@ def _objects(results: Mapping[str, Sequence[Any]], made: Callable[[Any], Any]) -
         for number, each in enumerate(given):
             try:
                 objects.append(made(each))
-            except GeometryError as error:
+            except GeometryError as error:  # noqa: PERF203 - which entry it is
                 raise ContentError(f"{entry_place(token, number)}: {error}") from error
     column = np.empty(len(objects), dtype=object)
     column[:] = objects
