@@ -1,4 +1,4 @@
-"""`MeansEvaluator`: tasks whose numbers are means, in tables: what each sample adds to their sums is all that is kept."""
+"""`MeansEvaluator`: tasks whose numbers are means, in tables; only what each sample adds to their sums is kept."""
 
 from __future__ import annotations
 

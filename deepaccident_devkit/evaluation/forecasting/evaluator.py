@@ -33,7 +33,7 @@ from deepaccident_devkit.evaluation.forecasting.truth import (
 )
 from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, Column, MeansEvaluator, MeansResult, Sums
 from deepaccident_devkit.evaluation.task import Task
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, check_least
+from deepaccident_devkit.support.arrays import FloatArray, check_least
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 TOGETHER: Final = "together"
@@ -175,7 +175,7 @@ def _together(
 
     Counted are actors with a whole future and a forecast of it, and the modes that all of these have.
     """
-    whole: BoolArray = np.isfinite(paths).all(axis=(2, 3))
+    whole = np.asarray(np.isfinite(paths).all(axis=(2, 3)))
     actors = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)) & whole.any(axis=1))
     modes = np.flatnonzero(whole[actors].all(axis=0))
     if not len(actors) or not len(modes):
