@@ -1,7 +1,7 @@
 """Predictions without a model.
 
-What a set of agents sees by the labels goes on at a constant velocity or turn rate (`outlook`); `predict` makes motion
-maps, accidents (`collisions`) and detections of that, and `predict_results` files of them.
+What a set of agents sees by the labels goes on at a constant velocity or turn rate, or stands (`outlook`); `predict`
+makes motion maps, accidents (`collisions`), detections and paths of that, and `predict_results` files of them.
 """
 
 from deepaccident_devkit.baselines.outlook import (
@@ -13,7 +13,13 @@ from deepaccident_devkit.baselines.outlook import (
     outlook,
     turn_rates,
 )
-from deepaccident_devkit.baselines.predict import predict_accidents, predict_detections, predict_motion
+from deepaccident_devkit.baselines.predict import (
+    predict_accidents,
+    predict_detections,
+    predict_forecasts,
+    predict_motion,
+    predict_plan,
+)
 from deepaccident_devkit.baselines.predict_results import Baseline, predict_results
 from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
@@ -28,7 +34,9 @@ __all__ = [
     "outlook",
     "predict_accidents",
     "predict_detections",
+    "predict_forecasts",
     "predict_motion",
+    "predict_plan",
     "predict_results",
     "seen_actors",
     "turn_rates",

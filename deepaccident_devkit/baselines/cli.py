@@ -1,7 +1,7 @@
 """`deepaccident predict`: results files of a trained model, or of a baseline that needs none."""
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 
@@ -17,16 +17,19 @@ from deepaccident_devkit.cli.options import (
     release_parameters,
     seed_parameter,
     use_threads_sparingly,
+    words_of,
 )
 from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
+from deepaccident_devkit.evaluation.results import RESULTS_NAMES
+from deepaccident_devkit.evaluation.runs.setups import agent_of
 from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.parallel import workers_kept
 from deepaccident_devkit.rooms import need_room
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 from deepaccident_devkit.v2x import Link
 
 _ALONE = "single"
@@ -34,9 +37,12 @@ _SHIPPED = "tiny"
 _LINK = ("latency", "pose_noise", "packet_loss", "seed")
 """Their names as parameters of a verb."""
 _RELEASED_HORIZON = Baseline().horizon
+_USUAL = ("motion", "accident", "detection")
+"""Tasks of which results are written if none is named: those of trained models."""
 _EXAMPLES = """\b
 Examples:
   deepaccident predict constant_velocity DATAROOT --agents all --out baseline
+  deepaccident predict standing DATAROOT --task planning,forecasting --samples all --out paths
   deepaccident predict runs/all DATAROOT --split val --out results
   deepaccident predict runs/all DATAROOT --agents single --out results_single
   deepaccident evaluate motion DATAROOT --results results/motion --switch labels=clean"""
@@ -51,16 +57,16 @@ Examples:
     "--task",
     "tasks",
     multiple=True,
-    type=WordChoice([*get_args(ResultsTask), "all"]),
-    default=("all",),
-    show_default=True,
-    help="Of a baseline: task to write results for; you can repeat this option.",
+    metavar="NAME[,NAME…]",
+    default=_USUAL,
+    help=f"Of a baseline: tasks to write results for: {', '.join(RESULTS_NAMES)}, or all.  "
+    f"[default: {','.join(_USUAL)}]",
 )
 @click.option(
     "--horizon",
     default=_RELEASED_HORIZON,
     show_default=True,
-    help="Of a baseline: how many seconds to predict, in steps of 0.5.",
+    help="Of a baseline: how many seconds to predict, in steps of 0.5; planning and forecasting predict at least 3.",
 )
 @link_parameters()
 @field_option(Link, "packet_loss")
@@ -86,8 +92,9 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
     """Predict a split of the release in DATAROOT.
 
     MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` for those that the devkit ships.
-    Or a baseline, which needs no training: `constant_velocity` or `constant_turn_rate` say how actors go on that some
-    agents see. The files motion/, accident.json and detection.json are what `deepaccident evaluate` takes.
+    Or a baseline, which needs no training: `constant_velocity`, `constant_turn_rate` or `standing` say how actors go on
+    that some agents see. The files motion/, accident.json, … are what `deepaccident evaluate` takes. The path that a
+    baseline plans for a vehicle is its own, if it goes on so.
     """
     if not Path(model).exists():  # before PyTorch is asked for
         model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, _SHIPPED))
@@ -107,18 +114,21 @@ def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, ou
         refuse_unused("with --agents single, which has no partners", *_LINK)
     if link is None or not (link.pose_noise or link.packet_loss):
         refuse_unused("without --pose-noise or --packet-loss", "seed")
+    words = [choice("--task", word, (*RESULTS_NAMES, "all")) for word in words_of(options["tasks"])]
+    asked = [task for task in RESULTS_NAMES if task in words or "all" in words]
     chosen = Baseline(agents=agents, model=model, link=link, horizon=options["horizon"])
     folder = writable_folder(out)
     released = chosen.horizon == _RELEASED_HORIZON and options["scope"] == "accident"
     engine = engine_of(options)
     dataset = DeepAccident(**release_of(options), **engine)
     tokens = _samples(dataset, purpose, "released" if released else "paper", chosen.horizon, options)
-    for task in get_args(ResultsTask):
-        if task in options["tasks"] or "all" in options["tasks"]:
-            path = folder / RESULTS_NAMES[task]
-            kept = is_predicted(dataset, task, tokens, path, chosen)
-            predict_results(dataset, task, tokens, path, chosen, **engine, progress=True)
-            click.echo(f"{task}: {len(tokens):,} samples in {path}{', which were there already' if kept else ''}")
+    for task in asked:
+        path, own = folder / RESULTS_NAMES[task], tokens
+        if task == "planning":
+            own = [token for token in tokens if agent_of(token) in VEHICLE_AGENTS]
+        kept = is_predicted(dataset, task, own, path, chosen)
+        predict_results(dataset, task, own, path, chosen, **engine, progress=True)
+        click.echo(f"{task}: {len(own):,} samples in {path}{', which were there already' if kept else ''}")
 
 
 def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, seed: int, **options: Any) -> None:

@@ -1,12 +1,12 @@
 """`Outlook`: where an agent and its partners expect the actors that they see now.
 
 Who is seen, and where, is by the labels (`v2x.cooperation`): an oracle. Actors go on at a constant velocity, or at a
-constant turn rate besides.
+constant turn rate besides, or all stand still from now on.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -19,7 +19,7 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Link
 from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
-MotionModel = Literal["constant_velocity", "constant_turn_rate"]
+MotionModel = Literal["constant_velocity", "constant_turn_rate", "standing"]
 MOTION_MODELS: Final[tuple[MotionModel, ...]] = get_args(MotionModel)
 HISTORY: Final = 5
 """Recorded frames that turn rates look back, at most: 0.5 s."""
@@ -130,7 +130,7 @@ def outlook(
         dataset: the release.
         sample: token or record: its agent is the ego, its frame the present.
         agents: who cooperates.
-        model: how actors go on; one that nobody saw before goes straight on by either model.
+        model: how actors go on; one that nobody saw before goes straight on at a constant turn rate, too.
         link: what happens to the partners' data; None for nothing.
 
     Raises:
@@ -139,6 +139,8 @@ def outlook(
     """
     model = choice("model", model, MOTION_MODELS)
     seen = seen_actors(dataset, sample, agents=agents, link=link)
+    if model == "standing":
+        seen = replace(seen, boxes=replace(seen.boxes, velocity=np.zeros_like(seen.boxes.velocity)))
     turns = model == "constant_turn_rate"
     rate = turn_rates(dataset, sample, agents=agents, link=link) if turns else np.zeros(len(seen.boxes))
     return Outlook(seen=seen, turn_rate=rate)

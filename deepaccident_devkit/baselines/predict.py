@@ -14,8 +14,10 @@ import numpy as np
 
 from deepaccident_devkit.baselines.outlook import MotionModel, Outlook, outlook
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
+from deepaccident_devkit.evaluation.forecasting import Forecast
+from deepaccident_devkit.evaluation.planning.scene import Plan
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, motion_labels_from_boxes
@@ -27,6 +29,10 @@ from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 DANGER_DISTANCE: Final = 0.25
 """Metres: actors that come nearer to each other collide. The evaluation's 1 m, which allows for cells, would be an
 alarm for every car that passes a cyclist."""
+PATH_HORIZON: Final = 3.0
+"""Seconds that paths go on, at least, as the metrics of plans and of forecasts need them."""
+PATH_STEP: Final = 0.5
+"""Seconds from one place of a path to the next."""
 _SITE: Final = 10.0
 """Metres within which two alarms are of one accident: the surer one is kept."""
 _MOVES: Final = 0.5
@@ -167,6 +173,70 @@ def predict_detections(
     points = seen.boxes.num_lidar_pts
     scores = (watchers + points / (points + _ENOUGH_POINTS)) / (len(AGENTS) + 1)
     return DetectedBoxes(boxes=seen.boxes, scores=np.where(seen.boxes.actor_id == OWN_ACTOR_ID, 0.0, scores))
+
+
+def predict_forecasts(
+    dataset: Dataset,
+    sample: RowArgument,
+    *,
+    agents: Agents = "single",
+    model: MotionModel = "constant_velocity",
+    link: Link | None = None,
+    horizon: float = PATH_HORIZON,
+) -> list[Forecast]:
+    """Where the actors go that some agents see, the ego itself left out: one mode of probability 1 each.
+
+    Args:
+        dataset: the release.
+        sample: as of `predict_motion`, and so are `agents`, `model` and `link`.
+        agents: who cooperates.
+        model: how actors go on.
+        link: what happens to the partners' data.
+        horizon: seconds to look ahead, in steps of 0.5.
+
+    Raises:
+        ConfigError: the horizon is no number of steps.
+        DeepAccidentError: as of `predict_motion`.
+    """
+    ahead = outlook(dataset, sample, agents=agents, model=model, link=link)
+    times = path_times(horizon)
+    places, boxes = ahead.poses(times)[..., :2], ahead.seen.boxes
+    return [
+        Forecast(actor_id=actor, times=times, paths=places[None, :, row], probabilities=np.ones(1))
+        for row, actor in enumerate(boxes.actor_id.tolist())
+        if actor != OWN_ACTOR_ID
+    ]
+
+
+def predict_plan(
+    dataset: Dataset,
+    sample: RowArgument,
+    *,
+    model: MotionModel = "constant_velocity",
+    horizon: float = PATH_HORIZON,
+) -> Plan:
+    """The ego's own path if it goes on as it does; arguments and errors as of `predict_forecasts`.
+
+    Raises:
+        NotAvailableError: the sample is of the infrastructure, which drives nowhere, or has no label.
+    """
+    ahead = outlook(dataset, sample, model=model)
+    if not ahead.seen.has_own:
+        token = dataset.get("sample", sample)["token"]
+        raise NotAvailableError(f"{token}: has no own vehicle to plan for; choose a sample of a vehicle")
+    times = path_times(horizon)
+    poses = _ego_poses(ahead.poses(np.append(0.0, times)), has_own=True)
+    present_from_ego = [poses[0].inverse() @ pose for pose in poses[1:]]
+    path = np.array([pose.translation[:2] for pose in present_from_ego])
+    return Plan(times=times, path=path, yaw=np.array([pose.yaw for pose in present_from_ego]))
+
+
+def path_times(horizon: float) -> FloatArray:
+    """(T,) seconds after the present up to a horizon, in steps of 0.5; raises ConfigError if it is no such number."""
+    steps = horizon / PATH_STEP
+    if not (1 <= steps < math.inf and abs(steps - round(steps)) < 1e-6):
+        raise ConfigError(f"horizon: {horizon!r} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
+    return np.arange(1, round(steps) + 1) * PATH_STEP
 
 
 def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = DANGER_DISTANCE) -> list[Accident]:

@@ -15,10 +15,20 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.baselines.outlook import MotionModel
-from deepaccident_devkit.baselines.predict import predict_accidents, predict_detections, predict_motion
+from deepaccident_devkit.baselines.predict import (
+    PATH_HORIZON,
+    path_times,
+    predict_accidents,
+    predict_detections,
+    predict_forecasts,
+    predict_motion,
+    predict_plan,
+)
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ConfigError, ResultsError
+from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
+from deepaccident_devkit.evaluation.forecasting import Forecast
+from deepaccident_devkit.evaluation.planning.scene import Plan
 from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
 from deepaccident_devkit.motion import MotionLabelConfig
@@ -33,7 +43,7 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.parallel import Engine
 
-Prediction = MotionOutput | list[Accident] | DetectedBoxes
+Prediction = MotionOutput | list[Accident] | DetectedBoxes | list[Plan] | list[Forecast]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +54,8 @@ class Baseline:
         agents: who cooperates, as of `v2x.cooperating_agents`.
         model: how actors go on.
         link: what happens to the partners' data; None for nothing.
-        horizon: seconds to look ahead, of motion and accidents; a multiple of 0.5.
+        horizon: seconds to look ahead, of motion and accidents; a multiple of 0.5. Plans and forecasts look at least
+            3 s ahead.
     """
 
     agents: Agents = "single"
@@ -59,11 +70,7 @@ class Baseline:
     @property
     def config(self) -> MotionLabelConfig:
         """The released labels, this far ahead; raises ConfigError."""
-        released = MotionLabelConfig()
-        frames = self.horizon / (released.step * FRAME_PERIOD)
-        if not (1 <= frames < float("inf") and abs(frames - round(frames)) < 1e-6):
-            raise ConfigError(f"horizon: {self.horizon!r} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
-        return MotionLabelConfig(future_frames=round(frames))
+        return MotionLabelConfig(future_frames=len(path_times(self.horizon)))
 
     def predict(self, dataset: Dataset, task: ResultsTask, token: str) -> Prediction:
         """Its prediction of a sample; raises DeepAccidentError as the functions of `predict`."""
@@ -72,7 +79,16 @@ class Baseline:
             return predict_motion(dataset, token, model=self.model, config=self.config, **seeing)
         if task == "accident":
             return predict_accidents(dataset, token, model=self.model, horizon=self.horizon, **seeing)
-        return predict_detections(dataset, token, **seeing)
+        if task == "detection":
+            return predict_detections(dataset, token, **seeing)
+        going: dict[str, Any] = {"model": self.model, "horizon": self.horizon_of(task)}
+        if task == "planning":
+            return [predict_plan(dataset, token, **going)]
+        return predict_forecasts(dataset, token, **going, **seeing)
+
+    def horizon_of(self, task: ResultsTask) -> float:
+        """Seconds that its predictions for a task look ahead."""
+        return max(self.horizon, PATH_HORIZON) if task in ("planning", "forecasting") else self.horizon
 
     def meta(self) -> dict[str, Any]:
         """Its notes in a results file, as JSON holds them."""
@@ -104,7 +120,7 @@ def predict_results(
 
     Args:
         dataset: the release.
-        task: `motion`, `accident` or `detection`.
+        task: of `RESULTS_NAMES`; of planning, samples of vehicles alone.
         tokens: of the samples.
         out: the file or folder to write.
         baseline: None for a single vehicle and constant velocity.
@@ -181,7 +197,8 @@ class _Work:
     @property
     def meta(self) -> dict[str, Any]:
         """The notes in its results."""
-        return {**self.baseline.meta(), "release": release_note(self.dataset, self.scenarios), "devkit": __version__}
+        horizon, release = self.baseline.horizon_of(self.task), release_note(self.dataset, self.scenarios)
+        return {**self.baseline.meta(), "horizon": horizon, "release": release, "devkit": __version__}
 
     def digest(self, scenarios: Mapping[str, tuple[str, ...]]) -> str:
         """Of all that decides the results of these samples."""

@@ -21,7 +21,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.parallel import Places, Store, run_batch
 from deepaccident_devkit.release.fingerprints import digest_of
-from deepaccident_devkit.support.arrays import IntArray
+from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
@@ -87,6 +87,18 @@ class Evaluator(ABC, Generic[Result]):
         for draw in times.tolist():
             taken = zip(pooled, draw, strict=True)
             yield self.result_of([each for part, often in taken for _ in range(often) for each in part])
+
+    def drawn_numbers(
+        self,
+        parts: Sequence[Sequence[Counts]],  # noqa: ARG002 - subclasses use them
+        times: IntArray,  # noqa: ARG002
+        names: Sequence[str],  # noqa: ARG002
+    ) -> FloatArray | None:
+        """(D, M) the numbers of these M paths in each draw of `resampled`, NaN for none, without its results.
+
+        None where a subclass has no faster way to them.
+        """
+        return None
 
     @abstractmethod
     def update(self, token: str, *arguments: Any) -> None:

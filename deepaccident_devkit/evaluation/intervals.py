@@ -158,6 +158,9 @@ def leaving_out(count: int) -> IntArray:
 def numbers_of_draws(evaluator: Evaluator[Any], parts: Clusters, times: IntArray, names: Iterable[str]) -> FloatArray:
     """(D, M) the numbers of these M names in each of D draws, as `Evaluator.resampled` makes them; NaN for none."""
     listed = list(names)
+    at_once = evaluator.drawn_numbers(parts, times, listed)
+    if at_once is not None:
+        return at_once
     drawn = (numbers_of(result) for result in evaluator.resampled(parts, times))
     rows = [[numbers.get(name, math.nan) for name in listed] for numbers in drawn]
     return np.array(rows).reshape(len(rows), len(listed))  # of no names, too

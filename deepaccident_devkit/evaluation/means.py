@@ -1,21 +1,31 @@
-"""`MeansEvaluator`: tasks whose numbers are means, in tables: what each sample adds to their sums is all that is kept."""
+"""`MeansEvaluator`: tasks whose numbers are means, in tables; only what each sample adds to their sums is kept."""
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 
+import numpy as np
+
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
 from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, Row, TaskResult, Unit, protocol_of
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import natural_order
 
 Numbers = Mapping[str, Mapping[str, Mapping[str, float]]]
 Whole = Mapping[str, Mapping[str, Mapping[str, int]]]
 SAMPLES: Final = "samples"
+SCENARIO: Final = "scenario"
+NAMES: Final = "names"
 SUMS: Final = "sums"
+COUNTS: Final = "counts"
 NOTES: Final = "notes"
+MEAN_OF_SCENARIOS: Final = "mean of scenarios"
+"""The row with the mean of the scenarios' own means of the main row, for evaluators that ask for it."""
+_PARTS: Final = 2.0**30
+"""Of 1: sums have no finer numbers."""
 
 
 class Column(NamedTuple):
@@ -68,7 +78,10 @@ Result = TypeVar("Result", bound=MeansResult)
 
 
 class Sums:
-    """What one sample adds: values by table, row and column."""
+    """What one sample adds: values by table, row and column.
+
+    Values are rounded to multiples of 2⁻³⁰ (1e-9), so that sums below 8 million are exact, in any order.
+    """
 
     def __init__(self) -> None:
         """Start with nothing."""
@@ -77,19 +90,28 @@ class Sums:
 
     def add(self, table: str, row: str, column: str, values: float | Iterable[float]) -> None:
         """Add one value, or several; NaN are not counted."""
-        given = [values] if isinstance(values, int | float) else values
-        there = [float(value) for value in given if not math.isnan(value)]
-        place = self._sums.setdefault(f"{table}/{row}/{column}", [0.0, 0])
-        place[0] += math.fsum(there)
-        place[1] += len(there)
+        given = np.array([values] if isinstance(values, int | float) else list(values), dtype=np.float64)
+        self.add_rows(table, {row: np.ones(len(given), dtype=bool)}, {column: given})
+
+    def add_rows(self, table: str, rows: Mapping[str, BoolArray], columns: Mapping[str, FloatArray]) -> None:
+        """Add values (N,) of columns to each row, of which its mask (N,) has them; NaN are not counted."""
+        values = np.stack([*columns.values()], axis=1)
+        there = np.isfinite(values)
+        masks = np.stack([*rows.values()]).astype(np.float64)
+        sums, counts = masks @ np.where(there, _rounded(values), 0.0), masks @ there
+        for row, *numbers in zip(rows, sums.tolist(), counts.tolist(), strict=True):
+            for column, value, count in zip(columns, *numbers, strict=True):
+                place = self._sums.setdefault(f"{table}/{row}/{column}", [0.0, 0])
+                place[0] += value
+                place[1] += int(count)
 
     def note(self, text: str, count: int = 1) -> None:
         """Say that something was left out, so many times; the text has {} for how many of all samples."""
         self._notes[text] = self._notes.get(text, 0) + count
 
-    def counts(self) -> Counts:
-        """As an evaluator keeps them."""
-        return {SUMS: self._sums, NOTES: self._notes}
+    def counts(self, scenario: str | None = None) -> Counts:
+        """As an evaluator keeps them; with a scenario's token, the row `MEAN_OF_SCENARIOS` has means of its means."""
+        return _counts(self._sums, self._notes) | ({} if scenario is None else {SCENARIO: scenario})
 
 
 class MeansEvaluator(Evaluator[Result], Generic[Result]):
@@ -118,20 +140,52 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
         """The protocol's choices."""
         return asdict(self.protocol)
 
+    def add(self, token: str, counts: Counts) -> None:
+        """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""
+        super().add(token, {**counts, NAMES: sys.intern(counts[NAMES])})
+
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """One set of counts: their sums."""
-        return [_pooled(counts)]
+        by_scenario: dict[str | None, list[Counts]] = {}
+        for each in counts:
+            by_scenario.setdefault(each.get(SCENARIO), []).append(each)
+        return [_pooled([self._of_scenario(name, _pooled(those)) for name, those in by_scenario.items()])]
+
+    def _of_scenario(self, name: str | None, counts: Counts) -> Counts:
+        """The sums of one scenario with its means."""
+        if name is None:  # sums of several, which have the means
+            return counts
+        sums, end = _by_path(counts), f"/{self.result_class.main_row}/"
+        means = {
+            path.replace(end, f"/{MEAN_OF_SCENARIOS}/"): [
+                float(_rounded(value / count)) if count else 0.0,
+                min(count, 1),
+            ]
+            for path, (value, count) in sums.items()
+            if end in path
+        }
+        return {**counts, **_counts(sums | means, counts[NOTES])}
+
+    def drawn_numbers(self, parts: Sequence[Sequence[Counts]], times: IntArray, names: Sequence[str]) -> FloatArray:
+        """The numbers of each draw (`Evaluator.drawn_numbers`): all sums are drawn at once."""
+        pooled = [_by_path(self.pooled(part)[0]) for part in parts]
+        paths = [name.removeprefix("means/") for name in names]
+        given = np.array([[each.get(path, _NOTHING) for path in paths] for each in pooled])
+        sums, counts = np.moveaxis(given.reshape(len(parts), len(paths), 2), -1, 0)
+        drawn = times @ counts
+        return np.where(drawn > 0, times @ sums / np.maximum(drawn, 1), np.nan)
 
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The means over some samples, in any order."""
-        pooled = _pooled(counts)
+        (pooled,) = self.pooled(counts)
+        sums = _by_path(pooled)
         means: dict[str, dict[str, dict[str, float]]] = {}
         numbers: dict[str, dict[str, dict[str, int]]] = {}
-        for path in sorted(pooled[SUMS], key=self._place):
+        for path in sorted(sums, key=self._place):
             table, row, column = path.split("/")
-            value, count = pooled[SUMS][path]
+            value, count = sums[path]
             means.setdefault(table, {}).setdefault(row, {})[column] = ratio(value, count)
-            numbers.setdefault(table, {}).setdefault(row, {})[column] = count
+            numbers.setdefault(table, {}).setdefault(row, {})[column] = int(count)
         notes = tuple(text.format(f"{count:,}") for text, count in sorted(pooled[NOTES].items()))
         return self.result_class(samples=pooled[SAMPLES], means=means, counted=numbers, notes=notes)
 
@@ -143,18 +197,37 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
         return *((at, natural_order(name)) for at, name in zip(known, names, strict=True)), columns.index(column)
 
 
-def _pooled(counts: Collection[Counts]) -> dict[str, Any]:
-    sums: dict[str, tuple[list[float], list[int]]] = {}
+_NOTHING: Final = (0.0, 0)
+_Paths = Mapping[str, Sequence[float]]
+"""`table/row/column` → sum, and of how many."""
+
+
+def _rounded(values: FloatArray | float) -> FloatArray:
+    return np.asarray(np.rint(np.multiply(values, _PARTS)) / _PARTS)
+
+
+def _counts(sums: _Paths, notes: Mapping[str, int]) -> dict[str, Any]:
+    values, numbers = zip(*sums.values(), strict=True) if sums else ((), ())
+    return {NAMES: "\n".join(sums), SUMS: [*values], COUNTS: [*numbers], NOTES: dict(notes)}
+
+
+def _by_path(counts: Counts) -> dict[str, Sequence[float]]:
+    names = counts[NAMES].split("\n") if counts[NAMES] else []
+    return dict(zip(names, zip(counts[SUMS], counts[COUNTS], strict=True), strict=True))
+
+
+def _pooled(counts: Collection[Counts]) -> Counts:
+    alike: dict[str, list[Counts]] = {}
+    sums: dict[str, list[float]] = {}
     notes: dict[str, int] = {}
     for each in counts:
-        for path, (value, count) in each[SUMS].items():
-            values, numbers = sums.setdefault(path, ([], []))
-            values.append(value)
-            numbers.append(count)
+        alike.setdefault(each[NAMES], []).append(each)
         for text, count in each[NOTES].items():
             notes[text] = notes.get(text, 0) + count
-    return {
-        SAMPLES: sum(each.get(SAMPLES, 1) for each in counts),
-        SUMS: {path: [math.fsum(values), sum(numbers)] for path, (values, numbers) in sums.items()},
-        NOTES: notes,
-    }
+    for those in alike.values():  # few, of many samples
+        totals = [np.sum([each[part] for each in those], axis=0).tolist() for part in (SUMS, COUNTS)]
+        for path, value, count in zip(_by_path(those[0]), *totals, strict=True):
+            place = sums.setdefault(path, [0.0, 0])
+            place[0] += value
+            place[1] += count
+    return {SAMPLES: sum(each.get(SAMPLES, 1) for each in counts), **_counts(sums, notes)}

@@ -1,14 +1,25 @@
-"""`Forecast`: how an actor may go on; and how far such paths are from the recorded one."""
+"""`Forecast`: how an actor may go on; and how far such paths are from the recorded one.
+
+The errors by mode, and those of all actors together (`world_errors`), are the package av2's, which picks no mode. Which
+one counts is as argoverse-api's `eval_forecasting.py` says: that with the least error at the end.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.evaluation.instances import distances
 from deepaccident_devkit.evaluation.predictions import ascending_times
-from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, checked, checked_whole
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, checked, checked_whole
+
+MISS_DISTANCE: Final = 2.0
+"""Metres; a larger error at the end is a miss."""
+COLLISION_DISTANCE: Final = 1.0
+"""Metres; centres that come nearer to each other collide."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,3 +52,113 @@ class Forecast(FrozenArrays):
         object.__setattr__(self, "paths", paths)
         object.__setattr__(self, "probabilities", probabilities)
         FrozenArrays.__post_init__(self)
+
+    def at(self, steps: FloatArray, present: FloatArray) -> FloatArray:
+        """(K, S, 2) where it is at S seconds after the present, linear between its times; NaN after the last of them.
+
+        Before the first of its times it goes straight on from where the actor is at the present, (2,).
+        """
+        times, paths = self.times, self.paths
+        if times[0] > 0:
+            start = np.broadcast_to(present, (len(paths), 1, 2))
+            times, paths = np.append(0.0, times), np.concatenate([start, paths], axis=1)
+        if len(times) == 1:
+            return np.full((len(paths), len(steps), 2), np.nan)
+        after = times.searchsorted(steps - _SLACK).clip(1, len(times) - 1)
+        share = ((steps - times[after - 1]) / (times[after] - times[after - 1]))[:, None]
+        found = paths[:, after - 1] * (1 - share) + paths[:, after] * share
+        return np.where((steps <= times[-1] + _SLACK)[:, None], found, np.nan)
+
+
+def mode_errors(paths: FloatArray, truth: FloatArray, valid: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """How far each mode is from the recorded path.
+
+    Args:
+        paths: (N, K, T, 2) of N actors, metres; NaN where there is none.
+        truth: (N, T, 2) of the same moments.
+        valid: (N, T) whether the truth is recorded; it is not read elsewhere.
+
+    Returns:
+        (N, K) the mean distance over the valid steps (ADE), and (N, K) the distance at the last step (FDE); NaN where
+        there is no such step, or no path.
+    """
+    apart = np.where(valid[:, None], distances(paths, truth[:, None]), 0.0)
+    steps = valid.sum(axis=1)[:, None]
+    ade = np.where(steps > 0, apart.sum(axis=-1) / np.maximum(steps, 1), np.nan)
+    return ade, np.where(valid[:, -1:], apart[..., -1], np.nan)
+
+
+def brier(errors: FloatArray, probabilities: FloatArray) -> FloatArray:
+    """Errors in metres, to which (1 − probability)² is added."""
+    return errors + (1 - probabilities) ** 2
+
+
+def actor_errors(
+    paths: FloatArray,
+    truth: FloatArray,
+    valid: BoolArray,
+    probabilities: FloatArray,
+    most: int,
+    miss_distance: float = MISS_DISTANCE,
+) -> dict[str, FloatArray]:
+    """The errors of the best of each actor's modes: of the first `most` by probability that with the least FDE.
+
+    Of equal modes the first counts.
+
+    Args:
+        paths: as of `mode_errors`; so are `truth` and `valid`.
+        truth: the recorded paths.
+        valid: where they are recorded.
+        probabilities: (N, K) of the modes, not normalised; NaN of modes that are not there.
+        most: how many modes count.
+        miss_distance: metres.
+
+    Returns:
+        (N,) each, NaN for none: `min_fde`, `miss` (1 or 0) and `brier_min_fde` need the last step, `min_ade` (of the
+        best mode) and `min_ade_any` (the least of any mode) the whole future, `cut_ade` (the same) any step.
+    """
+    first = np.argsort(-probabilities, axis=1, kind="stable")[:, :most]
+    ade, fde, chance = (
+        np.take_along_axis(each, first, 1) for each in (*mode_errors(paths, truth, valid), probabilities)
+    )
+    best = np.argmin(np.where(np.isnan(fde), np.inf, fde), axis=1)[:, None]
+    min_ade, min_fde, probability = (np.take_along_axis(each, best, 1)[:, 0] for each in (ade, fde, chance))
+    least = np.where(np.isnan(ade), np.inf, ade).min(axis=1, initial=np.inf)
+    least[np.isinf(least)] = np.nan
+    whole = valid.all(axis=1)
+    return {
+        "min_ade": np.where(whole, min_ade, np.nan),
+        "min_fde": min_fde,
+        "miss": np.where(np.isnan(min_fde), np.nan, min_fde > miss_distance),
+        "brier_min_fde": brier(min_fde, probability),
+        "min_ade_any": np.where(whole, least, np.nan),
+        "cut_ade": least,
+    }
+
+
+def world_errors(
+    paths: FloatArray, truth: FloatArray, miss_distance: float = MISS_DISTANCE
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """The errors of N actors together, whose modes of one number are one world.
+
+    Args:
+        paths: (N, K, T, 2) metres, at least one actor.
+        truth: (N, T, 2), all recorded.
+        miss_distance: metres.
+
+    Returns:
+        (K,) means over the actors of ADE and of FDE, metres, and (N, K) which actors are missed.
+    """
+    ade, fde = mode_errors(paths, truth, np.ones(truth.shape[:2], dtype=bool))
+    return ade.mean(axis=0), fde.mean(axis=0), fde > miss_distance
+
+
+def collisions(paths: FloatArray, distance: float = COLLISION_DISTANCE) -> BoolArray:
+    """(N, K) whether an actor's centre is nearer than a distance (metres) to another's of that mode at one step."""
+    apart = distances(paths[:, None], paths)
+    apart[np.arange(len(paths)), np.arange(len(paths))] = np.inf
+    return np.asarray((apart < distance).any(axis=(1, 3)))
+
+
+_SLACK: Final = 1e-6
+"""Seconds: decimal moments compare as they are meant."""

@@ -393,7 +393,7 @@ def _objects(results: Mapping[str, Sequence[Any]], made: Callable[[Any], Any]) -
         for number, each in enumerate(given):
             try:
                 objects.append(made(each))
-            except GeometryError as error:
+            except GeometryError as error:  # noqa: PERF203 - which entry it is
                 raise ContentError(f"{entry_place(token, number)}: {error}") from error
     column = np.empty(len(objects), dtype=object)
     column[:] = objects

@@ -31,8 +31,8 @@ from deepaccident_devkit.evaluation.results.records import (
     LENGTH_FIRST,
     RESULTS_FILE,
     ContentError,
-    ResultsTask,
     Kind,
+    ResultsTask,
     Shard,
     Stored,
     check_token,
@@ -344,7 +344,7 @@ def _all_of(kind: type[Kind], prediction: object) -> list[Kind]:
     others = [each for each in given if not isinstance(each, kind)]
     if others:
         raise ResultsError(f"expected a list of {kind.__name__}s, found {type(others[0]).__name__} in it")
-    return given
+    return [each for each in given if isinstance(each, kind)]
 
 
 _ENTRIES: Final[Mapping[str, Callable[[str, object], list[dict[str, Any]]]]] = {

@@ -1,0 +1,22 @@
+"""Predicted paths of other actors, compared with the recorded ones: the task `FORECASTING` and its evaluator."""
+
+from deepaccident_devkit.evaluation.forecasting.evaluator import (
+    FORECASTING,
+    FORECASTING_PROTOCOLS,
+    ForecastingEvaluator,
+    ForecastingProtocol,
+    ForecastingResult,
+)
+from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
+from deepaccident_devkit.evaluation.forecasting.truth import ForecastingTruth, forecasting_truth
+
+__all__ = [
+    "FORECASTING",
+    "FORECASTING_PROTOCOLS",
+    "Forecast",
+    "ForecastingEvaluator",
+    "ForecastingProtocol",
+    "ForecastingResult",
+    "ForecastingTruth",
+    "forecasting_truth",
+]
