@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple
 
-import cv2
 import numpy as np
 
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
@@ -47,7 +46,7 @@ class CellRules:
         box_ahead: metres from the path's point to the centre of the ego's box.
         ego: length and width of that box; None for the agent's own.
         turned: whether the box turns with the path; below 1 m a step has no direction.
-        point_shift: cells by which the point's cell is wrong; None for the one of VAD, 25 m away.
+        point_far_off: whether the point's cell is 25 m away.
         objects: `vehicles` are all but pedestrians; those and pedestrians that are `seen` or `annotated` at the
             present.
     """
@@ -124,6 +123,8 @@ def occupied(corners: FloatArray, rules: CellRules) -> BoolArray:
         cells = np.round((vertices + HALF) / rules.cell)
     else:
         cells = np.trunc((vertices.astype(np.float32) + np.float32(rules.middle)) / np.float32(rules.cell))
+    import cv2
+
     drawn = np.zeros((rules.size, rules.size), dtype=np.uint8)
     for polygon in cells.astype(np.int32):
         cv2.fillPoly(drawn, [polygon], 1)
@@ -138,7 +139,7 @@ def touching(path: FloatArray, cells: BoolArray, ego: tuple[float, float], rules
     else:
         rows, columns = _box_beside(path, along, across, rules)
     steps = np.arange(len(path))
-    box = cells[steps[:, None], rows, columns].any(axis=1)
+    box = np.asarray(cells[steps[:, None], rows, columns].any(axis=1))
     row, column = _point(path, rules)
     inside = (row >= 0) & (row < rules.size) & (column >= 0) & (column < rules.size)
     point = np.zeros(len(path), dtype=bool)

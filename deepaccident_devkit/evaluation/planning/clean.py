@@ -12,7 +12,7 @@ from deepaccident_devkit.accidents.replay import HORIZON
 from deepaccident_devkit.evaluation.means import Sums
 from deepaccident_devkit.evaluation.planning.cells import HORIZONS, STEP
 from deepaccident_devkit.evaluation.planning.contacts import Contacts, first_contacts
-from deepaccident_devkit.evaluation.planning.scene import Plan, PlanningScene, recorded_poses
+from deepaccident_devkit.evaluation.planning.scene import Plan, PlanningScene, recorded_poses, steps_of
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -68,7 +68,7 @@ def drive(plan: Plan, scene: PlanningScene, margin: float, rules: CleanPlanning)
     known = min(float(plan.times[-1]), scene.duration)
     partner = scene.actor_id == scene.partner
     until = scene.duration + (HORIZON if partner.any() else 0.0)
-    times = np.arange(round(until / FRAME_PERIOD) + 1) * FRAME_PERIOD
+    times = np.append(0.0, steps_of(FRAME_PERIOD, until))
     contacts = first_contacts(
         box_path(plan.poses(times), scene.offset),
         scene.size,
@@ -76,12 +76,13 @@ def drive(plan: Plan, scene: PlanningScene, margin: float, rules: CleanPlanning)
         np.where(partner, margin, 0.0),
         np.where(partner, until, max(known, min(scene.duration, HORIZONS[-1]))),
     )
-    steps = np.arange(1, int(min(scene.duration, HORIZONS[-1]) / STEP + _SLACK) + 1) * STEP
+    steps = steps_of(STEP, min(scene.duration, HORIZONS[-1]))
+    away = plan.poses(steps) - recorded_poses(scene, steps)
     along, across = _accelerations(plan, scene.before)
     lost, way = _progress(plan, scene, known)
     return Driven(
         contacts=contacts,
-        error=np.hypot(*(plan.poses(steps) - recorded_poses(scene, steps))[:, :2].T),
+        error=np.hypot(*away[:, :2].T),
         lost=lost,
         way=way,
         infeasible=bool(max(np.abs(along).max(), np.abs(across).max()) > rules.most_acceleration + _SLACK),

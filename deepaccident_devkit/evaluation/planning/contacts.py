@@ -1,4 +1,4 @@
-"""When a planned path first touches others, exactly and in continuous time; the search is that of `accidents.contact`."""
+"""When a planned path first touches others, exactly and in continuous time, by the search of `accidents.contact`."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
@@ -22,7 +22,13 @@ from deepaccident_devkit.evaluation.planning.cells import (
     touching,
 )
 from deepaccident_devkit.evaluation.planning.clean import CleanPlanning, add_plan, drive, margin_of, usable
-from deepaccident_devkit.evaluation.planning.scene import Plan, PlanningScene, planning_scene, trivial_plans
+from deepaccident_devkit.evaluation.planning.scene import (
+    Plan,
+    PlanningScene,
+    planning_scene,
+    steps_of,
+    trivial_plans,
+)
 from deepaccident_devkit.evaluation.task import Task
 from deepaccident_devkit.geometry.box_arrays import corner_offsets
 from deepaccident_devkit.support.arrays import BoolArray
@@ -47,7 +53,7 @@ class PlanningResult(MeansResult):
 
     __slots__ = ()
     task = "planning"
-    main_tables = (*_BY_LEAD, *_BY_HORIZON, _MEAN)
+    main_tables: ClassVar[Sequence[str]] = (*_BY_LEAD, *_BY_HORIZON, _MEAN)
     main_row = GIVEN
     columns: ClassVar[Mapping[str, Column]] = {
         "avoided": Column("%", "higher"),
@@ -87,7 +93,7 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
 
     result_class = PlanningResult
     protocols = PLANNING_PROTOCOLS
-    order = (
+    order: ClassVar[Sequence[str]] = (
         *(f"{role}{lead}{end}" for role in ("", "bystander, ") for end in ("", " to contact") for lead in _BY_LEAD),
         *_BY_HORIZON,
         _MEAN,
@@ -112,7 +118,7 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
 
 def _counts(token: str, plans: Iterable[Plan], scene: PlanningScene, rules: Protocol) -> Counts:
     """What a sample adds."""
-    given = list(plans)
+    given: list[Any] = list(plans)
     others = [each for each in given if not isinstance(each, Plan)]
     if others or not given:
         found = type(others[0]).__name__ if others else "none"
@@ -147,7 +153,7 @@ def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: Planning
     sums.note(_LEFT_OUT)
     if rules.point_far_off:
         sums.note(_FAR_OFF)
-    times = np.arange(1, STEPS + 1) * STEP
+    times = steps_of(STEP, STEPS * STEP)
     if rows[GIVEN].times[-1] < times[-1] - FRAME_PERIOD / 2:
         raise EvaluationError(
             f"{token}: the plan ends after {rows[GIVEN].times[-1]:g} s; these rules look {times[-1]:g} s ahead: plan "
@@ -155,14 +161,11 @@ def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: Planning
         )
     frames = np.rint(times / FRAME_PERIOD).astype(np.int64)
     valid = frames < len(scene.recorded)
+    nobody = np.zeros((0, 5))
     drawn = _drawn(scene, rules)
-    footprints = [
-        scene.footprint[frame, drawn] if there else np.zeros((0, 5)) for frame, there in zip(frames, valid, strict=True)
-    ]
-    corners = [
-        corner_offsets(each) + each[:, None, :2] for each in (each[np.isfinite(each[:, 0])] for each in footprints)
-    ]
-    cells = np.stack([occupied(each, rules) for each in corners])
+    shown = [scene.footprint[at, drawn] if there else nobody for at, there in zip(frames, valid, strict=True)]
+    boxes = [each[np.isfinite(each[:, 0])] for each in shown]
+    cells = np.stack([occupied(corner_offsets(each) + each[:, None, :2], rules) for each in boxes])
     paths = {name: plan.poses(times)[:, :2] for name, plan in rows.items()}
     ego = float(scene.size[0]), float(scene.size[1])
     true = paths[TRIVIAL[0]]
@@ -182,14 +185,6 @@ def _drawn(scene: PlanningScene, rules: CellRules) -> BoolArray:
     return scene.seen if rules.objects == "seen" else np.isfinite(scene.footprint[0, :, 0])
 
 
-def _summary(result: PlanningResult) -> dict[str, Any]:
-    return result.as_dict()
-
-
-def _result(counts: Collection[Counts], rules: Any) -> PlanningResult:
-    return PlanningEvaluator(rules).result_of(counts)
-
-
 PLANNING: Final = Task(
     name="planning",
     kinds=("planning",),
@@ -197,8 +192,8 @@ PLANNING: Final = Task(
     evaluator=PlanningEvaluator,
     truth=lambda dataset, token, _rules, _form, _horizon: (planning_scene(dataset, token),),
     counts=_counts,
-    result=_result,
-    summary=_summary,
+    result=lambda counts, rules: PlanningEvaluator(rules).result_of(counts),
+    summary=PlanningResult.as_dict,
     whole_recordings=True,
     needs_meta=True,
     vehicles_alone=True,

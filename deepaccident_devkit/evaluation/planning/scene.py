@@ -1,7 +1,8 @@
-"""`Plan`: a path that an agent plans to drive; `PlanningScene`: all that it meets; and the plans that need no planner."""
+"""`Plan`: a path that an agent plans to drive; `PlanningScene`: all that it meets; plans that need no planner."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -52,19 +53,15 @@ class Plan(FrozenArrays):
         yaw = None if self.yaw is None else checked("yaw", self.yaw, (len(times),)).copy()
         if not np.isfinite(path).all() or (yaw is not None and not np.isfinite(yaw).all()):
             raise GeometryError("path: not all numbers are finite; leave out what is not planned")
-        for name, value in {
-            "times": times,
-            "path": path,
-            "yaw": yaw,
-            "score": checked_number("score", self.score),
-        }.items():
+        checks = {"times": times, "path": path, "yaw": yaw, "score": checked_number("score", self.score)}
+        for name, value in checks.items():
             object.__setattr__(self, name, value)
         FrozenArrays.__post_init__(self)
 
     def poses(self, times: FloatArray) -> FloatArray:
         """(N, 3) x, y, yaw at times (N,): linear from the present on, straight on after the last stated one.
 
-        Without yaw, it is the direction of the step, kept where that is shorter than 0.1 m (docs/protocols.md, Planning).
+        Without yaw, it is the direction of the step, kept where that is shorter than 0.1 m.
         """
         moments, path = self.times, self.path
         if moments[0] > 0:
@@ -172,9 +169,8 @@ def planning_scene(dataset: Dataset, sample: RowArgument) -> PlanningScene:
     moved = tracks.boxes.select(rows).transform(dataset.world_from(token, "ego").inverse(), "ego")
     actors, first, which = np.unique(moved.actor_id, return_index=True, return_inverse=True)
     footprint = np.full((last - present + 1, len(actors), 5), np.nan)
-    footprint[tracks.index[rows] - present, which] = np.column_stack(
-        [moved.center[:, :2], moved.size[:, :2], moved.yaw]
-    )
+    outlines = np.column_stack([moved.center[:, :2], moved.size[:, :2], moved.yaw])
+    footprint[tracks.index[rows] - present, which] = outlines
     is_collider = accident is not None and agent["name"] in accident.agents
     ids = accident.actor_ids if accident is not None and kind == "accident" else ()
     end = np.nan if accident is None else (accident.last_frame - present) * FRAME_PERIOD
@@ -236,8 +232,8 @@ def trivial_plans(scene: PlanningScene) -> Mapping[str, Plan]:
     `recorded` (all that is left of it) and `full braking` (on the recorded path, 8 m/s², nobody is sped up) have steps
     of 0.1 s, `standing` (at once) and `constant velocity` of 0.5 s; they look at least 3 s ahead.
     """
-    fine = np.arange(1, max(round(_REACH / FRAME_PERIOD), len(scene.recorded) - 1) + 1) * FRAME_PERIOD
-    coarse = np.arange(1, round(_REACH / _STEP) + 1) * _STEP
+    fine = steps_of(FRAME_PERIOD, max(_REACH, scene.duration))
+    coarse = steps_of(_STEP, _REACH)
     nowhere = np.zeros(len(coarse))
     return {
         "recorded": _plan_of(fine, recorded_poses(scene, fine)),
@@ -245,6 +241,15 @@ def trivial_plans(scene: PlanningScene) -> Mapping[str, Plan]:
         "constant velocity": Plan(times=coarse, path=coarse[:, None] * scene.before, yaw=nowhere),
         "full braking": _plan_of(fine, _braked(scene, fine, 0.0)),
     }
+
+
+def steps_of(step: float, until: float) -> FloatArray:
+    """(N,) the seconds of steps up to a time."""
+    return np.asarray(np.arange(1, math.floor(until / step + _SAME_TIME) + 1, dtype=np.float64) * step)
+
+
+_SAME_TIME: Final = 1e-6
+"""Share of a step by which a time that is meant to be a step's may miss it."""
 
 
 def recorded_poses(scene: PlanningScene, times: FloatArray) -> FloatArray:

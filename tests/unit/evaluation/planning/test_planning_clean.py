@@ -31,8 +31,9 @@ def test_the_recorded_plan_avoids_nothing_and_causes_nothing() -> None:
     numbers = lead(found, "recorded")
     assert numbers == pytest.approx(
         {
-            **{name: 0 for name in ("avoided", "striking", "struck", "lost", "lost_way", "prolonged", "infeasible")},
-            **{"impact_speed": 10, "relative_speed": 10},
+            **dict.fromkeys(("avoided", "striking", "struck", "lost", "lost_way", "prolonged", "infeasible"), 0),
+            "impact_speed": 10,
+            "relative_speed": 10,
         }
     )
     assert {found.means[f"{horizon} s"]["recorded"]["l2"] for horizon in (1, 2, 3)} == {0}
