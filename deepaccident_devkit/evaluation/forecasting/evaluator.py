@@ -200,4 +200,5 @@ FORECASTING: Final = Task(
     result=lambda counts, rules: ForecastingEvaluator(rules).result_of(counts),
     summary=ForecastingResult.as_dict,
     whole_recordings=True,
+    has_horizon=False,
 )

@@ -34,6 +34,11 @@ class Plan(FrozenArrays):
         yaw = None if self.yaw is None else checked("yaw", self.yaw, (len(times),)).copy()
         if not np.isfinite(path).all() or (yaw is not None and not np.isfinite(yaw).all()):
             raise GeometryError("path: not all numbers are finite; leave out what is not planned")
-        for name, value in {"times": times, "path": path, "yaw": yaw, "score": checked_number("score", self.score)}.items():
+        for name, value in {
+            "times": times,
+            "path": path,
+            "yaw": yaw,
+            "score": checked_number("score", self.score),
+        }.items():
             object.__setattr__(self, name, value)
         FrozenArrays.__post_init__(self)
