@@ -21,8 +21,8 @@ from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArra
 
 _COARSE: Final = 0.32
 """Seconds of the longest intervals."""
-_HALVINGS: Final = 18
-"""How often an interval is halved at most: down to a microsecond, in which a car moves by less than 0.1 mm."""
+_HALVINGS: Final = 20
+"""How often an interval is halved at most: down to 0.3 µs, in which a car moves by less than 0.01 mm."""
 _TOUCHING: Final = 1e-9
 """Metres of a gap that still counts as contact."""
 

@@ -50,7 +50,7 @@ class MeansResult(TaskResult):
     Attributes:
         samples: that were counted.
         means: table → row → column → mean; NaN where there is nothing to count.
-        counts: table → row → column → of how many.
+        counted: table → row → column → of how many.
         notes: sentences on what was left out.
     """
 
@@ -60,7 +60,7 @@ class MeansResult(TaskResult):
 
     samples: int
     means: Numbers
-    counts: Whole
+    counted: Whole
     notes: tuple[str, ...]
 
     def __init_subclass__(cls) -> None:
@@ -188,7 +188,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
             means.setdefault(table, {}).setdefault(row, {})[column] = ratio(value, count)
             numbers.setdefault(table, {}).setdefault(row, {})[column] = int(count)
         notes = tuple(text.format(f"{count:,}") for text, count in sorted(pooled[NOTES].items()))
-        return self.result_class(samples=pooled[SAMPLES], means=means, counts=numbers, notes=notes)
+        return self.result_class(samples=pooled[SAMPLES], means=means, counted=numbers, notes=notes)
 
     def _place(self, path: str) -> tuple[Any, ...]:
         """Where a number comes: by the given order, and columns by that of the result's."""

@@ -15,6 +15,7 @@ from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.setups import agent_of, scenario_of
+from deepaccident_devkit.evaluation.task import HEADLINE_UNITS
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
 from deepaccident_devkit.reports import Table
 from deepaccident_devkit.support.text import columns_text
@@ -22,7 +23,7 @@ from deepaccident_devkit.support.text import columns_text
 SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")
 _COLUMNS: Final = 5
 """Headlines that a breakdown shows."""
-_NOT_COUNTED: Final = ("beside", "notes", "curve", "references")
+_NOT_COUNTED: Final = ("beside", "notes", "curve", "references", "counted")
 """Parts of the metrics that hold no counts of the samples."""
 _PUBLISHED_CELLS: Final = [-50.0, 50.0, 0.5]
 _PUBLISHED_PREDICTIONS: Final = 6
@@ -69,6 +70,7 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
         ("evaluated", _head(summary)),
         ("results", _headlines(summary)),
         *((("predictors", table),) if (table := predictors_text(summary["metrics"])) else ()),
+        *((("means", tables),) if (tables := _means_text(summary)) else ()),
         *((each.title, each.text(part)) for each, part in further_results(summary)),
         ("counts", "\n".join(_counts(summary["metrics"]))),
         *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
@@ -189,6 +191,43 @@ def predictor_tables(metrics: Json) -> list[Table]:
 def predictors_text(metrics: Json) -> str:
     """All tables of `predictor_tables`, as aligned lines; empty without any."""
     return "\n\n".join(each.to_text() for each in predictor_tables(metrics))
+
+
+def means_tables(metrics: Json) -> dict[str, Table]:
+    """The tables of a summary of means by name; `n` is of how many, and stands behind means of fewer.
+
+    Numbers are the columns, or where they are more than the rows, these.
+    """
+    tables = {}
+    for name, means in (metrics.get("means") or {}).items():
+        counted = metrics["counted"][name]
+        columns = dict.fromkeys(column for row in means.values() for column in row)
+        headings = (f"{each}, {HEADLINE_UNITS[f'means/*/{each}']}" for each in columns)
+        most = {row: max(counts.values()) for row, counts in counted.items()}
+        cells = [(name, "n", *headings)]
+        for row, values in means.items():
+            told = (_mean(values.get(each), counted[row].get(each, 0), most[row]) for each in columns)
+            cells.append((row, f"{most[row]:,}", *told))
+        wide = len(cells[0]) > len(cells) + _WIDER
+        tables[name] = Table(rows=list(zip(*cells, strict=True)) if wide else cells)
+    return tables
+
+
+_WIDER: Final = 4
+"""More columns than rows from which a table is turned."""
+
+
+def _mean(value: float | None, count: int, most: int) -> str:
+    return "–" if value is None else f"{value:.2f}" if count == most else f"{value:.2f} ({count:,})"
+
+
+def _means_text(summary: Json) -> str:
+    """The tables that headlines are of, and the names of the others."""
+    tables = means_tables(summary["metrics"])
+    main = {each["path"].split("/")[1] for each in summary["headlines"]} if tables else ()
+    others = ", ".join(name for name in tables if name not in main)
+    texts = [table.to_text() for name, table in tables.items() if name in main]
+    return "\n\n".join([*texts, *([f"also in metrics_summary.json and the report: {others}"] if others else [])])
 
 
 def _cell(figures: Json, path: str) -> str:

@@ -18,7 +18,7 @@ from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
 from deepaccident_devkit.evaluation.runs.setups import TASKS
-from deepaccident_devkit.evaluation.runs.text import predictor_tables, reading_notes
+from deepaccident_devkit.evaluation.runs.text import means_tables, predictor_tables, reading_notes
 from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, sample_figures, save_figure
 from deepaccident_devkit.render.evaluation.panels import UNKNOWN
@@ -61,7 +61,7 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
         ],
         "interval": f"{percent}interval",
         "interval_notes": () if group is None else group.notes,
-        "predictors": predictor_tables(told),
+        "predictors": [*predictor_tables(told), *means_tables(told).values()],
         "further": {
             each.title.capitalize(): (each.tables(part), [*part["notes"], *part["interval_notes"]])
             for each, part in further_results(summary)

@@ -1,0 +1,107 @@
+"""When a planned path first touches others, exactly and in continuous time, by the search of `accidents.contact`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.accidents.contact import contact_times, impacts, pair_of
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+_STANDS: Final = 0.05
+"""m/s up to which the ego stands."""
+_NO_BRAKING: Final = [[np.inf, np.inf]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Contacts(FrozenArrays):
+    """How a path first touches each of A others; NaN, and False, where it does not. Arrays are read-only.
+
+    Attributes:
+        time: (A,) seconds after the present; inf for no contact.
+        speed: (A,) of the ego, m/s.
+        relative_speed: (A,) m/s.
+        struck: (A,) whether the ego is struck: it stands, or the other's centre is behind its rear edge.
+        overlapping: (A,) whether the two touch at the present already; such contacts are left out.
+    """
+
+    time: FloatArray
+    speed: FloatArray
+    relative_speed: FloatArray
+    struck: BoolArray
+    overlapping: BoolArray
+
+
+def first_contacts(
+    path: FloatArray, size: FloatArray, others: FloatArray, margins: FloatArray, until: FloatArray
+) -> Contacts:
+    """The first contacts of a box with others up to some times.
+
+    Args:
+        path: (L, 3) x, y, yaw of the centre of the ego's box at 10 Hz, from the present on.
+        size: (2,) its length and width.
+        others: (L, A, 5) x, y, length, width, yaw; NaN where one is not there. Between frames poses are linear, and
+            whoever is missing in between goes straight.
+        margins: (A,) metres of a gap that counts as contact.
+        until: (A,) seconds.
+    """
+    count = others.shape[1]
+    numbers = np.full((3, count), np.nan)
+    numbers[0] = np.inf
+    struck, overlapping = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    if len(path) < 2:
+        return Contacts(
+            time=numbers[0], speed=numbers[1], relative_speed=numbers[2], struck=struck, overlapping=overlapping
+        )
+    own = np.concatenate([path[:, :2], np.broadcast_to(size, (len(path), 2)), path[:, 2:]], axis=1)
+    overlapping = gaps_of_pairs(own[:1], others[0]) <= margins
+    for actor in np.flatnonzero(_near(own, others, margins, until) & ~overlapping).tolist():
+        frames = np.flatnonzero(np.isfinite(others[:, actor, 0]))
+        first, last = int(frames[0]), int(frames[-1])
+        if last == first:
+            continue
+        rows = others[frames, actor]
+        values = (*rows[:, :2].T, np.unwrap(rows[:, 4]))
+        other = np.column_stack([np.interp(np.arange(first, last + 1), frames, each) for each in values])
+        paths = np.stack([path[first : last + 1], other])
+        pair = pair_of(paths, np.stack([size, np.median(rows[:, 2:4], axis=0)]), margin=float(margins[actor]))
+        window = (0.0, min(float(until[actor]), last * FRAME_PERIOD) - first * FRAME_PERIOD)
+        if window[1] <= 0:
+            continue
+        time = contact_times(pair, _NO_BRAKING, [1.0], window=window)
+        if not np.isfinite(time[0]):
+            continue
+        impact = impacts(pair, _NO_BRAKING, [1.0], time)
+        numbers[:, actor] = time[0] + first * FRAME_PERIOD, impact.speeds[0, 0], impact.relative_speeds[0]
+        ego, hit = (_pose_at(each, float(time[0])) for each in (pair.motions[0].poses, pair.motions[1].poses))
+        way = hit[:2] - ego[:2]
+        ahead = np.cos(ego[2]) * way[0] + np.sin(ego[2]) * way[1]
+        struck[actor] = impact.speeds[0, 0] <= _STANDS or ahead < -size[0] / 2
+    return Contacts(
+        time=numbers[0], speed=numbers[1], relative_speed=numbers[2], struck=struck, overlapping=overlapping
+    )
+
+
+def _near(own: FloatArray, others: FloatArray, margins: FloatArray, until: FloatArray) -> BoolArray:
+    """(A,) whether two can come to touch in time, by their distances at the frames and their ways between them."""
+    reach = np.hypot(*own[0, 2:4]) / 2 + np.hypot(others[..., 2], others[..., 3]) / 2
+    apart = np.hypot(others[..., 0] - own[:, None, 0], others[..., 1] - own[:, None, 1]) - reach - margins
+    there = np.isfinite(apart)
+    in_time = np.arange(len(own))[:, None] * FRAME_PERIOD < until + FRAME_PERIOD
+    step = np.hypot(*np.diff(own[:, :2], axis=0).T).max()
+    steps = np.diff(others[..., :2], axis=0)
+    ways = np.where(np.isfinite(steps[..., 0]), np.hypot(steps[..., 0], steps[..., 1]), 0.0).max(axis=0, initial=0.0)
+    gone = there.sum(axis=0) < len(own)  # what is missing in between can be on a longer way
+    least = np.where(there & in_time, apart, np.inf).min(axis=0)
+    near: BoolArray = (least <= np.where(gone, 2.0, 1.0) * (step + ways) + gone) & there.any(axis=0)
+    return near
+
+
+def _pose_at(poses: FloatArray, time: float) -> FloatArray:
+    """A pose at a time of a path at 10 Hz."""
+    frames = np.arange(len(poses)) * FRAME_PERIOD
+    return np.array([np.interp(time, frames, each) for each in poses.T])

@@ -1,0 +1,200 @@
+"""`PlanningEvaluator`: planned paths by the definitions of four public codes, and by one for accidents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.means import Column, MeansEvaluator, MeansResult, Sums
+from deepaccident_devkit.evaluation.planning.cells import (
+    CELL_PROTOCOLS,
+    HORIZONS,
+    STEP,
+    STEPS,
+    CellRules,
+    cell_numbers,
+    occupied,
+    touching,
+)
+from deepaccident_devkit.evaluation.planning.clean import CleanPlanning, add_plan, drive, margin_of, usable
+from deepaccident_devkit.evaluation.planning.scene import (
+    Plan,
+    PlanningScene,
+    planning_scene,
+    steps_of,
+    trivial_plans,
+)
+from deepaccident_devkit.evaluation.task import Task
+from deepaccident_devkit.geometry.box_arrays import corner_offsets
+from deepaccident_devkit.support.arrays import BoolArray
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+Protocol = CleanPlanning | CellRules
+PLANNING_PROTOCOLS: Final[Mapping[str, Protocol]] = MappingProxyType({"clean": CleanPlanning(), **CELL_PROTOCOLS})
+GIVEN: Final = "given"
+TRIVIAL: Final = ("recorded", "standing", "constant velocity", "full braking")
+_MEAN: Final = "mean"
+_LEFT_OUT: Final = (
+    "by these rules a plan that repeats the recorded accident has 0 % collisions: steps at which the recorded path "
+    "touches, or is not recorded, are left out; left_out is their share"
+)
+_FAR_OFF: Final = "point_collision looks 25 m beside the path, as the code does; ignore it"
+_BY_HORIZON: Final = tuple(f"{horizon} s" for horizon in HORIZONS)
+_BY_LEAD: Final = tuple(f"lead {lead:g} s" for lead in CleanPlanning().leads)
+
+
+class PlanningResult(MeansResult):
+    """Tables by horizon, and in `clean` by lead; rows are the plans that are given and the trivial ones."""
+
+    __slots__ = ()
+    task = "planning"
+    main_tables: ClassVar[Sequence[str]] = (*_BY_LEAD, *_BY_HORIZON, _MEAN)
+    main_row = GIVEN
+    columns: ClassVar[Mapping[str, Column]] = {
+        "avoided": Column("%", "higher"),
+        "striking": Column("%"),
+        "striking_twins": Column("%"),
+        "lost_twins": Column("%"),
+        "l2": Column("m"),
+        "l2_mean": Column("m"),
+        "contact": Column("%"),
+        "collision": Column("%"),
+        "point_collision": Column("%"),
+        "left_out": Column("%", "neither"),
+        "impact_speed": Column("m/s", is_headline=False),
+        "relative_speed": Column("m/s", is_headline=False),
+        "prolonged": Column("%", "neither", is_headline=False),
+        "struck": Column("%", is_headline=False),
+        "struck_twins": Column("%", is_headline=False),
+        "lost": Column("%", is_headline=False),
+        "lost_way": Column("m", is_headline=False),
+        "lost_way_twins": Column("m", is_headline=False),
+        "infeasible": Column("%", is_headline=False),
+        "infeasible_twins": Column("%", is_headline=False),
+        "braking_twins": Column("%", is_headline=False),
+    }
+
+
+class PlanningEvaluator(MeansEvaluator[PlanningResult]):
+    """Collisions and errors of planned paths.
+
+    Whatever the protocol, rows of plans that need no planner stand beside the given ones: a plan equal to the recorded
+    accident has no collision by any of the four public definitions, as they leave out the steps at which the recorded
+    path touches.
+
+    >>> PlanningEvaluator("uniad").compute().samples
+    0
+    """
+
+    result_class = PlanningResult
+    protocols = PLANNING_PROTOCOLS
+    order: ClassVar[Sequence[str]] = (
+        *(f"{role}{lead}{end}" for role in ("", "bystander, ") for end in ("", " to contact") for lead in _BY_LEAD),
+        *_BY_HORIZON,
+        _MEAN,
+        GIVEN,
+        *TRIVIAL,
+    )
+
+    def update(self, token: str, plans: Iterable[Plan], scene: PlanningScene) -> None:
+        """Count one sample.
+
+        Args:
+            token: of the sample.
+            plans: one or more; the one with the highest score counts, of equal ones the first.
+            scene: from `planning_scene(dataset, token)`.
+
+        Raises:
+            EvaluationError: there is no plan, it ends before the 3 s of the public codes, or the sample came before
+                with other counts.
+        """
+        self.add(token, _counts(token, plans, scene, self.protocol))
+
+
+def _counts(token: str, plans: Iterable[Plan], scene: PlanningScene, rules: Protocol) -> Counts:
+    """What a sample adds."""
+    given: list[Any] = list(plans)
+    others = [each for each in given if not isinstance(each, Plan)]
+    if others or not given:
+        found = type(others[0]).__name__ if others else "none"
+        raise EvaluationError(f"{token}: expected one Plan or more, found {found}")
+    rows = {GIVEN: max(given, key=lambda each: each.score), **trivial_plans(scene)}
+    sums = Sums()
+    if isinstance(rules, CleanPlanning):
+        _add_clean(sums, rows, scene, rules)
+    else:
+        _add_cells(sums, token, rows, scene, rules)
+    return sums.counts()
+
+
+def _add_clean(sums: Sums, rows: Mapping[str, Plan], scene: PlanningScene, rules: CleanPlanning) -> None:
+    if len(scene.recorded) < 2:
+        sums.note("{} samples are last frames, after which nothing is recorded")
+        return
+    margin = margin_of(scene)
+    driven = {name: drive(plan, scene, margin, rules) for name, plan in rows.items()}
+    recorded = driven[TRIVIAL[0]]
+    overlapping = int(recorded.contacts.overlapping.sum())
+    if overlapping:
+        sums.note("{} actors overlap the ego at the present; they are left out", overlapping)
+    if scene.partner is not None and (reason := usable(scene, margin, recorded)):
+        sums.note(f"{scene.scenario}: {reason}; {{}} of its samples are left out")
+        return
+    for name, each in driven.items():
+        add_plan(sums, name, each, recorded, scene, rules)
+
+
+def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: PlanningScene, rules: CellRules) -> None:
+    sums.note(_LEFT_OUT)
+    if rules.point_far_off:
+        sums.note(_FAR_OFF)
+    times = steps_of(STEP, STEPS * STEP)
+    if rows[GIVEN].times[-1] < times[-1] - FRAME_PERIOD / 2:
+        raise EvaluationError(
+            f"{token}: the plan ends after {rows[GIVEN].times[-1]:g} s; these rules look {times[-1]:g} s ahead: plan "
+            "so far, or evaluate by the protocol clean"
+        )
+    frames = np.rint(times / FRAME_PERIOD).astype(np.int64)
+    valid = frames < len(scene.recorded)
+    nobody = np.zeros((0, 5))
+    drawn = _drawn(scene, rules)
+    shown = [scene.footprint[at, drawn] if there else nobody for at, there in zip(frames, valid, strict=True)]
+    boxes = [each[np.isfinite(each[:, 0])] for each in shown]
+    cells = np.stack([occupied(corner_offsets(each) + each[:, None, :2], rules) for each in boxes])
+    paths = {name: plan.poses(times)[:, :2] for name, plan in rows.items()}
+    ego = float(scene.size[0]), float(scene.size[1])
+    true = paths[TRIVIAL[0]]
+    found = {name: touching(path, cells, ego, rules) for name, path in paths.items()}
+    for name, path in paths.items():
+        numbers = cell_numbers(path, true, valid, (found[name], found[TRIVIAL[0]]), rules)
+        for column, values in numbers._asdict().items():
+            scaled = values if column == "l2" else 100.0 * values
+            for table, value in zip((*_BY_HORIZON, _MEAN), (*scaled, scaled.mean()), strict=True):
+                sums.add(table, name, column, float(value))
+
+
+def _drawn(scene: PlanningScene, rules: CellRules) -> BoolArray:
+    """(A,) whose boxes the rules draw."""
+    if rules.objects == "vehicles":
+        return ~scene.is_pedestrian
+    return scene.seen if rules.objects == "seen" else np.isfinite(scene.footprint[0, :, 0])
+
+
+PLANNING: Final = Task(
+    name="planning",
+    kinds=("planning",),
+    protocols=PLANNING_PROTOCOLS,
+    evaluator=PlanningEvaluator,
+    truth=lambda dataset, token, _rules, _form, _horizon: (planning_scene(dataset, token),),
+    counts=_counts,
+    result=lambda counts, rules: PlanningEvaluator(rules).result_of(counts),
+    summary=PlanningResult.as_dict,
+    whole_recordings=True,
+    needs_meta=True,
+    vehicles_alone=True,
+)

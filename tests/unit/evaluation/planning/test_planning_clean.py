@@ -1,0 +1,160 @@
+"""The protocol `clean` of planning, on scenes whose numbers follow from school physics."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from planning_scenes import CAR, GIVEN, SCENARIO, plan_at, scene, straight
+
+from deepaccident_devkit.evaluation.planning import PlanningEvaluator, PlanningResult, PlanningScene, trivial_plans
+from deepaccident_devkit.evaluation.planning.clean import box_path
+from deepaccident_devkit.evaluation.planning.scene import Plan
+
+TOKEN = f"{SCENARIO}/ego_vehicle/{{:03d}}"
+
+
+def result_of(*scenes: PlanningScene, plan: Plan | None = None) -> PlanningResult:
+    evaluator = PlanningEvaluator()
+    for number, each in enumerate(scenes):
+        evaluator.update(TOKEN.format(number), [plan or plan_at(10)], each)
+    return evaluator.compute()
+
+
+def lead(result: PlanningResult, row: str = GIVEN, seconds: float = 3) -> dict[str, float]:
+    return dict(result.means[f"lead {seconds:g} s"][row])
+
+
+def test_the_recorded_plan_avoids_nothing_and_causes_nothing() -> None:
+    found = result_of(scene(10))
+    numbers = lead(found, "recorded")
+    assert numbers == pytest.approx(
+        {
+            **dict.fromkeys(("avoided", "striking", "struck", "lost", "lost_way", "prolonged", "infeasible"), 0),
+            "impact_speed": 10,
+            "relative_speed": 10,
+        }
+    )
+    assert {found.means[f"{horizon} s"]["recorded"]["l2"] for horizon in (1, 2, 3)} == {0}
+    assert found.means["3 s"]["recorded"]["contact"] == 100
+
+
+def test_constant_velocity_is_the_recording_where_that_is_straight_and_uniform() -> None:
+    found = result_of(scene(10))
+    assert lead(found, "constant velocity") == pytest.approx(lead(found, "recorded"), abs=1e-9)
+
+
+@pytest.mark.parametrize(("speed", "infeasible"), [(4.0, 0), (5.0, 0), (5.1, 100), (12.0, 100)])
+def test_standing_at_once_loses_all_and_is_infeasible_above_5_metres_a_second(speed: float, infeasible: int) -> None:
+    found = result_of(scene(speed))
+    numbers = lead(found, "standing")
+    assert (numbers["avoided"], numbers["lost"], numbers["striking"]) == (100, 100, 0)
+    assert numbers["infeasible"] == infeasible
+    for horizon in (1, 2, 3):
+        assert found.means[f"{horizon} s"]["standing"]["l2"] == pytest.approx(speed * horizon)
+
+
+@given(st.floats(2.0, 25.0))
+def test_full_braking_stands_after_v_squared_over_16_metres(speed: float) -> None:
+    numbers = lead(result_of(scene(speed)), "full braking")
+    stops = min(speed * 3, speed**2 / 16 if speed / 8 <= 3 else speed * 3 - 36)
+    assert numbers["lost_way"] == pytest.approx(speed * 3 - stops, abs=0.02)
+    assert numbers["lost_way"] >= 0
+    assert numbers["avoided"] == (100 if speed * 3 > speed**2 / 16 else 0)
+
+
+def test_braking_too_late_is_slower_at_the_impact() -> None:
+    found = result_of(scene(10, seconds=0.5))
+    numbers = lead(found, "full braking", 0.5)
+    within_a_step = 8 * 0.1 / 2
+    assert numbers["avoided"] == 0
+    assert numbers["impact_speed"] == pytest.approx(np.sqrt(100 - 2 * 8 * 5), abs=within_a_step)
+
+
+def test_a_plan_that_ends_goes_straight_on() -> None:
+    found = result_of(scene(10), plan=plan_at(10, seconds=1.5))
+    assert (lead(found)["avoided"], lead(found)["prolonged"]) == (0, 100)
+
+
+def test_new_collisions_are_of_whom_the_recording_does_not_touch() -> None:
+    beside = straight((20, 4), 0.0, 0.0, 31)  # a parked car to the left
+    swerve = Plan(times=np.array([1.0, 2.0, 3.0]), path=np.array([[10.0, 0.0], [20.0, 4.0], [20.0, 4.0]]))
+    numbers = lead(result_of(scene(10, others=[beside]), plan=swerve))
+    assert (numbers["avoided"], numbers["striking"], numbers["struck"]) == (100, 100, 0)
+
+
+def test_who_stands_is_struck_by_a_follower() -> None:
+    follower = straight((-10, 0), 0.0, 10.0, 31)
+    numbers = lead(result_of(scene(10, others=[follower])), "standing")
+    assert (numbers["striking"], numbers["struck"]) == (0, 100)
+
+
+def test_actors_that_overlap_at_the_present_are_left_out_and_counted() -> None:
+    found = result_of(scene(10, others=[straight((0.5, 0.5), 0.0, 10.0, 31)]))
+    assert lead(found)["striking"] == 0
+    assert found.notes == ("1 actors overlap the ego at the present; they are left out",)
+
+
+def test_twins_are_the_price() -> None:
+    twin = replace(scene(10, partner=False), kind="twin", is_collider=True)
+    numbers = lead(result_of(twin), "full braking")
+    assert numbers["lost_twins"] == pytest.approx(100 * (30 - 6.25) / 30, abs=0.1)
+    assert (numbers["braking_twins"], "avoided" in numbers, "lost" in numbers) == (100, False, False)
+
+
+def test_bystanders_have_tables_of_their_own() -> None:
+    found = result_of(replace(scene(10, partner=False), is_collider=False))
+    assert "lead 3 s" not in found.means
+    assert found.means["bystander, lead 3 s"]["standing"]["lost"] == 100
+
+
+@pytest.mark.parametrize(("to_end", "table"), [(3.2, "lead 3 s"), (2.8, "lead 3 s"), (0.7, "lead 0.5 s"), (4.0, None)])
+def test_a_sample_counts_at_the_nearest_lead(to_end: float, table: str | None) -> None:
+    found = result_of(replace(scene(10), to_end=to_end, to_contact=np.nan))
+    assert [name for name in found.means if name.startswith("lead")] == ([table] if table else [])
+
+
+def test_leads_to_the_contact_stand_beside() -> None:
+    found = result_of(replace(scene(10), to_contact=1.0))
+    assert [name for name in found.means if name.startswith("lead")] == ["lead 3 s", "lead 1 s to contact"]
+
+
+def gone_by(scene: PlanningScene, side: float) -> PlanningScene:
+    """The same accident with a partner that stands aside."""
+    moved = scene.footprint.copy()
+    moved[:, 0, 1] += side
+    return replace(scene, footprint=moved)
+
+
+def test_an_accident_that_the_recording_does_not_show_is_left_out_by_name() -> None:
+    found = result_of(gone_by(scene(10), CAR[1] + 1.5))
+    assert "lead 3 s" not in found.means
+    assert found.notes == (f"{SCENARIO}: the pair is 1.50 m apart at the end; 1 of its samples are left out",)
+    near = result_of(gone_by(scene(10), CAR[1] + 0.5))
+    assert lead(near, "recorded")["avoided"] == 0  # the gap at the end counts as contact
+
+
+def test_of_several_plans_the_one_with_the_highest_score_counts() -> None:
+    evaluator = PlanningEvaluator()
+    given = [replace(plan_at(10), score=0.1), replace(plan_at(0), score=0.9), replace(plan_at(5), score=0.9)]
+    evaluator.update(TOKEN.format(1), given, scene(10))
+    assert evaluator.compute().means["1 s"][GIVEN]["l2"] == pytest.approx(10)
+
+
+def test_the_box_turns_with_the_ego_frame() -> None:
+    path = box_path(np.array([[5.0, 0.0, 0.0], [5.0, 0.0, np.pi / 2]]), np.array([1.0, 0.5]))
+    assert path == pytest.approx(np.array([[6.0, 0.5, 0.0], [4.5, 1.0, np.pi / 2]]))
+
+
+def test_last_frames_have_no_numbers() -> None:
+    found = result_of(scene(10, seconds=0.0))
+    assert not found.means
+    assert found.notes == ("1 samples are last frames, after which nothing is recorded",)
+
+
+def test_trivial_plans_look_3_seconds_ahead() -> None:
+    plans = trivial_plans(scene(10, seconds=1.0))
+    assert list(plans) == ["recorded", "standing", "constant velocity", "full braking"]
+    assert [each.times[-1] for each in plans.values()] == pytest.approx([3.0] * 4)
+    assert plans["recorded"].path[-1] == pytest.approx([30, 0])
