@@ -236,7 +236,7 @@ def path_times(horizon: float) -> FloatArray:
     steps = horizon / PATH_STEP
     if not (1 <= steps < math.inf and abs(steps - round(steps)) < 1e-6):
         raise ConfigError(f"horizon: {horizon!r} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
-    return np.arange(1, round(steps) + 1) * PATH_STEP
+    return np.arange(1.0, round(steps) + 1) * PATH_STEP
 
 
 def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = DANGER_DISTANCE) -> list[Accident]:

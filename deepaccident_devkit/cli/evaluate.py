@@ -49,9 +49,10 @@ from deepaccident_devkit.evaluation.runs import (
 )
 from deepaccident_devkit.evaluation.runs.bundles import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.further import with_further
-from deepaccident_devkit.evaluation.runs.sanity import check_sanity
+from deepaccident_devkit.evaluation.runs.sanity import CHECKED, check_sanity
 from deepaccident_devkit.evaluation.runs.setups import (
     TASK_PROTOCOLS,
+    TASKS,
     EvaluationSetup,
     SampleList,
     ScopeName,
@@ -73,6 +74,8 @@ _HELP = {
     "accident": "Evaluate predicted accidents: APA, and the errors in who, where and when.",
     "detection": "Evaluate detected boxes: AP and errors.",
     "warning": "Evaluate warnings: how early they come before accidents, and how often an alarm is false.",
+    "planning": "Evaluate planned paths: collisions, and distances from the recorded path.",
+    "forecasting": "Evaluate actors' predicted paths: minADE, minFDE, misses.",
 }
 _LINES = {
     **_HELP,
@@ -92,7 +95,7 @@ _selection_parameters = together(
         "--samples",
         type=WordChoice(get_args(SampleList)),
         help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.  "
-        "[default: evaluate; for warnings: all]",
+        "[default: evaluate; for warnings, planning and forecasting: all]",
     ),
     click.option(
         "--scope",
@@ -266,8 +269,11 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
         added("result", "prevented")  # before long work, as its room may be missing
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
-    if setup.task == "detection" and options["samples"] == "all":
-        refuse_unused("with --samples all: detections are of the present", "horizon")
+    if options["sanity"] and not set(TASKS[setup.task].kinds) & set(CHECKED):
+        raise click.UsageError(f"--sanity cannot check {setup.task} results; leave it out")
+    if not TASKS[setup.task].has_horizon and _selection_of(setup, options).samples == "all":
+        why = "detections are of the present" if setup.task == "detection" else "the protocol has its own"
+        refuse_unused(f"with --samples all: {why}", "horizon")
 
 
 def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:
@@ -303,14 +309,16 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
     if dataroot is None:
         return
     dataset = DeepAccident(version, dataroot, on_error=options["on_error"], **engine)
-    protocol = "boxes" if opened.task == "accident" else "released"  # the one that takes explicit accidents
+    first = next(iter(TASK_PROTOCOLS[opened.task]))
+    protocol = "boxes" if opened.task == "accident" else first  # the one that takes explicit accidents
     setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
     selection = _selection_of(setup, options)
     check_recordings(opened, dataset)
     covered = coverage(dataset, opened.tokens, selection)
     click.echo(f"{selection.text()}: {covered.to_text()}")
     shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))
-    warnings = check_sanity(dataset, opened, setup, shared, **engine).warnings_text() if shared else ""
+    checked = shared and opened.task in CHECKED
+    warnings = check_sanity(dataset, opened, setup, shared, **engine).warnings_text() if checked else ""
     if warnings:
         click.echo(warnings)
     if not covered.is_complete:

@@ -60,7 +60,8 @@ def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _evaluated(dataset: Dataset, token: str, *, results: Path, **choices: Any) -> Any:
-    return render_evaluation(dataset, token, read_results(results).prediction(token), **choices)
+    prediction: Any = read_results(results).prediction(token)
+    return render_evaluation(dataset, token, prediction, **choices)
 
 
 def _sensor_file(dataset: Dataset, token: str, *, color_by: ColorBy | None = None, **choices: Any) -> Any:

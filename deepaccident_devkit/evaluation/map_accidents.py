@@ -253,12 +253,21 @@ def accident_of(
     shapes = _shapes(instance, grid.orientation)
     size = np.array([grid.x[2], grid.y[2]])
     contact = _contact(shapes, size, reading.danger_distance)
+    return InstanceAccident(tracks=_tracks(shapes, len(instance), grid, rules), contact=contact)
+
+
+def _tracks(shapes: _Shapes, frames: int, grid: BevGrid, rules: LabelProtocol | None) -> InstanceTracks:
     identity, which = np.unique(shapes.identity, return_inverse=True)
-    center = np.full((len(instance), len(identity), 2), np.nan)
-    center[shapes.frame, which] = [grid.x[0], grid.y[0]] + (
-        shapes.center + (0.5 if rules is None else rules.place_in_cell)
-    ) * size
-    return InstanceAccident(tracks=InstanceTracks(identity=identity, center=center), contact=contact)
+    center = np.full((frames, len(identity), 2), np.nan)
+    place = shapes.center + (0.5 if rules is None else rules.place_in_cell)
+    center[shapes.frame, which] = [grid.x[0], grid.y[0]] + place * np.array([grid.x[2], grid.y[2]])
+    return InstanceTracks(identity=identity, center=center)
+
+
+def predicted_tracks(output: MotionOutput, rules: LabelProtocol | None) -> list[InstanceTracks]:
+    """Where the instances of each of the K predictions go; arguments as of `accident_of`."""
+    maps = map(instances_of_heads, output.heads or ()) if output.instances is None else output.instances
+    return [_tracks(_shapes(each, output.grid.orientation), len(each), output.grid, rules) for each in maps]
 
 
 def predicted_accidents(

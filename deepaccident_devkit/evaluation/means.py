@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -208,11 +209,16 @@ def _rounded(values: FloatArray | float) -> FloatArray:
 
 def _counts(sums: _Paths, notes: Mapping[str, int]) -> dict[str, Any]:
     values, numbers = zip(*sums.values(), strict=True) if sums else ((), ())
-    return {NAMES: "\n".join(sums), SUMS: [*values], COUNTS: [*numbers], NOTES: dict(notes)}
+    rows = [
+        f"{row}/{','.join(path.rpartition('/')[2] for path in paths)}"
+        for row, paths in groupby(sums, key=lambda path: path.rpartition("/")[0])
+    ]
+    return {NAMES: "\n".join(rows), SUMS: [*values], COUNTS: [*numbers], NOTES: dict(notes)}
 
 
 def _by_path(counts: Counts) -> dict[str, Sequence[float]]:
-    names = counts[NAMES].split("\n") if counts[NAMES] else []
+    rows = (line.rpartition("/") for line in counts[NAMES].splitlines())
+    names = [f"{row}/{column}" for row, _, columns in rows for column in columns.split(",")]
     return dict(zip(names, zip(counts[SUMS], counts[COUNTS], strict=True), strict=True))
 
 

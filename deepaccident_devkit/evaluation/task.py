@@ -41,6 +41,7 @@ class Task:
         whole_recordings: whether whole recordings are followed, so that attributes within them are of no use.
         needs_meta: whether the truth is in the scenarios' meta files.
         vehicles_alone: whether the roadside has no such predictions.
+        has_horizon: whether the horizon of a setup says how far ahead it looks.
     """
 
     name: TaskName
@@ -55,6 +56,7 @@ class Task:
     whole_recordings: bool = False
     needs_meta: bool = False
     vehicles_alone: bool = False
+    has_horizon: bool = True
 
 
 Kind = TypeVar("Kind")

@@ -15,6 +15,7 @@ from deepaccident_devkit.evaluation.accident.scoring import AccidentsWithin
 from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, EVERYTHING
 from deepaccident_devkit.evaluation.runs import Bundle
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE, Line
+from deepaccident_devkit.evaluation.runs.setups import TASKS
 from deepaccident_devkit.evaluation.task import LIMITS, value_text
 from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
@@ -159,7 +160,7 @@ def _facts(bundle: Bundle) -> dict[str, str]:
         **{name: scalar(results["meta"][name]) for name in _METHOD if name in results["meta"]},
         "samples": f"{counts['samples']:,} of {counts['scenarios']:,} scenarios{left_out}",
         "selection": bundle.selection.text(),
-        **({} if setup.task == "detection" else {"horizon": f"{setup.horizon:g} s"}),
+        **({"horizon": f"{setup.horizon:g} s"} if TASKS[setup.task].has_horizon else {}),
         "results": results["path"],
         "results' hash": results["fingerprint"],
         "release": f"{release['version']}, {release['dataroot']}",
@@ -281,7 +282,7 @@ def _detection(row: Row, *, whole: bool) -> str:
     return ", ".join([f"{_count(row, 'truths')} true boxes", f"{_count(row, 'detections')} detections", *found])
 
 
-def _warning(row: Row, **_: bool) -> str:
+def _values(row: Row, **_: bool) -> str:
     return ", ".join(f"{name} {text}" for name, text in other_values(row).items())
 
 
@@ -289,7 +290,7 @@ _WORDS: Final[Mapping[str, Callable[..., str]]] = {
     "accident": _accident,
     "motion": _motion,
     "detection": _detection,
-    "warning": _warning,
+    **dict.fromkeys(("warning", "planning", "forecasting"), _values),
 }
 
 

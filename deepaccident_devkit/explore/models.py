@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from deepaccident_devkit.explore.scenarios import Scenarios
 
 _PROTOCOL_OF: Final[Mapping[str, str]] = {"motion": "released", "accident": "boxes", "detection": "released"}
-"""Kind of results → the protocol by which they are looked at without a bundle."""
+"""Kind of results → the protocol by which they are looked at without a bundle; `clean` of others."""
+FORESEEN: Final = ("motion", "accident")
+"""Results that a replay can show."""
 
 
 class Score(NamedTuple):
@@ -83,7 +85,7 @@ class Model:
         task: TaskName = kind
         form = None if self.results is None else self.results.form
         horizon = 2.0 if form is None else min(2.0, (form.frames - 1) * form.step)
-        return EvaluationSetup(task=task, protocol=_PROTOCOL_OF[task], horizon=horizon or 0.5)
+        return EvaluationSetup(task=task, protocol=_PROTOCOL_OF.get(task, "clean"), horizon=horizon or 0.5)
 
     @cached_property
     def rows(self) -> Mapping[str, Mapping[str, Any]]:

@@ -19,7 +19,7 @@ from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.explore.background import Jobs
 from deepaccident_devkit.explore.choices import find_call, where_words
 from deepaccident_devkit.explore.explorer import thumbnail
-from deepaccident_devkit.explore.models import Model, open_models
+from deepaccident_devkit.explore.models import FORESEEN, Model, open_models
 from deepaccident_devkit.explore.pages.release import SLOW, cell, entry
 from deepaccident_devkit.explore.pages.responses import assets
 from deepaccident_devkit.explore.pages.scenario import PARTS, part_context
@@ -58,8 +58,6 @@ MOST: Final = 50
 INDEX: Final = "index.html"
 _STATIC: Final = "static"
 _ASSETS: Final = ("pages.css", "explore.css", "keys.js", "sorting.js")
-_FORESEEN: Final = ("motion", "accident")
-"""Results that a replay can show."""
 _POLICY: Final = (
     "default-src 'none'; script-src 'self' file:; style-src 'self' file:; img-src 'self' file: data:; "
     "frame-src 'self' file:; base-uri 'none'; form-action 'none'"
@@ -285,7 +283,7 @@ class _Pages:
         return tuple(
             (name, model.results)
             for name, model in self._models.items()
-            if model.results is not None and model.results.task in _FORESEEN and token in model.scenarios
+            if model.results is not None and model.results.task in FORESEEN and token in model.scenarios
         )
 
     def _write_index(self, filters: Sequence[str], told: Sequence[Told]) -> None:

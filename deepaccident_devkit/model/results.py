@@ -26,6 +26,7 @@ from deepaccident_devkit.evaluation import (
     foreseen_accident,
     read_results,
 )
+from deepaccident_devkit.evaluation.forecasting import Forecast, forecasts_of
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
@@ -39,6 +40,7 @@ from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link
+from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -182,7 +184,7 @@ def predict_results(
     """
     config = config or PredictConfig()
     folder = writable_folder(out)
-    paths = {task: folder / name for task, name in RESULTS_NAMES.items()}
+    paths: dict[ResultsTask, Path] = {task: folder / name for task, name in RESULTS_NAMES.items() if task != "planning"}
     meta = _meta(model, dataset, tokens, config)
     labels = model.config.labels
     form: dict[str, Any] = {
@@ -201,7 +203,16 @@ def predict_results(
             writers["motion"].add(found.token, found.motion)
             writers["accident"].add(found.token, found.accidents)
             writers["detection"].add(found.token, found.boxes)
+            writers["forecasting"].add(found.token, _forecasts(dataset, found, form["step"], form["labels"]))
     return paths
+
+
+def _forecasts(dataset: Dataset, found: SamplePrediction, step: float, labels: str) -> list[Forecast]:
+    """Of the actors that labels show at a sample's present; none without labels, which say who is who."""
+    scenario, _, number = found.token.rsplit("/", 2)
+    boxes = scenario_tracks(dataset, scenario).at(int(number))
+    boxes = boxes.transform(dataset.world_from(found.token, "ego").inverse(), "ego")
+    return forecasts_of(found.motion, boxes.actor_id, boxes.center[:, :2], step=step, labels=labels)
 
 
 def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path: Path) -> str:

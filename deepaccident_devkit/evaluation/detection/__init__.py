@@ -218,4 +218,5 @@ DETECTION: Final = Task(
     counts=sample_counts,
     result=detection_result,
     summary=DetectionResult.as_dict,
+    has_horizon=False,
 )

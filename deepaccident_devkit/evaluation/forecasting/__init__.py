@@ -8,6 +8,7 @@ from deepaccident_devkit.evaluation.forecasting.evaluator import (
     ForecastingResult,
 )
 from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
+from deepaccident_devkit.evaluation.forecasting.of_motion import forecasts_of
 from deepaccident_devkit.evaluation.forecasting.truth import ForecastingTruth, forecasting_truth
 
 __all__ = [
@@ -19,4 +20,5 @@ __all__ = [
     "ForecastingResult",
     "ForecastingTruth",
     "forecasting_truth",
+    "forecasts_of",
 ]

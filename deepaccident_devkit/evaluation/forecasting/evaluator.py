@@ -80,9 +80,7 @@ class ForecastingResult(MeansResult):
 
     __slots__ = ()
     task = "forecasting"
-    main_tables: ClassVar[Sequence[str]] = tuple(
-        table_name(horizon, modes) for horizon in (3, 1, 2, 5) for modes in (6, 1)
-    )
+    main_tables: ClassVar[Sequence[str]] = (table_name(3, 6), table_name(3, 1))
     main_row = EVERYBODY
     columns: ClassVar[Mapping[str, Column]] = {
         "min_fde": Column("m"),
@@ -108,7 +106,7 @@ class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
     result_class = ForecastingResult
     protocols = FORECASTING_PROTOCOLS
     order: ClassVar[Sequence[str]] = (
-        *ForecastingResult.main_tables,
+        *(table_name(horizon, modes) for horizon in (3, 1, 2, 5) for modes in (6, 1)),
         *(EVERYBODY, MEAN_OF_SCENARIOS, TOGETHER),
         *(*CLASSES, *ROLES, *SEEN, *TO_IMPACT, *MOTIONS),
     )
@@ -200,4 +198,5 @@ FORECASTING: Final = Task(
     result=lambda counts, rules: ForecastingEvaluator(rules).result_of(counts),
     summary=ForecastingResult.as_dict,
     whole_recordings=True,
+    has_horizon=False,
 )

@@ -180,4 +180,5 @@ PLANNING: Final = Task(
     whole_recordings=True,
     needs_meta=True,
     vehicles_alone=True,
+    has_horizon=False,
 )

@@ -14,7 +14,7 @@ from deepaccident_devkit.evaluation.detection import DetectionProtocol
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.motion import MotionResult
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
-from deepaccident_devkit.evaluation.task import plain
+from deepaccident_devkit.evaluation.task import TaskResult, headlines, plain
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import check_size, fault_text, read_bytes
 
@@ -32,7 +32,8 @@ def sample_rows(run: EvaluationRun) -> list[Row]:
     - accident: `positive` (an accident comes), whom the truth names, by metres allowed tp, fp and fn, and the errors
       (m, s) of what is foreseen within the largest distance;
     - detection: true boxes and detections that count, and true positives by threshold, over all classes and ranges;
-    - warning: the plain values of the sample's counts, and how many entries its lists have.
+    - warning: the plain values of the sample's counts, and how many entries its lists have;
+    - planning, forecasting: the headline numbers.
     """
     counts, cells = run.evaluator.counts, _CELLS[run.setup.task]
     rows = (
@@ -95,11 +96,17 @@ def _plain_cells(_result: object, counts: Counts, _rules: object) -> Cells:
             yield name, value
 
 
+def _headline_cells(result: TaskResult, _counts: Counts, _rules: object) -> Cells:
+    yield from ((each.name, each.value) for each in headlines(result.task, result))
+
+
 _CELLS: Final[Mapping[str, Callable[[Any, Counts, Any], Cells]]] = {
     "motion": _motion_cells,
     "accident": _accident_cells,
     "detection": _detection_cells,
     "warning": _plain_cells,
+    "planning": _headline_cells,
+    "forecasting": _headline_cells,
 }
 STAMP_KEY: Final = b"deepaccident"
 """Of the metadata: one JSON object."""

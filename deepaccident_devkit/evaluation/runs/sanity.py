@@ -58,6 +58,8 @@ _LEAST: Final[Mapping[Group, float]] = {"place": 0.2, "time": 0.4, "size": 0.5, 
 """The share that it has to reach; in time, slow predictions reach a part, too."""
 _EVIDENCE: Final = {"motion": 100, "accident": 4, "detection": 10}
 """Cells, accidents or boxes that have to be hit."""
+CHECKED: Final = tuple(_EVIDENCE)
+"""Kinds of results that can be checked."""
 _NEAR: Final = 2.0
 """Metres: as near on the ground, a box is found, and both places of an accident are hit on average."""
 _NEAR_IN_HEIGHT: Final = 0.7
@@ -144,6 +146,10 @@ def check_sanity(
     Raises:
         EvaluationError: the results are not of a kind that the task takes, or there is no sample.
     """
+    if results.task not in CHECKED:
+        raise EvaluationError(
+            f"{results.path}: {results.task} results have no sanity check; only {', '.join(CHECKED)} do"
+        )
     lists = results.task == "accident"
     if not tokens:
         raise EvaluationError("tokens: there is no sample to look at")

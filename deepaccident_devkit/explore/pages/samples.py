@@ -201,6 +201,8 @@ def why_not(explorer: Explorer, model: Model, token: str) -> str:
         return f"The predictions of {model.name} were not given."
     if not model.has(token):
         return f"{model.name} predicts nothing for this sample."
+    if _task(model) not in SIZES:
+        return f"There are no pictures of {model.setup.task}."
     try:
         SampleLoader(explorer.dataset, model.results, model.setup)
     except EvaluationError as error:

@@ -16,6 +16,7 @@ from starlette.routing import Route
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError, TokenError
 from deepaccident_devkit.explore.explorer import Explorer
+from deepaccident_devkit.explore.models import FORESEEN
 from deepaccident_devkit.explore.pages.responses import KEPT, explorer_of, page, picture, rendered, root_of, with_slash
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.render import detached_figure, render_motion_labels, render_sample
@@ -93,7 +94,7 @@ def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[
     """What a scenario's page shows, with the predictions of a model (a name) in its replay; None for none."""
     row, rows = explorer.scenarios.row_of[token], explorer.scenarios
     telling = [name for name, each in explorer.models.items() if each.results and token in each.scenarios]
-    shown = model if model in telling and explorer.models[model].setup.task != "detection" else None
+    shown = model if model in telling and explorer.models[model].setup.task in (*FORESEEN, "warning") else None
     twin, played = twin_of(explorer.dataset, token), explorer.replay(token, shown)
     return {
         "token": token,

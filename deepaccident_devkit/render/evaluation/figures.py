@@ -20,7 +20,7 @@ from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.evaluation.runs.setups import SampleLoader
+from deepaccident_devkit.evaluation.runs.setups import TASKS, SampleLoader
 from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
@@ -50,6 +50,8 @@ MAIN_NUMBERS: Final = {
     "accident": ("apa", "position_error"),
     "detection": ("mean_average_precision",),
     "warning": ("groups/ego_involved/auc_ahead",),
+    "planning": ("means/3 s/given/l2",),
+    "forecasting": ("means/3 s, K = 6/all/min_fde",),
 }
 """Task → paths of the headline numbers that figures show by attribute. The first one is shown by all attributes, and
 samples are ranked by it; the others are shown only by time to impact."""
@@ -107,10 +109,10 @@ def _mark(run: EvaluationRun) -> str:
 
 def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
     """All figures of a run: of its task, of further results, and of breakdowns with several groups and a number."""
-    own = [*_FIGURES[run.setup.task](run)]
+    own = [*_FIGURES[run.setup.task](run)] if run.setup.task in _FIGURES else []
     for name, told in run.further.items():
         own += added("figures", name)(told.groups[0].result)
-    left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.setup.task == "warning" else ()))
+    left_out = (EVERYTHING, *(WITHIN_RECORDINGS if TASKS[run.setup.task].whole_recordings else ()))
     broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
     numbers = [path for path in MAIN_NUMBERS[run.setup.task] if _headline(run.setup.task, run.result, path) is not None]
     pairs = [(path, each) for path in numbers[:1] for each in broken.values()]
@@ -235,9 +237,9 @@ def listed(values: Iterable[tuple[str, float | None]]) -> str:
 def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tuple[RunFigure, ...]:
     """The worst and the best samples of a run by its task's main number, the worst first.
 
-    Samples with nothing to count are left out. The task `warning` has none, because it is about whole recordings.
+    Samples with nothing to count are left out. Tasks that follow whole recordings have none.
     """
-    if run.setup.task == "warning":
+    if TASKS[run.setup.task].whole_recordings:
         return ()
     ranked = _ranked(run)
     count = min(_EACH, len(ranked) // 2)

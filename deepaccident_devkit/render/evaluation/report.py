@@ -17,6 +17,7 @@ from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
+from deepaccident_devkit.evaluation.runs.setups import TASKS
 from deepaccident_devkit.evaluation.runs.text import means_tables, predictor_tables, reading_notes
 from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, sample_figures, save_figure
@@ -85,7 +86,7 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
         **{name: scalar(run.results.meta[name]) for name in _SHOWN_META if name in run.results.meta},
         "samples": f"{summary['counts']['samples']:,} of {summary['counts']['scenarios']:,} scenarios",
         "selection": run.selection.text(),
-        **({} if setup.task == "detection" else {"horizon": f"{setup.horizon:g} s"}),
+        **({"horizon": f"{setup.horizon:g} s"} if TASKS[setup.task].has_horizon else {}),
         "results": run.results.path,
         "results' hash": run.results.fingerprint,
         "release": f"{run.release.version}, {run.release.dataroot}",
