@@ -54,7 +54,7 @@ def add_clean(sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules
         rules: the protocol.
     """
     if len(scene.recorded) < 2:
-        sums.note("{} samples are last frames, after which nothing is recorded")
+        sums.note("{} samples have no frame after them that counts; twins end where their accident does")
         return
     margin = _margin(scene)
     found = {name: _contacts(plan, scene, margin) for name, plan in plans.items()}

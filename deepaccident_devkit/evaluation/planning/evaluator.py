@@ -107,7 +107,7 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
         Args:
             token: of the sample.
             plans: one or more; the one with the highest score counts, of equal ones the first.
-            scene: from `planning_scene(dataset, token)`.
+            scene: from `planning_scene(dataset, token)`; for the rules of the public codes with `cut=False`.
 
         Raises:
             EvaluationError: there is no plan, it ends before the 3 s of the public codes, or the sample came before
@@ -173,7 +173,9 @@ PLANNING: Final = Task(
     kinds=("planning",),
     protocols=PLANNING_PROTOCOLS,
     evaluator=PlanningEvaluator,
-    truth=lambda dataset, token, _rules, _form, _horizon: (planning_scene(dataset, token),),
+    truth=lambda dataset, token, rules, _form, _horizon: (
+        planning_scene(dataset, token, cut=isinstance(rules, CleanPlanning)),
+    ),
     counts=_counts,
     result=lambda counts, rules: PlanningEvaluator(rules).result_of(counts),
     summary=PlanningResult.as_dict,

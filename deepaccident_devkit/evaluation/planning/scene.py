@@ -90,8 +90,7 @@ _TURNS: Final = 0.1
 class PlanningScene(FrozenArrays):
     """What a plan meets, from a sample's present on; the present ego frame, metres, seconds, radians.
 
-    Arrays are read-only. F frames at 10 Hz from the present to the recording's end, of a twin at most to the frame at
-    which its accident ends; A other actors.
+    Arrays are read-only. F frames at 10 Hz from the present to the recording's end; A other actors.
 
     Attributes:
         scenario: token.
@@ -131,8 +130,13 @@ class PlanningScene(FrozenArrays):
         return float((len(self.recorded) - 1) * FRAME_PERIOD)
 
 
-def planning_scene(dataset: Dataset, sample: RowArgument) -> PlanningScene:
+def planning_scene(dataset: Dataset, sample: RowArgument, *, cut: bool = True) -> PlanningScene:
     """What a plan of a sample's agent meets, from the labels of all agents.
+
+    Args:
+        dataset: the release.
+        sample: token or record.
+        cut: whether a twin ends where its accident does, and an accident at the last frame that shows the pair.
 
     Raises:
         TokenError: no such sample.
@@ -149,11 +153,11 @@ def planning_scene(dataset: Dataset, sample: RowArgument) -> PlanningScene:
             "does not drive; leave such samples out (--agents vehicles)"
         )
     scenario, present = dataset.scenario.get(there["scenario_token"]), int(token.rsplit("/", 1)[1])
-    stories = [tried(accident_of, dataset, each) for each in (scenario, twin_of(dataset, scenario)) if each is not None]
+    twin, last = twin_of(dataset, scenario), scenario["num_frames"]
+    stories = [tried(accident_of, dataset, each) for each in (scenario, twin) if each is not None]
     accident = next((each for each in stories if isinstance(each, Accident)), None)
-    last = (
-        scenario["num_frames"] if accident is None else max(present, min(scenario["num_frames"], accident.last_frame))
-    )
+    if accident is not None and cut:
+        last = max(present, min(last, accident.last_frame))
     truth = box_truth(dataset, token, (last - present) * FRAME_PERIOD)
     others = np.flatnonzero(truth.actor_id != agent["actor_id"])
     actors, tracks = truth.actor_id[others], scenario_tracks(dataset, scenario)

@@ -225,7 +225,7 @@ def _means_text(summary: Json) -> str:
     """The tables that headlines are of, and the names of the others."""
     tables = means_tables(summary["metrics"])
     main = {each["path"].split("/")[1] for each in summary["headlines"]} if tables else ()
-    others = ", ".join(name for name in tables if name not in main)
+    others = "; ".join(name for name in tables if name not in main)
     texts = [table.to_text() for name, table in tables.items() if name in main]
     return "\n\n".join([*texts, *([f"also in metrics_summary.json and the report: {others}"] if others else [])])
 

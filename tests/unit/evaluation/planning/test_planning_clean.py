@@ -150,7 +150,7 @@ def test_the_box_turns_with_the_ego_frame() -> None:
 def test_last_frames_have_no_numbers() -> None:
     found = result_of(scene(10, seconds=0.0))
     assert not found.means
-    assert found.notes == ("1 samples are last frames, after which nothing is recorded",)
+    assert found.notes == ("1 samples have no frame after them that counts; twins end where their accident does",)
 
 
 def test_trivial_plans_look_3_seconds_ahead() -> None:

@@ -143,6 +143,9 @@ def test_a_twin_is_cut_to_the_accident(da_motion: DeepAccident) -> None:
     found = planning_scene(da_motion, twin)
     assert (found.is_twin, found.is_collider, found.partner.any()) == (True, True, False)
     assert (found.to_end, len(found.recorded)) == (pytest.approx(1.0), 11)
+    scenario, _, number = twin.rsplit("/", 2)
+    left = da_motion.scenario.get(scenario)["num_frames"] - int(number)
+    assert len(planning_scene(da_motion, twin, cut=False).recorded) == left + 1
 
 
 def test_the_roadside_has_no_plan(da_motion: DeepAccident) -> None:
