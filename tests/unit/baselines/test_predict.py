@@ -185,7 +185,7 @@ def test_a_task_or_horizon_that_is_none_is_refused(
         (
             lambda: predict_results(da_hidden, "warning", tokens, out),
             ChoiceError,
-            "task: expected one of motion, accident, detection, found 'warning'",
+            "task: expected one of motion, accident, detection, planning, forecasting, found 'warning'",
         ),
         (
             lambda: predict_results(da_hidden, "motion", tokens, out, Baseline(horizon=0.7)),
