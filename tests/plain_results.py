@@ -51,6 +51,27 @@ def detections() -> dict[str, Any]:
     return document("detection", results=dict(zip((first, second, third), lists, strict=True)))
 
 
+def plan(**changes: Any) -> dict[str, Any]:
+    return {"times": [0.5, 1.0], "path": [[4.0, 0.0], [8.0, 0.5]], "score": 0.75, "yaw": [0.0, 0.1], **changes}
+
+
+def forecast(**changes: Any) -> dict[str, Any]:
+    paths = [[[12.0, 3.5], [10.0, 3.5]], [[12.0, 3.5], [11.0, 4.0]]]
+    return {"id": 1236, "times": [0.5, 1.0], "paths": paths, "probabilities": [0.75, 0.25], **changes}
+
+
+def plans() -> dict[str, Any]:
+    """Two plans, one and one."""
+    lists = [[plan(), plan(yaw=None, score=2)], [plan()], [plan(times=[0, 3])]]
+    return document("planning", results=dict(zip(TOKENS, lists, strict=True)))
+
+
+def forecasts() -> dict[str, Any]:
+    """Of two actors, of one and of none."""
+    lists = [[forecast(), forecast(id=1240, probabilities=[1, 0])], [forecast(times=[0, 3])], []]
+    return document("forecasting", results=dict(zip(TOKENS, lists, strict=True)))
+
+
 def instance_arrays(number: int = 0) -> dict[str, np.ndarray]:
     """Two predictions in which two instances go ahead."""
     maps = np.zeros((PREDICTIONS, FRAMES, *SHAPE), dtype=np.uint8)

@@ -11,6 +11,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.errors import NotAvailableError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.runs import read_bundle
 from deepaccident_devkit.splits import save_selection
 from deepaccident_devkit.v2x import Link
 
@@ -41,6 +42,32 @@ def test_predict_takes_a_link_a_model_a_horizon_and_a_scope(da_motion: DeepAccid
     told = Baseline(agents="all", model="constant_turn_rate", link=link, horizon=1.5).meta()
     assert (path.name, {name: results.meta[name] for name in told}) == ("accident.json", told)
     assert list(results.tokens) == da_motion.evaluation_samples("train", "paper", horizon=1.5, scope="all")
+
+
+def test_predict_writes_plans_and_forecasts_that_are_evaluated(da_motion: DeepAccident, tmp_path: Path) -> None:
+    options = "--split train --samples all --agents all --workers 1"
+    text = run("standing", da_motion.dataroot, *options.split(), "--task", "planning,forecasting", "--out", tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["forecasting.json", "planning.json"]
+    everything = da_motion.samples("train", "all")
+    for task, own in (
+        ("planning", [each for each in everything if "/infrastructure/" not in each]),
+        ("forecasting", everything),
+    ):
+        results = read_results(tmp_path / f"{task}.json")
+        assert (list(results.tokens), f"{task}: {len(own)} samples in" in text) == (own, True)
+    words = ("forecasting", da_motion.dataroot, "--split", "train", "--workers", 1)
+    words = (*words, "--results", tmp_path / "forecasting.json", "--out", tmp_path / "bundle")
+    told = called("evaluate", *words).output
+    lines = ("task         forecasting, protocol clean", "min_fde 3 s, K = 6  ", "seen by a partner alone", "collider")
+    assert [each for each in lines if each not in told] == []
+    rows = read_bundle(tmp_path / "bundle").rows()
+    assert set(rows) == set(everything)
+    assert any(row["min_fde 3 s, K = 1"] is not None for row in rows.values())
+    assert "seen by nobody" in (tmp_path / "bundle" / "report.html").read_text(encoding="utf-8")
+    told = called(
+        "evaluate", "check", tmp_path / "forecasting.json", "--dataroot", da_motion.dataroot, "--split", "train"
+    )
+    assert f"all {len(everything)} samples have a prediction" in told.output
 
 
 def test_predict_takes_names_and_the_agents_that_are_there(da_motion: DeepAccident, tmp_path: Path) -> None:

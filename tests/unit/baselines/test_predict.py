@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,17 +11,22 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import (
+    MOTION_MODELS,
     Baseline,
+    MotionModel,
     Outlook,
     SeenActors,
+    outlook,
     predict_accidents,
     predict_detections,
+    predict_forecasts,
     predict_motion,
+    predict_plan,
     predict_results,
     seen_actors,
 )
 from deepaccident_devkit.baselines.predict import accidents_ahead, label_times, motion_of
-from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
 from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, detection_truth
 from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
@@ -177,6 +184,69 @@ def test_results_of_the_other_tasks(
     assert len(detection.prediction(tokens[0])) == len(predict_detections(da_hidden, tokens[0], agents="all"))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("model", ["constant_velocity", "constant_turn_rate", "standing"])
+def test_forecasts_are_where_seen_actors_go(da_hidden: DeepAccident, tokens: list[str], model: MotionModel) -> None:
+    ahead = outlook(da_hidden, tokens[1], agents="all", model=model)
+    found = predict_forecasts(da_hidden, tokens[1], agents="all", model=model, horizon=4.0)
+    others = ahead.seen.boxes.actor_id != OWN_ACTOR_ID
+    assert [each.actor_id for each in found] == ahead.seen.boxes.actor_id[others].tolist()
+    times = np.arange(1, 9) / 2
+    expected = ahead.poses(times)[:, others, :2]
+    for row, each in enumerate(found):
+        assert (each.times.tolist(), each.probabilities.tolist()) == (times.tolist(), [1.0])
+        np.testing.assert_array_equal(each.paths, [expected[:, row]])
+    assert 0 < len(predict_forecasts(da_hidden, tokens[1], model=model)) < len(found)
+
+
+def test_of_the_models_standing_moves_nobody(da_hidden: DeepAccident, tokens: list[str]) -> None:
+    moved = {}
+    for model in MOTION_MODELS:
+        ahead = outlook(da_hidden, tokens[0], agents="all", model=model)
+        moved[model] = np.linalg.norm(np.ptp(ahead.poses(np.array([0.0, 2.0]))[..., :2], axis=0), axis=-1).max()
+    assert moved["standing"] == 0 < min(moved["constant_velocity"], moved["constant_turn_rate"])
+
+
+def test_a_plan_is_the_egos_own_path(da_hidden: DeepAccident, tokens: list[str]) -> None:
+    """In straight and even driving it is the recorded one; the ego frame moves, not the box."""
+    token = tokens[0]
+    plan = predict_plan(da_hidden, token)
+    scenario, agent, number = token.rsplit("/", 2)
+    assert (plan.times.tolist(), plan.score) == ([0.5, 1.0, 1.5, 2.0, 2.5, 3.0], 1.0)
+    ego_from_world = da_hidden.world_from(token, "ego").inverse()
+    recorded = [
+        ego_from_world @ da_hidden.world_from(f"{scenario}/{agent}/{int(number) + frames:03d}", "ego")
+        for frames in (5, 10)
+    ]
+    np.testing.assert_allclose(plan.path[:2], [pose.translation[:2] for pose in recorded], atol=1.0)
+    assert np.linalg.norm(plan.path[-1]) > 10
+    assert plan.yaw is not None
+    np.testing.assert_allclose(plan.yaw, 0, atol=1e-9)
+    assert not predict_plan(da_hidden, token, model="standing").path.any()
+    turning = predict_plan(da_hidden, token, model="constant_turn_rate", horizon=5.0)
+    assert (len(turning.times), turning.path[0] == pytest.approx(plan.path[0], abs=0.2)) == (10, True)
+
+
+def test_the_infrastructure_has_no_plan(da_hidden: DeepAccident, tokens: list[str]) -> None:
+    pole = tokens[0].replace("ego_vehicle", "infrastructure")
+    assert_refused(
+        (lambda: predict_plan(da_hidden, pole), NotAvailableError, (pole, "no own vehicle")),
+        (lambda: predict_plan(da_hidden, tokens[0], horizon=0.3), ConfigError, "no number of steps of 0.5 s"),
+        (lambda: predict_forecasts(da_hidden, tokens[0], horizon=np.inf), ConfigError, "no number of steps of 0.5 s"),
+    )
+
+
+@pytest.mark.parametrize(("horizon", "steps"), [(2.0, 6), (4.0, 8)])
+def test_paths_in_files_look_three_seconds_ahead_at_least(
+    da_hidden: DeepAccident, tokens: list[str], tmp_path: Path, horizon: float, steps: int
+) -> None:
+    baseline = Baseline(model="standing", horizon=horizon)
+    for task in ("planning", "forecasting"):
+        results = read_results(predict_results(da_hidden, task, tokens, tmp_path / task, baseline, workers=1))
+        assert (results.task, results.meta["model"], results.meta["horizon"]) == (task, "standing", steps / 2)
+        predicted: Any = results.prediction(tokens[0])
+        assert {len(each.times) for each in predicted} == {steps}
+
+
 def test_a_task_or_horizon_that_is_none_is_refused(
     da_hidden: DeepAccident, tokens: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -185,7 +255,7 @@ def test_a_task_or_horizon_that_is_none_is_refused(
         (
             lambda: predict_results(da_hidden, "warning", tokens, out),
             ChoiceError,
-            "task: expected one of motion, accident, detection, found 'warning'",
+            "task: expected one of motion, accident, detection, planning, forecasting, found 'warning'",
         ),
         (
             lambda: predict_results(da_hidden, "motion", tokens, out, Baseline(horizon=0.7)),

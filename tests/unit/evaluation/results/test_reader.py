@@ -52,10 +52,13 @@ HEADERS: dict[str, tuple[Document, str]] = {
     "a version that is a text": ({"version": "1"}, 'version: expected 1, found "1"'),
     "a version that is true": ({"version": True}, "version: expected 1, found true"),
     "no task": ({"task": ...}, "required field `task`"),
-    "an unknown task": ({"task": "tracking"}, 'task: expected one of motion, accident, detection, found "tracking"'),
+    "an unknown task": (
+        {"task": "tracking"},
+        'task: expected one of motion, accident, detection, planning, forecasting, found "tracking"',
+    ),
     "a list of tasks": (
         {"task": ["accident"]},
-        'task: expected one of motion, accident, detection, found ["accident"]',
+        'task: expected one of motion, accident, detection, planning, forecasting, found ["accident"]',
     ),
     "another task": ({"task": "detection"}, f"results of '{FIRST}': [0]: "),
     "no meta": ({"meta": ...}, "required field `meta`"),

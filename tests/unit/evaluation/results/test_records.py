@@ -16,11 +16,17 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes, MotionOutput
-from deepaccident_devkit.evaluation.results import RESULT_SCHEMAS, read_results
+from deepaccident_devkit.evaluation.results import RESULT_SCHEMAS, RESULTS_NAMES, read_results
 
 SCHEMA = Path(__file__).parents[4] / "schema"
 PAGE = SCHEMA / "results" / "README.md"
-TASKS = ("motion", "accident", "detection")
+DOCUMENTS = {
+    "accident": plain.accidents,
+    "detection": plain.detections,
+    "planning": plain.plans,
+    "forecasting": plain.forecasts,
+}
+TASKS = ("motion", *DOCUMENTS)
 STRANGE: tuple[Any, ...] = (None, True, "a", -1, 0.5, 10**30, [], {}, [[1, 2], [3, 4]], ...)
 """What stands in place of each value in turn; `...` takes it away."""
 
@@ -39,7 +45,7 @@ def document(task: str, folder: Path) -> dict[str, Any]:
     if task == "motion":
         told: dict[str, Any] = json.loads((plain.write_motion(folder) / "results.json").read_text(encoding="utf-8"))
         return told
-    return plain.accidents() if task == "accident" else plain.detections()
+    return DOCUMENTS[task]()
 
 
 def places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -113,7 +119,7 @@ def test_what_the_schema_refuses_the_reader_refuses(task: str, tmp_path: Path) -
 
 def test_the_examples_of_the_page(tmp_path: Path) -> None:
     found = [json.loads(block) for block in blocks("json")]
-    assert [example["task"] for example in found] == ["accident", "detection", "motion"]
+    assert [example["task"] for example in found] == ["accident", "detection", "planning", "forecasting", "motion"]
     for example in found:
         validator(example["task"]).validate(example)
         if example["task"] != "motion":
@@ -127,16 +133,17 @@ def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
         "folder": str(tmp_path),
         "predictions": {token: [plain.accident()], plain.TOKENS[1]: []},
         "detections": {token: [(100.0, -20.0, 0.8, 4.5, 1.9, 1.6, 0.3, "car", 0.9)], plain.TOKENS[1]: []},
+        "plans": {token: np.array([[4.0, 0.0], [8.0, 0.5]]), plain.TOKENS[1]: np.ones((1, 2))},
+        "forecasts": {token: {1236: np.arange(12.0).reshape(2, 3, 2)}, plain.TOKENS[1]: {}},
         "maps": {token: ids, plain.TOKENS[1]: 0 * ids},
     }
     codes = blocks("python")
-    assert len(codes) == 3
+    assert len(codes) == 5
     for code in codes:
         exec(compile(code, str(PAGE), "exec"), dict(given))  # noqa: S102
-    accidents, detections, motion = (
-        read_results(tmp_path / name) for name in ("accident.json", "detection.json", "motion")
-    )
-    for results in (accidents, detections, motion):
+    written = {task: read_results(tmp_path / name) for task, name in RESULTS_NAMES.items()}
+    accidents, detections, motion = (written[task] for task in ("accident", "detection", "motion"))
+    for results in written.values():
         results.check()
         assert results.tokens == plain.TOKENS[:2]
     (accident,) = accidents.prediction(token)  # type: ignore[misc]
@@ -145,6 +152,9 @@ def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
     assert isinstance(detected, DetectedBoxes)
     np.testing.assert_array_equal(detected.boxes.size, [[4.5, 1.9, 1.6]])
     np.testing.assert_allclose(detected.boxes.yaw, [0.3])
+    (plan,), (forecast,) = (written[task].prediction(token) for task in ("planning", "forecasting"))  # type: ignore[misc]
+    np.testing.assert_array_equal(np.column_stack([plan.times, plan.path]), [[0.5, 4.0, 0.0], [1.0, 8.0, 0.5]])
+    assert (forecast.actor_id, forecast.paths.shape, forecast.probabilities.tolist()) == (1236, (2, 3, 2), [0.5, 0.5])
     output = motion.prediction(token)
     assert isinstance(output, MotionOutput)
     np.testing.assert_array_equal(output.instances, ids)  # type: ignore[arg-type]

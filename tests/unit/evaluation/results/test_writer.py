@@ -192,7 +192,9 @@ def test_what_a_writer_refuses_at_once(tmp_path: Path, options: dict[str, Any], 
 
 
 def test_tasks_without_results(tmp_path: Path) -> None:
-    with pytest.raises(ChoiceError, match="task: expected one of motion, accident, detection, found 'warning'"):
+    with pytest.raises(
+        ChoiceError, match="task: expected one of motion, accident, detection, planning, forecasting, found 'warning'"
+    ):
         ResultsWriter(tmp_path / "x", "warning")  # type: ignore[arg-type]
 
 

@@ -40,6 +40,7 @@ WRITTEN = {
     "further.with_further": "resampling=None",
     "rows.STAMP_KEY": "b'deepaccident'",
     "sanity.NOTHING_WRONG": "'Nothing looks wrong with the predictions.'",
+    "sanity.CHECKED": "('motion', 'accident', 'detection')",
     "sanity.SAMPLES": "20",
     "sanity.LISTS": "60",
     "sanity.NEAR_IN_TIME": "0.15",
@@ -50,7 +51,8 @@ WRITTEN = {
     "setups.LIST_STEP": "0.5",
     "setups.TASK_RESULTS": (
         "mappingproxy({'motion': ('motion',), 'accident': ('motion', 'accident'), "
-        "'detection': ('detection',), 'warning': ('motion', 'accident')})"
+        "'detection': ('detection',), 'warning': ('motion', 'accident'), 'planning': ('planning',), "
+        "'forecasting': ('forecasting',)})"
     ),
     "setups.SampleSelection": "samples='evaluate', scope='accident', agents=None, horizon=2.0",
     "setups.Coverage": "missing=(), extra=(), unknown=(), splits=(), agents=()",
@@ -69,6 +71,11 @@ PROTOCOLS = {
     "accident": ("released", "paper", "boxes"),
     "detection": ("released", "released_iou", "paper", "opencood"),
     "warning": ("clean", "field"),
+    "planning": (
+        *("clean", "uniad", "stp3", "vad", "bev_planner"),
+        *("uniad_own_box", "stp3_own_box", "vad_own_box", "bev_planner_own_box"),
+    ),
+    "forecasting": ("clean",),
 }
 
 

@@ -22,6 +22,8 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     instances_of,
 )
+from deepaccident_devkit.evaluation.forecasting import ForecastingEvaluator
+from deepaccident_devkit.evaluation.planning import PlanningEvaluator
 from deepaccident_devkit.evaluation.predictions import label_config
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import Coverage, SampleSelection, coverage, default_selection
@@ -50,6 +52,8 @@ class TestSetup:
             "accident": AccidentEvaluator,
             "detection": DetectionEvaluator,
             "warning": WarningEvaluator,
+            "planning": PlanningEvaluator,
+            "forecasting": ForecastingEvaluator,
         }
         setup = EvaluationSetup(task=task, protocol=protocol)
         evaluator = setup.evaluator()
@@ -73,7 +77,7 @@ class TestSetup:
             (
                 {"task": "motions"},
                 ChoiceError,
-                r"task: expected one of motion, accident, detection, warning, found 'mo",
+                r"task: expected one of motion, accident, detection, warning, planning, forecasting, found 'mo",
             ),
             (
                 {"task": "motion", "protocol": "boxes"},

@@ -1,0 +1,37 @@
+"""Every default and constant of forecasting, against what is written out here."""
+
+from written_out import written_out
+
+from deepaccident_devkit.evaluation.forecasting.evaluator import FORECASTING, FORECASTING_PROTOCOLS
+
+WRITTEN = {
+    "evaluator.TOGETHER": "'together'",
+    "evaluator.FORECASTING_PROTOCOLS": (
+        "mappingproxy({'clean': ForecastingProtocol(horizons=(3.0, 1.0, 2.0, 5.0), modes=(6, 1), miss_distance=2.0)})"
+    ),
+    "evaluator.ForecastingProtocol": "horizons=(3.0, 1.0, 2.0, 5.0), modes=(6, 1), miss_distance=2.0",
+    "metrics.MISS_DISTANCE": "2.0",
+    "metrics.COLLISION_DISTANCE": "1.0",
+    "metrics.actor_errors": "miss_distance=2.0",
+    "metrics.world_errors": "miss_distance=2.0",
+    "metrics.collisions": "distance=1.0",
+    "of_motion.forecasts_of": "step=0.5, labels='released'",
+    "truth.LONGEST": "5.0",
+    "truth.MOVING_SPEED": "0.5",
+    "truth.EVERYBODY": "'all'",
+    "truth.CLASSES": (
+        "('class car', 'class truck', 'class van', 'class cyclist', 'class motorcycle', 'class pedestrian')"
+    ),
+    "truth.ROLES": "('collider', 'other')",
+    "truth.SEEN": "('seen by ego', 'seen by a partner alone', 'seen by nobody')",
+    "truth.TO_IMPACT": (
+        "('0–1 s to impact', '1–2 s to impact', '2–3 s to impact', '3–4 s to impact', '4–5 s to impact', 'normal')"
+    ),
+    "truth.MOTIONS": "('moving', 'standing')",
+    "truth.forecasting_truth": "seconds=5.0",
+}
+
+
+def test_every_default_and_constant_written_out() -> None:
+    assert written_out("deepaccident_devkit.evaluation.forecasting") == WRITTEN
+    assert (FORECASTING.whole_recordings, FORECASTING.needs_meta, [*FORECASTING_PROTOCOLS]) == (True, False, ["clean"])

@@ -1,0 +1,138 @@
+"""`MeansEvaluator`: sums that are exact in any order, means of scenarios, and draws."""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of, numbers_of, numbers_of_draws
+from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, Column, MeansEvaluator, MeansResult, Sums
+from deepaccident_devkit.evaluation.task import headlines
+
+
+class Lengths(MeansResult):
+    """Of a test."""
+
+    __slots__ = ()
+    task = "forecasting"
+    main_tables: ClassVar[Sequence[str]] = ("late",)
+    main_row = "all"
+    columns: ClassVar[Mapping[str, Column]] = {"far": Column("m", "higher"), "near": Column("m", is_headline=False)}
+
+
+class LengthsEvaluator(MeansEvaluator[Lengths]):
+    """Of a test."""
+
+    result_class = Lengths
+    protocols: ClassVar[Mapping[str, Any]] = {"clean": Resampling(), "other": Resampling(seed=1)}
+    order: ClassVar[Sequence[str]] = ("late", "early", "all")
+
+    def update(self, token: str, *arguments: Any) -> None:
+        scenario, values = arguments
+        sums = Sums()
+        sums.add("early", "some", "near", 1.0)
+        for value in values:
+            sums.add("late", "all", "far", value)
+        self.add(token, sums.counts(scenario))
+
+
+def filled(values: Sequence[Sequence[float]], scenarios: int = 8) -> LengthsEvaluator:
+    evaluator = LengthsEvaluator()
+    for number, each in enumerate(values):
+        evaluator.update(f"{number:04d}", f"s{number % scenarios}", each)
+    return evaluator
+
+
+@pytest.fixture
+def values() -> list[list[float]]:
+    source = np.random.default_rng(3)
+    return [source.exponential(3, source.integers(0, 4)).tolist() for _ in range(40)]
+
+
+def test_tables_rows_and_columns_stand_in_their_order() -> None:
+    sums = Sums()
+    for row in ("10 s", "b", "2 s", "all", "a"):
+        sums.add("early", row, "near", [1.0, 2.0])
+    sums.add("late", "a", "near", [])
+    sums.add("late", "a", "far", np.nan)
+    evaluator = LengthsEvaluator()
+    evaluator.add("t", sums.counts())
+    result = evaluator.compute()
+    assert {table: [*rows] for table, rows in result.means.items()} == {
+        "late": ["a"],
+        "early": ["all", "2 s", "10 s", "a", "b"],
+    }
+    assert [*result.means["late"]["a"]] == ["far", "near"]
+    assert (result.counted["late"]["a"], result.counted["early"]["a"]) == ({"far": 0, "near": 0}, {"near": 2})
+    assert headlines("forecasting", result) == ()
+    assert LengthsEvaluator("other").settings["seed"] == 1
+
+
+def test_rows_are_those_of_their_masks() -> None:
+    sums = Sums()
+    masks = {"all": np.ones(3, dtype=bool), "few": np.array([True, False, True])}
+    sums.add_rows("late", masks, {"far": np.array([1.0, 2.0, np.nan]), "near": np.array([np.inf, 5.0, 7.0])})
+    evaluator = LengthsEvaluator()
+    evaluator.add("t", sums.counts())
+    result = evaluator.compute()
+    assert result.means["late"] == {"all": {"far": 1.5, "near": 6.0}, "few": {"far": 1.0, "near": 7.0}}
+    assert result.counted["late"] == {"all": {"far": 2, "near": 2}, "few": {"far": 1, "near": 1}}
+
+
+def test_sums_are_the_same_in_any_order_and_parts(values: list[list[float]]) -> None:
+    whole = filled(values)
+    counts = [whole.counts[token] for token in sorted(whole.tokens)]
+    expected = whole.compute()
+    assert whole.result_of(counts[::-1]) == expected
+    assert (
+        whole.result_of([*whole.pooled(counts[:16]), *whole.pooled(counts[16:])]).means["late"]["all"]
+        == (expected.means["late"]["all"])
+    )
+    stored = json.loads(json.dumps(counts))
+    assert whole.result_of(stored) == expected
+    every = [value for each in values for value in each]
+    assert expected.means["late"]["all"]["far"] == pytest.approx(np.mean(every), abs=1e-9)
+
+
+def test_the_mean_of_scenarios(values: list[list[float]]) -> None:
+    result = filled(values).compute()
+    by_scenario = [[value for each in values[first::8] for value in each] for first in range(8)]
+    expected = np.mean([np.mean(each) for each in by_scenario if each])
+    assert result.means["late"][MEAN_OF_SCENARIOS]["far"] == pytest.approx(expected, abs=1e-8)
+    assert result.counted["late"][MEAN_OF_SCENARIOS]["far"] == sum(map(bool, by_scenario))
+    assert MEAN_OF_SCENARIOS not in result.means["early"]
+
+
+def test_draws_at_once_are_those_of_one_after_another(values: list[list[float]]) -> None:
+    evaluator = filled(values)
+    clusters = evaluator.clustered({token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)})
+    times = np.random.default_rng(1).integers(0, 3, (20, len(clusters)))
+    names = [*numbers_of(evaluator.compute()), "means/late/nobody/far"]
+    slowly = [numbers_of(each) for each in Evaluator.resampled(evaluator, clusters, times)]
+    expected = [[each.get(name, np.nan) for name in names] for each in slowly]
+    assert_array_equal(numbers_of_draws(evaluator, clusters, times, names), expected)
+
+
+def test_a_cluster_without_a_number_does_not_change_it() -> None:
+    """The jackknife counts the clusters that change a number; rounding must not make them more."""
+    source = np.random.default_rng(5)
+    evaluator = filled([[value] if number % 8 < 5 else [] for number, value in enumerate(source.uniform(0, 9, 80))])
+    clusters = evaluator.clustered({token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)})
+    found = intervals_of(evaluator, clusters, evaluator.compute())
+    assert found.ends == {}
+    assert any("fewer than 6 clusters" in note and "means/late/all/far" in note for note in found.notes)
+
+
+def test_notes_count_over_the_samples() -> None:
+    evaluator = LengthsEvaluator()
+    for number in range(3):
+        sums = Sums()
+        sums.note("{} are left out", 500 * number)
+        evaluator.add(str(number), sums.counts())
+    result = evaluator.compute()
+    assert (result.notes, result.samples, result.means) == (("1,500 are left out",), 3, {})
+    assert evaluator.compute([]).samples == 0
