@@ -243,9 +243,11 @@ def _predict(job: _Job) -> None:
     work = job.work
     if job.path.exists():
         return
-    how = work.baseline.agents, work.baseline.link, work.payload
+    sent = [
+        traffic(work.dataset, token, work.baseline.agents, work.baseline.link, work.payload) for token in job.tokens
+    ]
     try:
-        with work.writer(job.path, [traffic(work.dataset, token, *how) for token in job.tokens]) as writer:
+        with work.writer(job.path, sent) as writer:
             for token in job.tokens:
                 writer.add(token, work.baseline.predict(work.dataset, work.task, token))
     except ResultsError as error:

@@ -113,11 +113,10 @@ def compare(
             raise click.BadParameter(f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}")
     if more and not over_bytes:
         raise click.UsageError("differences are those of two evaluations; give --over-bytes to compare more")
-    how = Resampling(resamples=resamples)
     comparison = (
-        evaluations_over_bytes([a, b, *more], how, common=common)
+        evaluations_over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
         if over_bytes
-        else compare_bundles(a, b, how, common=common)
+        else compare_bundles(a, b, Resampling(resamples=resamples), common=common)
     )
     as_text = comparison.to_json()
     for path in out:

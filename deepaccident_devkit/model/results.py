@@ -123,8 +123,10 @@ def _inputs(model: V2XFormer, config: PredictConfig) -> V2XConfig:
 def _features(model: V2XFormer) -> tuple[int, dict[str, Any]]:
     """Bytes of a partner's message, its own map of the present (`V2XFormer.encoded`) and its pose; form of the map."""
     shape, dtype = [model.config.temporal.channels, *model.config.grid.shape], next(model.parameters()).dtype
-    size = POSE_BYTES + math.prod(shape) * dtype.itemsize
-    return size, {"shape": shape, "dtype": str(dtype).removeprefix("torch.")}
+    return (
+        POSE_BYTES + math.prod(shape) * dtype.itemsize,
+        {"shape": shape, "dtype": str(dtype).removeprefix("torch.")},
+    )
 
 
 def check_images(dataset: Dataset, tokens: Sequence[str]) -> None:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import msgspec
 
@@ -22,9 +22,6 @@ from deepaccident_devkit.evaluation.task import Unit, headlines, value_text
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.text import columns_text, path_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-
-_SHOWN: Final = 4
-"""Headlines: the most important ones."""
 
 
 class SentBytes(msgspec.Struct, kw_only=True, frozen=True):
@@ -101,18 +98,20 @@ class OverBytes(Report):
 
     def to_text(self) -> str:
         """A line for each headline of each evaluation."""
-        top = ("number", "evaluation", "bytes a sample", "value", f"{self.resampling.confidence:.0%} interval")
-        rows = (
-            (
-                each.headline,
-                each.evaluation,
-                f"{each.bytes:,.0f}",
-                value_text(each.value, each.unit),
-                "–" if each.low is None or each.high is None else f"[{each.low:.3f}, {each.high:.3f}]",
-            )
-            for each in self.points
-        )
-        return f"{self.task}, protocol {self.protocol}: {self.samples} samples\n\n{columns_text([top, *rows], left=2)}"
+        rows = [
+            ("number", "evaluation", "bytes a sample", "value", f"{self.resampling.confidence:.0%} interval"),
+            *(
+                (
+                    each.headline,
+                    each.evaluation,
+                    f"{each.bytes:,.0f}",
+                    value_text(each.value, each.unit),
+                    "–" if each.low is None or each.high is None else f"[{each.low:.3f}, {each.high:.3f}]",
+                )
+                for each in self.points
+            ),
+        ]
+        return f"{self.task}, protocol {self.protocol}: {self.samples} samples\n\n{columns_text(rows, left=2)}"
 
     def named_tables(self) -> dict[str, list[Row]]:
         """A line a point."""
@@ -162,12 +161,11 @@ def over_bytes(
             for each in headlines(task, result)
             if each.value is not None
         ]
-    counted = Counter(each.headline for each in points).items()
-    shown = [headline for headline, count in counted if count == len(bundles)][:_SHOWN]
+    shown = [name for name, count in Counter(each.headline for each in points).items() if count == len(bundles)]
     return OverBytes(
         task=task,
         protocol=bundles[0].setup.protocol,
         samples=len(tokens),
         resampling=chosen,
-        points=tuple(each for headline in shown for each in points if each.headline == headline),
+        points=tuple(each for headline in shown[:4] for each in points if each.headline == headline),
     )

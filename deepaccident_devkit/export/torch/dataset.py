@@ -161,14 +161,14 @@ class V2XDataset(TorchDataset):
         augmentation = self.config.augmentation_of(int(self._epoch), position)
         return V2XItem(self._received_item(sample, augmentation) | self._target_items([sample], augmentation)[0])
 
-    def senders(self) -> Iterator[tuple[AgentName, ...]]:
+    def senders(self) -> list[tuple[AgentName, ...]]:
         """For each item the agents whose data of the present it has, its own first; nothing is read but what is there.
 
         Raises:
             MissingFileError: a sensor file of a sample's own agent was not downloaded, or may not be skipped.
         """
-        for row in self._rows.tolist():
-            yield tuple(self._arrived(self._dataset.sample[row]["token"])[1][-1])
+        tokens = (self._dataset.sample[row]["token"] for row in self._rows.tolist())
+        return [tuple(self._arrived(token)[1][-1]) for token in tokens]
 
     def _arrived(self, sample: str) -> tuple[tuple[AgentName, ...], sensor_data.Received, IntArray]:
         """Who takes part, the messages that arrived, and how many files are lacking (`sensor_data.with_files`)."""

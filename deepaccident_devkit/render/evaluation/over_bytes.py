@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.evaluation.runs import BytesPoint, OverBytes
 from deepaccident_devkit.render.captions import set_title
@@ -16,9 +16,6 @@ from deepaccident_devkit.render.styles import ESTIMATE_COLOR, MUTED_COLOR, curre
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-_BESIDE: Final = 2
-"""How far nothing is to the left of the first power of 2."""
 
 
 @in_own_settings
@@ -33,9 +30,8 @@ def render_over_bytes(report: OverBytes, *, fig: Figure | None = None) -> Figure
         The figure, with a panel for each headline (two at most in a paper's column), in which evaluations are named at
         their dots. Where partners send nothing they are at the left edge.
     """
-    narrow = current_style().room == "column"
-    names = list(dict.fromkeys(each.headline for each in report.points))[: 2 if narrow else None]
-    columns = 1 if narrow or len(names) < 2 else 2
+    columns = 1 if current_style().room == "column" else 2
+    names = list(dict.fromkeys(each.headline for each in report.points))[: 2 * columns]
     rows = -(-len(names) // columns) or 1
     fig = figure_or_new(fig, (PANEL[0] * columns, PANEL[1] * rows + 0.7), column=0.75 * rows)
     set_title(fig, f"{report.task}, protocol {report.protocol}: {report.samples:,} samples")
@@ -53,24 +49,20 @@ def render_over_bytes(report: OverBytes, *, fig: Figure | None = None) -> Figure
 
 
 def _draw(points: Sequence[BytesPoint], ax: Axes) -> None:
-    """One panel."""
+    """One panel; the evaluations without bytes stand two powers of 2 to the left of the others."""
     powers = [math.log2(each.bytes) for each in points if each.bytes]
     first, last = math.floor(min(powers, default=0)), math.ceil(max(powers, default=0))
-    ticks = {first - _BESIDE: "none"} if len(powers) < len(points) else {}
-    ticks |= {power: str(power) for power in range(first, last + 1, max((last - first) // 4, 1)) if powers}
-    x = [math.log2(each.bytes) if each.bytes else first - _BESIDE for each in points]
-    values = [each.value for each in points]
-    low = [each.value if each.low is None else each.low for each in points]
-    high = [each.value if each.high is None else each.high for each in points]
-    ax.vlines(x, low, high, color=ESTIMATE_COLOR, linewidth=1.4)
-    ax.plot(x, values, "o", color=ESTIMATE_COLOR, markersize=6.5)
-    keep_free(
-        ax, [[(at, start), (at, end)] for at, start, end in zip(x, low, high, strict=True)], margin=(-4, -4, 4, 4)
-    )
-    place_chips(ax, [(each.evaluation, place) for each, *place in zip(points, x, values, strict=True)])
+    shown = range(first, last + 1, max((last - first) // 4, 1)) if powers else ()
+    edge = [first - 2] if len(powers) < len(points) else []
+    for each in points:
+        x = math.log2(each.bytes) if each.bytes else edge[0]
+        low, high = (each.value if end is None else end for end in (each.low, each.high))
+        ax.plot((x, x, x), (low, each.value, high), "o-", markevery=[1], markersize=6.5, color=ESTIMATE_COLOR)
+        keep_free(ax, [[(x, low), (x, high)]], margin=(-4, -4, 4, 4))
+        place_chips(ax, [(each.evaluation, (x, each.value))])
     ax.set(
-        xticks=list(ticks),
-        xticklabels=list(ticks.values()),
+        xticks=[*edge, *shown],
+        xticklabels=[*("none" for _ in edge), *map(str, shown)],
         ylabel=points[0].headline + ("" if points[0].unit == "share" else f" ({points[0].unit})"),
         xmargin=0.2,
         ymargin=0.2,
