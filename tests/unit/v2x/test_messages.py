@@ -18,7 +18,6 @@ from deepaccident_devkit.v2x import Link, PoseNoise
 from deepaccident_devkit.v2x.cooperation import seen_actors
 from deepaccident_devkit.v2x.messages import message_bytes, messages, traffic, traffic_note
 
-
 BEHIND = AGENTS[1]
 
 
@@ -325,8 +324,7 @@ def test_bytes_of_a_message_are_those_of_its_sizes(da: DeepAccident, da_b: DeepA
     assert {kind: message_bytes(da, token, kind) for kind in sizes} == sizes  # type: ignore[arg-type]
     assert [message_bytes(da, token, given) for given in (70, None)] == [70, 0]
     blind = f"{da_b.scenario[0]['token']}/infrastructure/003"
-    with pytest.raises(MissingFileError):
-        message_bytes(da_b, blind, "cloud")
+    assert_refused((lambda: message_bytes(da_b, blind, "cloud"), MissingFileError, "lidar01"))
     assert message_bytes(da_b, blind, "boxes") == 24 + 45 * len(da_b.boxes(blind))
 
 

@@ -43,7 +43,6 @@ WRITTEN = {
     "sanity.NOTHING_WRONG": "'Nothing looks wrong with the predictions.'",
     "sanity.SAMPLES": "20",
     "sanity.LISTS": "60",
-    "over_bytes.over_bytes": "resampling=None, common=False",
     "sanity.NEAR_IN_TIME": "0.15",
     "sanity.MOVING": "4.0",
     "sanity.STRAIGHT": "0.2617993877991494",
