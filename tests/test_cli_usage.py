@@ -33,6 +33,9 @@ UNUSED = [
     ("evaluate check results --split val", "--split changes nothing without --dataroot"),
     ("evaluate check results --on-error raise", "--on-error changes nothing without --dataroot"),
     (BASELINE + " --latency 0.2", "--latency changes nothing with --agents single"),
+    (BASELINE + " --budget 1000", "--budget changes nothing with --agents single"),
+    ("predict tiny release --out out --agents single --budget 1000", "--budget changes nothing with --agents single"),
+    (BASELINE + " --agents all --budget 1000 --seed 3", "--seed changes nothing without --pose-noise or --packet-loss"),
     (
         "predict constant_velocity release --out out --agents all --seed 3",
         "--seed changes nothing without --pose-noise",
