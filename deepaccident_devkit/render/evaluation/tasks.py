@@ -335,7 +335,7 @@ def render_plans(result: PlanningResult, *, ax: Axes | None = None) -> Axes:
         row: [(table[row].get("lost_twins", math.nan), table[row].get("avoided", math.nan)) for table in tables]
         for row in (tables[0] if tables else ())
     }
-    if not np.isfinite([*lines.values()]).all(axis=-1).any():
+    if not any(math.isfinite(lost + avoided) for points in lines.values() for lost, avoided in points):
         return draw_nothing(ax, "no accident with a twin")
     for (row, points), dash in zip(lines.items(), cycle(_DASHES), strict=False):
         color = ESTIMATE_COLOR if row == GIVEN else TRUE_PLACE_COLOR
