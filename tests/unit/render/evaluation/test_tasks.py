@@ -143,6 +143,6 @@ def test_plans_stand_where_they_avoid_and_lose() -> None:
     for number, each in enumerate((scene(10), twin)):
         evaluator.update(f"a/b/{number:03d}", [plan_at(10)], each)
     ax = render_plans(evaluator.compute(), ax=new_axes())
-    assert not lacking(words(ax), "given", "recorded", "standing", "full braking", "accidents avoided (%)")
+    assert not lacking(words(ax), "given", "recorded", "standing", "full braking", "constant velocity")
     drawn = [line.get_xydata()[0].round(1).tolist() for line in ax.lines]
     assert drawn == [[0, 0], [0, 0], [100, 100], [0, 0], [79.2, 100]]
