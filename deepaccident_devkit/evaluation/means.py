@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
-from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, Row, TaskResult, Unit, protocol_of
+from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, Row, TaskResult, Unit, plain, protocol_of
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import natural_order
 
@@ -128,7 +128,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices."""
-        return asdict(self.protocol)
+        return {name: plain(value) for name, value in asdict(self.protocol).items()}
 
     def add(self, token: str, counts: Counts) -> None:
         """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""
