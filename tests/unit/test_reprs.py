@@ -29,6 +29,8 @@ from deepaccident_devkit.evaluation import (
     MotionOutput,
     WarningEvaluator,
 )
+from deepaccident_devkit.evaluation.forecasting import ForecastingEvaluator
+from deepaccident_devkit.evaluation.planning import PlanningEvaluator
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud
 from deepaccident_devkit.interactions import InteractionConfig, Interactions
@@ -100,6 +102,8 @@ OWN = {
     "AnticipationResult": lambda: WarningEvaluator("clean").compute(),
     "Contact": contact,
     "DetectionResult": lambda: DetectionEvaluator().compute(),
+    "ForecastingResult": lambda: ForecastingEvaluator().compute(),
+    "PlanningResult": lambda: PlanningEvaluator().compute(),
     "FieldResult": lambda: WarningEvaluator("field").compute(),
     "LidarPointCloud": cloud,
     "MotionHeads": heads,
