@@ -17,7 +17,8 @@ from deepaccident_devkit.support.text import counted, path_of
 from deepaccident_devkit.taxonomy import MINI_SPLITS
 
 _NAMED: Final = re.compile(
-    r"(type\d+_subtype\d+_(?:accident|normal))[\s/\\]+(?:[\w.-]{1,200}[/\\]+){0,8}?(\w{1,200}?_scenario\d+)"  # type, name
+    r"(type\d+_subtype\d+_(?:accident|normal))[\s/\\]+"  # type, and what may lie between
+    r"(?:[\w.-]{1,200}[/\\]+){0,8}?(\w{1,200}?_scenario\d+)"  # name
     r"(?:[^\s,;\"']{0,300}?[/\\_](\d{3,})(?!\d))?"  # frame
 )
 _MINI: Final = re.compile(r"(?<![a-z])mini(?![a-z])", re.IGNORECASE)
