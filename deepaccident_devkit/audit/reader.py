@@ -22,7 +22,7 @@ from deepaccident_devkit.release import read_image, read_label, read_labels, wri
 from deepaccident_devkit.release.npz import write_npz
 from deepaccident_devkit.reports import Row
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
-from deepaccident_devkit.support.files import replacing_folder
+from deepaccident_devkit.support.files import check_free, replacing_folder
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import number_of, path_of
@@ -63,6 +63,8 @@ _BELIEFS: Final = "|".join(
     + [right for _, _, _, right in _COLUMNS.values()]
 )
 """Names that say what something is: of what no column has, and those that are right of some column."""
+_PICTURE: Final = r"(?i)image|img|rgb|picture|photo|\.(jpe?g|png)$"
+"""Files, keys and paths that are called so may be pictures."""
 _REMEDIES: Final = {
     "misread": "docs/format.md says what each column holds; of vx and vy, v_world = Rz(−yaw) · (vx, vy).",
     "picture": "Keep the array: JPEG changes ids and classes. Channel 2 is the class, 1 + 256 · 0 the object.",
@@ -75,6 +77,7 @@ def write_audit_release(out: Path) -> Path:
     Raises:
         ConfigError: `out` is a file or is not empty.
     """
+    check_free(out)
     start, step = np.array([each[:2] for each in _COLUMNS.values()]).T
     with replacing_folder(out) as made:
         write_small_release(made, SmallRelease(frames=2, splits=("train",), channels=(*CAMERAS, LIDAR)))
@@ -125,15 +128,12 @@ def audit_reader(reader: Callable[[str], object] | str | os.PathLike[str]) -> Au
             key = "/".join("*" if isinstance(each, int) else each for each in path).lstrip("/")
             held[key].append(leaf)
             held[f"{key}[{path[-1]}]"].append(leaf)  # a place of a list, such as [x, y, z]
-        named: list[tuple[str, Any]] = [
-            *((str(path.relative_to(folder)), path) for path in sorted(folder.rglob("*"))),
-            *((each if isinstance(each, str) else key, each) for key in held if "[" not in key for each in held[key]),
-        ]
-        pictures = [
-            name
-            for name, each in named
-            if re.search(r"(?i)image|img|rgb|picture|photo|\.(jpe?g|png)$", name) and _is_bev(each)
-        ]
+        named: dict[str, Any] = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*"))}
+        for key in [key for key in held if "[" not in key]:
+            named |= {
+                each if isinstance(each, str) else key: each for each in held[key] if isinstance(each, str | np.ndarray)
+            }
+        pictures = [name for name, each in named.items() if re.search(_PICTURE, name) and _is_bev(each)]
         labels = read_labels(sorted(release.glob("*/*/label/*/*.txt")), raw=True)
     boxes = [labels.center, labels.size, labels.yaw, labels.velocity, labels.actor_id, labels.num_lidar_pts]
     others = np.column_stack(boxes)[labels.actor_id != OWN_ACTOR_ID].T  # the own velocity is that of line 1
@@ -189,7 +189,9 @@ def _column(values: Sequence[Any], columns: Mapping[str, FloatArray]) -> tuple[s
         seen = sum(each.startswith(("t", "1")) for each in words)
         # seven of the ten rows of a label, or of nine without the own one
         return "column 13 of the labels", len(words) * (seen % 7 == 0 and 9 * seen <= 7 * len(words) <= 10 * seen)
-    numbers = np.abs([number for each in words if (number := number_of(each))])  # zeros tell nothing
+    numbers = np.abs(
+        [number for each in words if (number := number_of(each)) and math.isfinite(number)]
+    )  # zeros tell nothing
     near = {place: numbers[np.abs(numbers[:, None] - of).min(axis=1) < 0.0051] for place, of in columns.items()}
     best = max(near, key=lambda place: len(near[place]))
     known = len(near[best]) >= 0.8 * len(numbers) and len({*near[best]}) >= min(2, len(columns[best]))  # no constant

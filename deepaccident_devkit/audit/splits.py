@@ -21,7 +21,7 @@ _NAMED: Final = re.compile(
     r"(?:[\w.-]{1,200}[/\\]+){0,8}?(\w{1,200}?_scenario\d+)"  # name
     r"(?:[^\s,;\"']{0,300}?[/\\_](\d{3,})(?!\d))?"  # frame
 )
-_MINI: Final = re.compile(r"(?<![a-z])mini(?![a-z])", re.IGNORECASE)
+_MINI: Final = re.compile(r"(?<![a-z])mini(?=[/\\]|$)", re.IGNORECASE)
 _SAYS: Final = {
     "frames": ("frame", "on two sides: what is tested was learnt"),
     "recordings": ("recording", "on two sides, as by a random split by frames: frames 0.1 s apart are nearly the same"),
@@ -37,7 +37,7 @@ def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
     Args:
         paths: two or more files, a side each. A line names a scenario (`<type> <name>`, `<type>/<name>`), a sample or a
             frame by its token, or any file of a release by its path; all names in a line count. It is of the mini
-            release if the path before the scenario's type, the file's own name or its folder has the word `mini`
+            release if a folder before the scenario's type, the file's own name or its folder ends with the word `mini`
             (`train_mini.txt` and `val_mini.txt` are of the full release).
 
     Raises:
