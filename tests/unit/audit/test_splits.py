@@ -7,10 +7,9 @@ from random import Random
 
 import pytest
 
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.audit import AuditReport, audit_splits
 from deepaccident_devkit.errors import ConfigError, MissingFileError, SplitFileError
-from deepaccident_devkit.splits import official_split, split_records
+from deepaccident_devkit.splits import split_records
 
 ACCIDENT, NORMAL = "type1_subtype1_accident", "type1_subtype1_normal"
 NAMES = [f"Town0{number % 5 + 1}_type001_subtype0001_scenario{number:05d}" for number in range(40)]
@@ -40,23 +39,18 @@ def path_of(token: str, frame: int, root: str = "/data/2023/DeepAccident") -> st
     return f"{root}/{kind}/ego_vehicle/label/{name}/{name}_{frame:03d}.txt"
 
 
-def test_the_official_split_passes(da_b: DeepAccident, tmp_path: Path) -> None:
-    files = official_split(da_b).save(tmp_path)
-    by_name = {path.stem: path for path in files}
-    report = audit_splits([by_name["train"], by_name["val"], by_name["test"]])
-    assert (report.findings, report.to_text().splitlines()[0]) == ((), "Nothing was found.")
-    assert audit_splits([by_name["train_mini"], by_name["val"], by_name["test"]]).findings == ()
-
-
-def test_subsets_of_train_are_no_mini_release(sides: Sides) -> None:
+def test_the_official_split_passes_and_so_do_its_subsets(sides: Sides) -> None:
     records = [
         {"token": token, "scenario_type": token.split("/")[0], "name": token.split("/")[1], "collision": None}
         | {"designed_accident": token.startswith(ACCIDENT), "road_type": None, "spawn_side": None, "weather": "Clear"}
         for token in TOKENS
     ]
-    split = split_records(records).by_name()  # type: ignore[arg-type]
-    assert numbers(sides(train_mini=[*split["train_mini"]], val=[*split["val"]])) == {}
-    assert numbers(sides(train_mini=[*split["train_mini"]], train=[*split["train"]]))["recordings"] == 10
+    split = {name: list(tokens) for name, tokens in split_records(records).by_name().items()}  # type: ignore[arg-type]
+    report = sides(train=split["train"], val=split["val"], test=split["test"])
+    assert (report.findings, report.to_text().splitlines()[0]) == ((), "Nothing was found.")
+    assert [row[1] for row in report.tables["sides"]] == ["recordings", 56, 12, 12]
+    assert numbers(sides(train_mini=split["train_mini"], val=split["val"])) == {}
+    assert numbers(sides(train_mini=split["train_mini"], train=split["train"])) == {"recordings": 10}
 
 
 @pytest.mark.parametrize("form", ["{0} {1}", "{0}/{1}", "  {0}  {1}  "])
