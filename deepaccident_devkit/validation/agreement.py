@@ -116,8 +116,9 @@ def _compare(subject: Subject, views: Views, first: int, second: int) -> Iterato
             yield subject.finding(code, where, _worst(views, bad, values, both, unit))
     other_class = both & (views.category[:, first] != views.category[:, second])
     if other_class.any():
-        what = f"{actors_text(views.actor[other_class])}, {frames_text(views.frame[other_class])}"
-        yield subject.finding("classes-differ", where, what)
+        yield subject.finding(
+            "classes-differ", where, f"{actors_text(views.actor[other_class])}, {frames_text(views.frame[other_class])}"
+        )
 
 
 def _worst(views: Views, bad: BoolArray, values: FloatArray, both: BoolArray, unit: str) -> str:
@@ -207,8 +208,9 @@ def _overlaps(subject: Subject, views: Views) -> Iterator[Finding]:
     over = (depth > POSITION) & (np.abs(np.diff(center[pairs, 2])[:, 0]) < size[pairs, 2].mean(axis=1))
     if over.any():
         who, when = actors_text(views.actor[pairs[over]].ravel()), frames_text(views.frame[pairs[over, 0]])
-        what = f"{who} overlap by up to {depth[over].max():.2f} m, {when}"
-        yield subject.finding("overlap-unnamed", subject.token, what)
+        yield subject.finding(
+            "overlap-unnamed", subject.token, f"{who} overlap by up to {depth[over].max():.2f} m, {when}"
+        )
 
 
 def _wrapped(angle: FloatArray) -> FloatArray:
@@ -219,8 +221,7 @@ def _wrapped(angle: FloatArray) -> FloatArray:
 def check_story(subject: Subject) -> Iterator[Finding]:
     """All that meta says, compared with the format and the recordings."""
     if subject.files.scenario.name in SHEER_CURTAINS:
-        what = "vehicles behind sheer curtains are marked invisible"
-        yield subject.finding("sheer-curtain", subject.token, what)
+        yield subject.finding("sheer-curtain", subject.token, "vehicles behind sheer curtains are marked invisible")
     yield from _name(subject)
     if subject.files.meta is not None:
         for check in _CHECKS:
@@ -272,10 +273,11 @@ def _words(subject: Subject, meta: Meta) -> Iterator[Finding]:
 def _counts(subject: Subject, meta: Meta) -> Iterator[Finding]:
     expected = meta.recorded_frames
     if expected != subject.num_frames:
-        what = (
-            f"counts {meta.simulated_frames} simulated frames, so {expected} recorded ones, found {subject.num_frames}"
+        yield _at_meta(
+            subject,
+            "meta-frames",
+            f"counts {meta.simulated_frames} simulated frames, so {expected} recorded ones, found {subject.num_frames}",
         )
-        yield _at_meta(subject, "meta-frames", what)
 
 
 def _folder(subject: Subject, meta: Meta) -> Iterator[Finding]:
@@ -302,8 +304,9 @@ def _agents(subject: Subject, meta: Meta) -> Iterator[Finding]:
         yield _at_meta(subject, "meta-pair", f"the colliding agents '{names}' are not the pair {collision.ids}")
     named = {agent for agent, actor in id_of.items() if actor in collision.ids}
     if not named <= set(collision.agents):
-        what = f"the pair {collision.ids} has an agent that 'colliding agents' does not name"
-        yield _at_meta(subject, "meta-pair", what)
+        yield _at_meta(
+            subject, "meta-pair", f"the pair {collision.ids} has an agent that 'colliding agents' does not name"
+        )
 
 
 def _pair(subject: Subject, meta: Meta) -> Iterator[Finding]:
@@ -321,8 +324,9 @@ def _pair(subject: Subject, meta: Meta) -> Iterator[Finding]:
             code = "pair-not-seen" if actor in agent_of else "counterpart-unknown"
             yield _at_meta(subject, code, f"nobody annotated actor {actor}")
         elif found != [name]:
-            what = f"actor {actor} is a {shortened(name)}, the labels say {', '.join(found)}"
-            yield _at_meta(subject, "meta-pair", what)
+            yield _at_meta(
+                subject, "meta-pair", f"actor {actor} is a {shortened(name)}, the labels say {', '.join(found)}"
+            )
 
 
 def _impact(subject: Subject, meta: Meta) -> Iterator[Finding]:

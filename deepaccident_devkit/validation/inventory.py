@@ -122,8 +122,9 @@ def _repeated(path: ReleasePath, tokens: list[str]) -> Iterator[Finding]:
     repeated = [shortened(token.replace("/", " ", 1)) for token, count in Counter(tokens).items() if count > 1]
     if repeated:
         more = f" and {len(repeated) - _NAMED} more" if len(repeated) > _NAMED else ""
-        what = f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"
-        yield make_finding("split-file-repeats", None, str(path), what)
+        yield make_finding(
+            "split-file-repeats", None, str(path), f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"
+        )
 
 
 def _assignment_findings(splits: SplitAssignment) -> Iterator[Finding]:
